@@ -17,16 +17,17 @@ from teds_provision.steps import visits
     "teds-provision agree 8d4d --rotate --via can --can udp_multicast:239.74.163.2",
 )
 @click.argument("uuid")
-@click.option("--rotate", is_flag=True, help="Make a new key although there is one.")
+@click.option("--rotate", is_flag=True, help="Replace the existing key with a new one.")
 @yes_option
 @dry_run_option
 @link_options
 @pass_app
 def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry_run: bool) -> None:
-    """Agree on a key with a whitelisted node; on a node that has one, do nothing, or --rotate it.
+    """Agree on a key with a whitelisted node; if it already has one, do nothing, or --rotate it.
 
-    The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link. A node that
-    has a key of another station is taken over by tap, after a question, or with --rotate --yes: that one is locked out.
+    The first agreement needs a tap (or the bus of a node built without NFC); a rotation works over any link. A node
+    keyed by another station is taken over by tap after confirmation, or with --rotate --yes; that locks the other
+    station out.
     """
 
     def confirm(question: str) -> None:
@@ -37,7 +38,7 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
     )
     node, agreed = done.uuid.hex(), done.agreed
     if agreed is None:
-        told = f"Plan: {done.plan} ({', '.join(done.held) or 'no key held'})."
+        told = f"Plan: {done.plan} ({', '.join(done.held) or 'no key yet'})."
         app.emit({"uuid": node, "plan": done.plan, "held": list(done.held)}, told)
         return
     again = "." if agreed.fresh else " (nothing to do)."
@@ -54,16 +55,16 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
 @link_options
 @pass_app
 def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) -> None:
-    """Erase a node's key and trust in a session; its identity, epoch and sequence stay.
+    """Erase a node's key and trust in a session; its identity, epoch and sequence remain.
 
-    The node signs the statement; in factory state it signs it again, so a lost receipt can be fetched.
+    The node signs a receipt. A node in factory state signs it again, so a lost receipt can be fetched.
     """
     station = app.station()
     octets = station.nodes.resolve(uuid)
     if dry_run:
         app.emit({"uuid": octets.hex(), "plan": "reset"}, f"Plan: reset {octets.hex()} to factory state.")
         return
-    app.confirm(f"Reset node {octets.hex()}? Its key is erased and its datasheet counts as unsigned.", yes=yes)
+    app.confirm(f"Reset node {octets.hex()}? Its key is erased, and its datasheet becomes unsigned.", yes=yes)
     receipt = visits.at_node.reset_at(station, links, octets, reporter_for(app))
     app.emit(
         {
@@ -73,7 +74,7 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
             "challenge": receipt.challenge.hex(),
             "proof": receipt.proof.hex(),
         },
-        f"Node {octets.hex()} is back in factory state; it signed that at epoch {receipt.epoch}.",
+        f"Node {octets.hex()} is back in factory state and signed a receipt (epoch {receipt.epoch}).",
     )
 
 
@@ -96,15 +97,15 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
 @link_options
 @pass_app
 def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
-    """Give a node another CAN address, 1 to 239, for good: by tap, or in a session where its key is held."""
+    """Permanently change a node's CAN address, 1 to 239: by tap, or in a session if its key is held."""
     del yes  # the old address can be given back the same way
     done = visits.at_node.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
     node = done.uuid.hex()
     if done.changed is None:
-        plan = f"Plan: node {node} gets CAN address 0x{address:02x}."
+        plan = f"Plan: change the CAN address of node {node} to 0x{address:02x}."
         app.emit({"uuid": node, "plan": "address", "can_address": address}, plan)
         return
-    told = "has" if done.changed else "has already"
+    told = "now has" if done.changed else "already has"
     app.emit(
         {"uuid": node, "can_address": address, "changed": done.changed},
         f"Node {node} {told} CAN address 0x{address:02x}.",

@@ -23,15 +23,14 @@ if TYPE_CHECKING:
     from teds_provision.store import Store
 
 _KEY_HINT = (
-    "A recovery key is an encrypted PEM: openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 "
+    "A recovery key is an encrypted PEM file: openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 "
     "-aes256 -out recovery.pem"
 )
 _fd_option = click.option(
     "--backup-passphrase-fd",
     type=int,
     metavar="N",
-    help="Read the passphrase of the backup (or recovery key) from this file descriptor; --passphrase-fd serves both "
-    "where this is not given.",
+    help="Read the passphrase of the backup (or recovery key) from this file descriptor (default: --passphrase-fd).",
 )
 
 
@@ -51,10 +50,10 @@ _fd_option = click.option(
 def backup(
     app: App, file: Path, recovery: Path | None, backup_passphrase_fd: int | None, yes: bool, dry_run: bool
 ) -> None:
-    """Write the whole store, and what the vault keeps secret, to one sealed file (mode 0600).
+    """Back up the whole store and the vault's secrets to one sealed file (mode 0600).
 
-    Whitelist, nodes, keys, trust, handovers and the audit log, at one moment, also while the station is at work.
-    With a PKCS #11 keystore the keys in the token are not in it. config.toml is not in it.
+    Contains whitelist, nodes, keys, trust, handovers and the audit log as of one moment, even while the station is
+    running. Does not contain config.toml, nor the keys inside a PKCS #11 token.
     """
     station = app.station()
     point = protocol.keys.from_pem(read_file(recovery)) if recovery is not None else None
@@ -91,9 +90,9 @@ def backup(
     "--recovery-key",
     type=FileToRead(),
     metavar="PEM",
-    help="The recovery key it was sealed to, as an encrypted PEM.",
+    help="The recovery key it was sealed to, an encrypted PEM file.",
 )
-@click.option("--keystore", metavar="keyring|file|pkcs11:URI", help="Where the keys shall lie (default: as before).")
+@click.option("--keystore", metavar="keyring|file|pkcs11:URI", help="Where to keep the keys (default: as before).")
 @_fd_option
 @yes_option
 @dry_run_option
@@ -107,11 +106,11 @@ def restore(
     yes: bool,
     dry_run: bool,
 ) -> None:
-    """Bring a sealed store back: into an empty home the whole station, else what the station here lacks.
+    """Restore a backup: the whole station into an empty home, otherwise only what this station lacks.
 
-    Nothing goes back: epochs and sequences keep the greater value, newer keys stay, tombstones and revocations stay,
-    the audit log only grows. A backup of another station is refused (exit 6). A wrong passphrase is exit 7, a file
-    that was changed 4, one that is cut off or something else 8.
+    Nothing goes back: epochs and sequences keep the greater value, newer keys, tombstones and revocations stay, and
+    the audit log only grows. Another station's backup is refused (exit 6). Exits 7 for a wrong passphrase, 4 for a
+    modified file, 8 for one that is truncated or not a backup.
     """
     content = _open(file, recovery_key, _asker(app, backup_passphrase_fd))
     app.closing(content.close)
@@ -124,25 +123,25 @@ def restore(
     app.note(_told(content, wanted))
     if dry_run:
         plan = {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True}
-        app.emit(plan | {"age_days": content.age_days()}, f"Plan: make this station in {app.home}.")
+        app.emit(plan | {"age_days": content.age_days()}, f"Plan: rebuild this station in {app.home}.")
         return
     if recovery_key is not None:  # whoever has the public key can seal: only the fingerprint tells whose this is
-        app.confirm(f"Is that your station, and shall its keys lie in {_named(wanted)}?", yes=yes)
+        app.confirm(f"Is this your station, and should its keys be kept in {_named(wanted)}?", yes=yes)
     done = backup_room.restore.rebuild(app.home, content, app.ask_secret, keystore=keystore)
     if done.set_aside is not None:
-        app.warn(f"The damaged store is kept as {done.set_aside}.")
+        app.warn(f"The damaged store was kept as {done.set_aside}.")
     if done.rotations_due:
         app.warn(
-            f"Nodes that need a new key before anything else: {done.rotations_due}; the keys in a backup may have been"
-            " given away since. Tap each, or: teds-provision agree UUID --rotate"
+            f"Nodes that need a new key first: {done.rotations_due}; the keys in a backup may have been handed over"
+            " since. Tap each node, or: teds-provision agree UUID --rotate"
         )
-    _emit(app, content, done, f"The station is back in {app.home}, its keys in the keystore {done.keystore}.")
+    _emit(app, content, done, f"The station is restored in {app.home}, with its keys in the keystore {done.keystore}.")
 
 
 def _told(content: Content, keystore: str | None) -> str:
     """Whose backup it is, how old, and where the keys shall lie: what a person has to compare."""
     days = content.age_days()
-    age = f"{days} day{'' if days == 1 else 's'} ago" if days >= 0 else "in the future: compare the clocks"
+    age = f"{days} day{'' if days == 1 else 's'} ago" if days >= 0 else "in the future: check the clocks"
     return (
         f"Backup of station {content.name}, made {content.created} ({age})\n"
         f"  key      {handover.trust.spoken(content.station)}\n"
@@ -151,7 +150,7 @@ def _told(content: Content, keystore: str | None) -> str:
 
 
 def _named(keystore: str | None) -> str:
-    return keystore or "the keyring, or a passphrase file where none works"
+    return keystore or "the OS keyring, or a passphrase file if there is none"
 
 
 def _require_place(home: Path, file: Path) -> None:
@@ -161,7 +160,9 @@ def _require_place(home: Path, file: Path) -> None:
         raise NotFound(f"There is no folder {folder}.")
     own = file.name.startswith(("store.", "vault", "config.toml")) and folder.resolve() == home.resolve()
     if own:
-        raise UsageFailure(f"{file} is a file of the station itself.", hint="Give the backup another name or place.")
+        raise UsageFailure(
+            f"{file} is one of the station's own files.", hint="Choose another name or place for the backup."
+        )
 
 
 def _merge(app: App, store: Store, content: Content, keystore: str | None, *, yes: bool, dry_run: bool) -> None:
@@ -171,30 +172,30 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     head = f"{_told(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
     app.note("\n".join([head, *_lines(plan)]))
     if dry_run:
-        _emit(app, content, plan, f"Plan: {'bring back what is listed' if plan.back else 'nothing to do'}.", dry=True)
+        _emit(app, content, plan, f"Plan: {'restore the items listed' if plan.back else 'nothing to do'}.", dry=True)
         return
     if plan.back:
-        app.confirm("Bring this back?", yes=yes)
+        app.confirm("Restore this?", yes=yes)
 
     def work(known: Callable[[str, bool], str]) -> Restored:
         with store_room.StoreLock(app.home, command="restore", notice=app.note):
             if not yes and backup_room.restore.merge(store, content, dry_run=True).back not in (plan.back, {}):
                 raise VaultChanged(
-                    "Another command changed the station while the question stood: something else would come back now. "
+                    "Another command changed the station while you were being asked, so the list is out of date. "
                     "Nothing was changed.",
-                    hint="Run it again, and look at the new list.",
+                    hint="Run it again and check the new list.",
                 )
             vault = backup_room.restore.complete_vault(store, content, known, keystore=keystore)
             return backup_room.restore.merge_checked(store, content, vault, known)
 
     backup_room.restore.open_vault_of(store, app.ask_secret)
     done = vault_room.asked_first(app.ask_secret, work)
-    _emit(app, content, done, "Brought back." if done.back else "The store lacks nothing of it (nothing to do).")
+    _emit(app, content, done, "Restored." if done.back else "Nothing to do: the store already has everything in it.")
 
 
 def _lines(done: Restored) -> list[str]:
-    back = [f"  comes back: {what}: {count}" for what, count in done.back.items()]
-    return back + [f"  stays as it is: {kept}" for kept in done.kept]
+    back = [f"  restored: {what}: {count}" for what, count in done.back.items()]
+    return back + [f"  unchanged: {kept}" for kept in done.kept]
 
 
 def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = False) -> None:
@@ -219,7 +220,7 @@ def _open(file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]
     if not sealed.is_for_key:
         return sealed.open_with_passphrase(ask("Passphrase of the backup", False))
     if recovery_key is None:
-        raise UsageFailure("This backup is sealed to a recovery key.", hint="Give it with --recovery-key PEM.")
+        raise UsageFailure("This backup is sealed to a recovery key.", hint="Pass it with --recovery-key PEM.")
     passphrase = ask(f"Passphrase of {recovery_key}", False)
     try:
         key = protocol.keys.SoftwareKey.from_secret(vault_room.ca_file.read_ca(recovery_key, passphrase))

@@ -55,14 +55,16 @@ def order_options(function: Function) -> Function:
             "-c",
             type=FileToRead(),
             metavar="FILE",
-            help="CSV of raw, value pairs, or coefficients.",
+            help="CSV file of raw, value pairs, or of coefficients.",
         ),
-        click.option("--no-calibration", is_flag=True, help="Drop the calibration that the node has."),
-        click.option("--name", help="Name of this node, written into its XdcrName TEDS."),
+        click.option("--no-calibration", is_flag=True, help="Drop the node's existing calibration."),
+        click.option("--name", help="Node name, written to its XdcrName TEDS."),
         click.option(
-            "--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged."
+            "--accept-calibration",
+            metavar='"WHY"',
+            help="Accept a calibration that the guard refuses; the reason is logged.",
         ),
-        click.option("--retype", is_flag=True, help="The board may become one of another type than it says it is."),
+        click.option("--retype", is_flag=True, help="Allow the board to change type."),
     ]
     wrapped: Any = with_order
     for option in reversed(options):
@@ -74,14 +76,18 @@ def order_options(function: Function) -> Function:
 @click.argument("uuid")
 @order_options
 @click.option(
-    "--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Also write it here."
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="IMAGE",
+    help="Also write it to this file.",
 )
-@click.option("--edition", type=click.Choice(["2007", "2024"]), default="2007", show_default=True, help="TEDS form.")
+@click.option("--edition", type=click.Choice(["2007", "2024"]), default="2007", show_default=True, help="TEDS edition.")
 @yes_option
 @dry_run_option
 @pass_app
 def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, yes: bool, dry_run: bool) -> None:
-    """Build the TEDS of the node's type, plus calibration, plus the Security TEDS, still unsigned."""
+    """Build a node's TEDS from its type and calibration, plus the Security TEDS; nothing is signed yet."""
     station = app.station()
     octets = station.nodes.resolve(uuid)
     built = steps.build.build(
@@ -126,9 +132,17 @@ def read_file(path: Path) -> bytes:
 
 @command("teds-provision sign 8d4d", "teds-provision sign angle.json --output signed.json")
 @click.argument("what", metavar="UUID|IMAGE")
-@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Signed image.")
-@click.option("--read-node", is_flag=True, help="Meet the node: take its epoch, sequence and TEDS, not the store's.")
-@click.option("--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged.")
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="IMAGE",
+    help="Write the signed image to this file.",
+)
+@click.option("--read-node", is_flag=True, help="Use the node's own epoch, sequence and TEDS instead of the store's.")
+@click.option(
+    "--accept-calibration", metavar='"WHY"', help="Accept a calibration that the guard refuses; the reason is logged."
+)
 @yes_option
 @dry_run_option
 @link_options
@@ -145,7 +159,7 @@ def sign(
 ) -> None:
     """Sign the datasheet that was built for a node, or an image file (needs --output).
 
-    Unchanged content, key epoch and signer give back the existing signature.
+    If content, key epoch and signer are unchanged, the existing signature is reused.
     """
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
@@ -173,12 +187,12 @@ def sign(
         "reused": done.signed.reused,
         "changes": list(done.changes),
     }
-    again = " (the signature that was there still holds)" if done.signed.reused else ""
+    again = " (existing signature reused)" if done.signed.reused else ""
     app.emit(result, f"{_changes(done.changes)}\nSigned {uuid.hex()}, sequence {done.signed.sequence}{again}.")
 
 
 def _changes(changes: tuple[str, ...]) -> str:
-    return "\n".join(f"  {change}" for change in changes) or "  no change against what the node has"
+    return "\n".join(f"  {change}" for change in changes) or "  no changes"
 
 
 @command(
@@ -187,16 +201,16 @@ def _changes(changes: tuple[str, ...]) -> str:
     "teds-provision write 8d4d --from 3 --nfc udp:localhost:54321",
 )
 @click.argument("uuid")
-@click.option("--image", type=FileToRead(), metavar="IMAGE", help="Write this file's image.")
+@click.option("--image", type=FileToRead(), metavar="IMAGE", help="Write the image in this file.")
 @click.option(
     "--from",
     "sequence",
     type=WholeNumber(0, 2**32 - 1),
     metavar="SEQUENCE",
-    help="Bring back what it had; see history.",
+    help="Restore an earlier datasheet; see history.",
 )
-@click.option("--retype", is_flag=True, help="The board may become one of another type than it says it is.")
-@click.option("--sequence-jump", is_flag=True, help="Write although its sequence is far ahead of the node's.")
+@click.option("--retype", is_flag=True, help="Allow the board to change type.")
+@click.option("--sequence-jump", is_flag=True, help="Write even if its sequence is far ahead of the node's.")
 @yes_option
 @dry_run_option
 @link_options
@@ -214,11 +228,11 @@ def write(
 ) -> None:
     """Write a signed datasheet over a session, commit it, read it back and compare.
 
-    --from brings an older datasheet of the node back, signed anew.
+    --from restores an earlier datasheet of the node, signed again.
     """
     if sequence is not None:
         if image is not None:
-            raise UsageFailure("--from and --image name two datasheets.", hint="Give one of them.")
+            raise UsageFailure("--from and --image cannot be combined.", hint="Use one of them.")
         _bring_back(app, uuid, sequence, links, dry_run=dry_run)
         return
     confirm = partial(app.confirm, yes=yes)
@@ -246,13 +260,13 @@ def write(
 def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
     done = visits.history.bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
     node, changes = done.uuid.hex(), [change.text for change in done.changes]
-    lines = "".join(f"\n  {text}" for text in changes) or "\n  no change of what it has"
+    lines = "".join(f"\n  {text}" for text in changes) or "\n  no changes"
     if done.written is None:
         plan = {"uuid": node, "plan": "write", "from": sequence, "changes": changes}
-        app.emit(plan, f"Plan: bring the datasheet of sequence {sequence} back to {node}.{lines}")
+        app.emit(plan, f"Plan: restore the datasheet of sequence {sequence} on {node}.{lines}")
         return
     result = _told(node, done.written) | {"from": sequence, "sequence": done.sequence, "changes": changes}
-    told = f"the datasheet of sequence {sequence} is back, as sequence {done.sequence}"
+    told = f"datasheet {sequence} restored as sequence {done.sequence}"
     app.emit(result, f"Node {node}: {told}; {_said(done.written)}.{lines}")
 
 
@@ -266,21 +280,25 @@ def _told(node: str, written: Written) -> dict[str, Any]:
 
 
 def _said(written: Written) -> str:
-    told = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is there already"
+    told = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is already there"
     return f"{told} ({written.seconds:.2f} s)"
 
 
 @command("teds-provision read 8d4d --nfc udp:localhost:54321 --output node.json")
 @click.argument("uuid")
 @click.option(
-    "--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Write the image here."
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="IMAGE",
+    help="Write the image to this file.",
 )
 @link_options
 @pass_app
 def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
-    """Read every TEDS of a node, over a session where this station holds its key; look at it with show.
+    """Read every TEDS of a node, in a session if this station holds its key; decode the result with show.
 
-    Where a key is held and no session came about, nothing is proven: what was heard is shown, no file is written,
+    If a key is held but no session can be opened, nothing is proven: the data received is shown, no file is written,
     and the exit code is 5.
     """
     done = visits.at_node.read_at(app.station(), links, uuid, reporter_for(app))
@@ -298,13 +316,13 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
 
 @click.group(epilog=examples("teds-provision draft list", "teds-provision draft drop 8d4d"))
 def draft() -> None:
-    """What was built and not written: a trial, or a run that was cut."""
+    """Drafts: datasheets built but not written, by a trial or an interrupted run."""
 
 
 @command("teds-provision draft list")
 @pass_app
 def list_(app: App) -> None:
-    """List every draft: the node, its profile, and how far it came."""
+    """List every draft: node, stage and profile."""
     drafts = [
         {"uuid": one.uuid.hex(), "profile": one.profile, "stage": one.stage, "created": one.created}
         for one in app.station().nodes.drafts()
@@ -313,7 +331,7 @@ def list_(app: App) -> None:
         f"{one['uuid']}  {one['stage']:<6}  {local_time(str(one['created']))}  {one['profile'] or ''}".rstrip()
         for one in drafts
     ]
-    app.emit({"drafts": drafts}, "\n".join(lines) or "Nothing lies ready.")
+    app.emit({"drafts": drafts}, "\n".join(lines) or "There are no drafts.")
 
 
 @command("teds-provision draft drop 8d4d")
@@ -322,12 +340,12 @@ def list_(app: App) -> None:
 @dry_run_option
 @pass_app
 def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
-    """Drop the draft of a node: its datasheet stays as it is."""
+    """Drop a node's draft; the datasheet on the node is not affected."""
     del yes  # what was built can be built again
     done = visits.history.drop_draft(app.station(), uuid, dry_run=dry_run)
     node = done.uuid.hex()
     if done.draft is None:
-        app.emit({"uuid": node, "dropped": False}, f"Nothing lies ready for node {node}.")
+        app.emit({"uuid": node, "dropped": False}, f"Node {node} has no draft.")
         return
     told = f"{'Plan: drop' if dry_run else 'Dropped'} the {done.draft.stage} draft of node {node}."
     app.emit({"uuid": node, "dropped": not dry_run}, told)
@@ -341,7 +359,7 @@ draft.add_command(drop, "drop")
 @click.argument("uuid")
 @pass_app
 def history(app: App, uuid: str) -> None:
-    """The datasheets that a node had, newest first; write UUID --from SEQUENCE brings one back, signed anew."""
+    """List a node's earlier datasheets, newest first; write UUID --from SEQUENCE restores one, signed again."""
     node, records = visits.history.history_of(app.station(), uuid)
     told = [
         {
@@ -360,5 +378,5 @@ def history(app: App, uuid: str) -> None:
     ]
     app.emit(
         {"uuid": node.hex(), "history": told},
-        "\n".join(map(str.rstrip, lines)) or f"No datasheet of node {node.hex()} is known.",
+        "\n".join(map(str.rstrip, lines)) or f"No datasheets are known for node {node.hex()}.",
     )

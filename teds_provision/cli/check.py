@@ -28,27 +28,27 @@ if TYPE_CHECKING:
 @click.option(
     "--factory",
     is_flag=True,
-    help="Key, write and reset the node too; it ends in factory state. One of ours loses its key.",
+    help="Also key, write and reset the node; it ends in factory state, and one of this station's nodes loses its key.",
 )
 @click.option(
     "--explain",
     is_flag=True,
-    help="Show T, OKM, M and tags of a test agreement that is never confirmed, to compare a firmware's own with.",
+    help="Show T, OKM, M and tags of a test agreement that is never confirmed, to compare with a firmware's values.",
 )
 @yes_option
 @dry_run_option
 @link_options
 @pass_app
 def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, links: LinkSettings) -> None:
-    """Run the rules of the profile against a board.
+    """Check a board's firmware against the rules of the profile.
 
-    Each ends as passed, failed or skipped, with its clause and what was seen.
+    Each rule is passed, failed or skipped, with its clause and what was observed.
 
-    Where a known slip explains what failed (a label without its 00, swapped halves of Z …) it is named.
+    If a known mistake explains a failure (a label without its 00, swapped halves of Z …), it is named.
 
-    A node of another owner is left alone (6). Keys change only with --factory: a factory node, or one of this
-    station's, is then keyed, written and reset.
-    Exits 4 where a rule failed, 5 where no node is, or it fell silent.
+    Another owner's node is left alone (6). Keys change only with --factory, which keys, writes and resets a factory
+    node or one of this station's.
+    Exits 4 if a rule failed, 5 if there is no node or it stopped answering.
     """
     station = app.station()
     if dry_run:
@@ -57,7 +57,7 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
         return
     if factory:
         app.confirm(
-            "Key, write and reset the node that is met? If it is one of yours its key and datasheet go.", yes=yes
+            "Key, write and reset the node found? If it is one of yours, it loses its key and datasheet.", yes=yes
         )
     report = check_room.run.check_at(station, links, reporter_for(app), factory=factory, explained=explain)
     counts = {result: report.count(result) for result in ("passed", "failed", "skipped")}
@@ -116,7 +116,7 @@ _EXPLAINED: Final = {
     "t": "T",
     "okm": "OKM (48 octets)",
     "m": "M",
-    "tag_n": "tagN, due",
+    "tag_n": "tagN, expected",
     "tag_n_received": "tagN, received",
     "sig_n_received": "sigN, received",
     "tag_s": "tagS",
@@ -124,7 +124,7 @@ _EXPLAINED: Final = {
 
 
 def _silent(report: Report) -> str:
-    return "" if report.lost is None else f"{report.lost.message} What comes after it was not tried."
+    return "" if report.lost is None else f"{report.lost.message} The remaining rules were not tried."
 
 
 def _table(console: Console, report: Report) -> None:
@@ -141,7 +141,7 @@ def _table(console: Console, report: Report) -> None:
     if report.explained is None:
         return
     told = _explained(report.explained)
-    console.print("A test agreement, never confirmed and ended on the node; none of it is anybody's key:")
+    console.print("A test agreement, never confirmed and ended on the node; none of these values is a key in use:")
     for key, name in _EXPLAINED.items():
         if (value := told.get(key)) is not None:
             console.print(f"{name:<18} {value}", markup=False, highlight=False, soft_wrap=True)

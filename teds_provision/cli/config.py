@@ -27,26 +27,26 @@ _PREFIX = "TEDS_PROVISION_"
     context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision config show", "teds-provision config path")
 )
 def config() -> None:
-    """What is set in config.toml and in the environment. docs/configuration.md lists every option and variable."""
+    """Show the settings in config.toml and the environment. docs/configuration.md lists every option and variable."""
 
 
 @config.command("path", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision config path"))
 @pass_app
 def path_(app: App) -> None:
-    """Say where config.toml of this home lies, whether it is there or not."""
+    """Print the path of this home's config.toml, whether or not it exists."""
     place = config_path(app.home)
     app.emit({"path": str(place), "exists": place.is_file()}, str(place))
 
 
 @config.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Show what is set, and where.",
+    short_help="Show all settings and their sources.",
     epilog=examples("teds-provision config show"),
 )
 @click.pass_context
 @pass_app
 def show(app: App, ctx: click.Context) -> None:
-    """Show every setting that is made, its value and where it comes from; a bad value is an error (exit 8)."""
+    """Show every setting, its value and its source; an invalid value is an error (exit 8)."""
     place = config_path(app.home)
     values = read_config(place) or {}
     root = ctx.find_root()
@@ -73,7 +73,7 @@ def _is_ours(name: str) -> bool:
 def _from_environment(name: str, app: App) -> dict[str, Any]:
     option = name.removeprefix(_PREFIX).lower().replace("_", "-")
     if not any(option in options for options in OPTIONS.values()):
-        app.warn(f"{name} is set, and no command has an option --{option}.")
+        app.warn(f"{name} is set, but no command has an option --{option}.")
     return {"name": option, "value": os.environ[name], "source": f"environment ({name})"}
 
 
@@ -98,7 +98,7 @@ def _check_value(root: click.Context, name: str, value: Any, place: Path) -> Non
                         each.process_value(click.Context(found, parent=root, info_name=path), value)
                     except click.BadParameter as error:
                         said = error.message.rstrip(".")
-                        raise BadData(f"{place}: {name} = {value!r}: {said}.", hint="Mend that line.") from error
+                        raise BadData(f"{place}: {name} = {value!r}: {said}.", hint="Fix that line.") from error
             return
 
 
@@ -122,7 +122,7 @@ def _table(console: Console, settings: list[dict[str, Any]]) -> None:
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 @pass_app
 def completion(app: App, shell: str) -> None:
-    """Print what a shell needs to complete commands, options, names, UUIDs, profiles and files.
+    """Print the shell script that completes commands, options, names, UUIDs, profiles and files.
 
     In bash: eval "$(teds-provision completion bash)"
     """

@@ -31,7 +31,7 @@ BROKERS: Final = "ncap brokers"
 """A table of names and URLs, not of options."""
 _LONGEST: Final = 40
 """More of a name is not shown."""
-_MEND: Final = "Mend or remove the file."
+_MEND: Final = "Fix or remove the file."
 
 
 class Defaults(dict[str, Any]):
@@ -103,7 +103,7 @@ def read_config(path: Path) -> dict[str, Any] | None:
     except BadData as error:
         raise BadData(error.message, hint=_MEND) from error
     for problem in problems(values, text):
-        raise BadData(f"{path}, {problem}", hint="teds-provision config show lists what there is.")
+        raise BadData(f"{path}, {problem}", hint="To list all settings: teds-provision config show")
     return values
 
 

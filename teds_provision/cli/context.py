@@ -89,9 +89,11 @@ class App:
             raise
         except OSError as error:  # the work is done and safe; a script that gets no answer must hear of it
             nowhere(sys.stdout)
-            told = f"The result cannot be written to stdout: {error.strerror}."
+            told = f"Cannot write the result to stdout: {error.strerror}."
             if self.json:
-                raise StoreFailure(told, hint="Free some space; the work itself is done.") from error
+                raise StoreFailure(
+                    told, hint="The work itself is done. Free some space before the next run."
+                ) from error
             self.note(told)
 
     def _print(self, human: Callable[[Console], None] | RenderableType) -> None:
@@ -169,13 +171,13 @@ class App:
             return
         if not self.interactive:
             raise PolicyRefused(
-                f"This needs a person's word and nobody can be asked. {question}"
+                f"This needs confirmation, but there is no terminal to ask on. {question}"
                 if named
-                else "This needs a person's word and nobody can be asked.",
+                else "This needs confirmation, but there is no terminal to ask on.",
                 hint=f"Add {named} --yes." if named else "Add --yes, or --dry-run to see the plan.",
             )
         if not self.ask(question):
-            raise PolicyRefused("You said no: nothing was changed.")
+            raise PolicyRefused("Cancelled. Nothing was changed.")
 
     def ask(self, question: str) -> bool:
         """Ask a person, yes or no; nothing that a node or a file brought steers the terminal."""
@@ -186,11 +188,11 @@ class App:
         """Who is asked before a board becomes one of another type: a person at a terminal who answered nothing yet."""
 
         def ask(uuid: bytes, differences: tuple[str, ...]) -> None:
-            self.note(f"Board {uuid.hex()} says that it is of another type than it would be given:")
+            self.note(f"Board {uuid.hex()} reports a different type from the one it would be given:")
             for text in differences:
                 self.note(f"  {text}")
-            if not self.ask("Make it one of the new type?"):
-                raise PolicyRefused(f"You said no: board {uuid.hex()} keeps its type, nothing was written.")
+            if not self.ask("Change it to the new type?"):
+                raise PolicyRefused(f"Cancelled. Board {uuid.hex()} keeps its type; nothing was written.")
 
         return ask if self.interactive and not yes else None
 
@@ -198,18 +200,18 @@ class App:
         """Ask a person whether a key counts: yes, no, or its digits (32 to 64, or a scanned label), held against it."""
         self.live_line()
         while True:
-            asked = _asked(f"{question} (or its digits) [y/N]")
+            asked = _asked(f"{question} [y/N], or type the first 32 digits of its key")
             said = click.prompt(asked, default="n", show_default=False, err=True).strip()
             if said.lower() in ("y", "yes", "n", "no"):
                 return said.lower().startswith("y")
             label = station_room.label.read_label(said)
             digits = label[1] if label is not None else protocol.fingerprints.read_fingerprint(said)
             if digits is not None and not protocol.fingerprints.same_key(digits, fingerprint):
-                say("These are the digits of another key.")
+                say("These digits belong to a different key.")
                 return False
             if digits is not None:
                 return True
-            say("Answer y or n, or give 32 to 64 digits of the fingerprint.")
+            say("Answer y or n, or type 32 to 64 digits of the fingerprint.")
 
     @property
     def has_passphrase(self) -> bool:
@@ -232,8 +234,8 @@ class App:
     def _typed(self, prompt: str, *, confirm: bool, instead: str) -> str:
         if self.no_input or not sys.stdin.isatty():
             raise WrongPassphrase(
-                f"{prompt.rstrip(': ')} is needed and nobody can be asked.",
-                hint=f"Give it through a file descriptor: {instead}.",
+                f"{prompt.rstrip(': ')} is needed, but there is no terminal to ask on.",
+                hint=f"Pass it through a file descriptor: {instead}.",
             )
         self.live_line()
         answer: str = click.prompt(_asked(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
@@ -290,10 +292,10 @@ def read_line(descriptor: int) -> str:
         with os.fdopen(os.dup(descriptor), "rb") as stream:
             line = stream.readline(4096)
     except OSError as error:
-        raise UsageFailure(f"--passphrase-fd {descriptor} cannot be read: {error.strerror}.") from error
+        raise UsageFailure(f"Cannot read --passphrase-fd {descriptor}: {error.strerror}.") from error
     text = line.decode(errors="surrogateescape").rstrip("\r\n")
     if not text:
-        raise WrongPassphrase(f"--passphrase-fd {descriptor} gave an empty line.")
+        raise WrongPassphrase(f"--passphrase-fd {descriptor} returned an empty line.")
     return text
 
 

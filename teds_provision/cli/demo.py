@@ -15,29 +15,29 @@ from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import UsageFailure
 
 NEXT = """
-Next, with a node of your own (or a virtual one: node create, node run):
-  teds-provision init         makes this station's keys; says where they go before it asks
-  teds-provision provision    waits for a tap, then does every step; run it again, it carries on
+Next, with your own node (or a virtual one: node create, node run):
+  teds-provision init         creates this station's keys; tells you where before it asks
+  teds-provision provision    waits for a tap, then does every step; run it again to continue
   teds-provision measure      records and publishes calibrated values
-  teds-provision doctor       says what is wrong with reader, bus or store, and the cure
-  teds-provision demo --page  the same in a browser: a base station that runs, with its page"""
+  teds-provision doctor       finds problems with reader, bus or store, and how to fix them
+  teds-provision demo --page  runs a base station with its web page"""
 
 
 @command("teds-provision demo", "teds-provision demo --page", "teds-provision --json demo")
-@click.option("--page", is_flag=True, help="Run a base station with its page and virtual nodes, until Ctrl-C.")
-@click.option("--http", metavar="HOST:PORT", help="With --page: where it is served (default: a free port here).")
+@click.option("--page", is_flag=True, help="Run a base station with its page and virtual nodes until Ctrl-C.")
+@click.option("--http", metavar="HOST:PORT", help="With --page: the address to serve on (default: a free local port).")
 @pass_app
 def demo(app: App, *, page: bool, http: str | None) -> None:
     """Two base stations and two virtual nodes: provision over NFC and CAN, hand over, measure, move an actuator.
 
-    Uses throwaway homes and vaults, talks to this machine alone, leaves nothing behind.
+    Uses temporary homes and vaults, communicates on this machine only, and leaves nothing behind.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: a folder and a process are to be taken away
     if page:
         _page(app, http)
         return
     if http is not None:
-        raise UsageFailure("--http belongs to --page.", hint="Run: teds-provision demo --page --http 127.0.0.1:8351")
+        raise UsageFailure("--http requires --page.", hint="Run: teds-provision demo --page --http 127.0.0.1:8351")
     done = demo_room.story.run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     app.emit(
@@ -52,10 +52,10 @@ def _page(app: App, http: str | None) -> None:
         signal.signal(number, lambda *_: over.set())
     with demo_room.page.page_demo(app.note, http) as shown:
         told = f"""Open {shown.url}
-  (good once, for five minutes; another: teds-provision --home {shown.home} ncap open)
-Lay one more node on its reader:
+  (valid once, for five minutes; for another: teds-provision --home {shown.home} ncap open)
+To place another node on its reader:
   {shown.tap}
-Ctrl-C ends it."""
+Press Ctrl-C to stop."""
         app.emit({"ready": True, "url": shown.url, "home": str(shown.home), "tap": shown.tap}, told)
         sys.stdout.flush()
         over.wait()

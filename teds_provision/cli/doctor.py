@@ -27,14 +27,14 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": 
 @command("teds-provision doctor", "teds-provision doctor --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2")
 @click.option("--nfc", metavar="PATH", help="Also open this reader: usb, tty:USB0:pn532, udp:localhost:54321.")
 @click.option("--can", metavar="INTERFACE:CHANNEL", help="Also open this bus: socketcan:can0, …")
-@click.option("--ble", metavar="ADAPTER", help="Also demand this Bluetooth adapter: auto, hci0.")
+@click.option("--ble", metavar="ADAPTER", help="Also require this Bluetooth adapter: auto, hci0.")
 @pass_app
 def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
-    """Look at Python, libraries, readers, buses, clock, keyring, vault and store; name cause and cure of each trouble.
+    """Check Python, libraries, readers, buses, clock, keyring, vault and store; explain each problem and how to fix it.
 
-    Opens no reader and no bus unless it is named, and asks for no passphrase; with --passphrase-fd the seals
-    of pins and trust are checked too. Exits 0 unless something failed
-    (warnings are no failure): 7 for the store, the keyring or the vault, 5 for a named reader or bus, 1 for the rest.
+    Opens only the readers and buses you name, and never asks for a passphrase; with --passphrase-fd it also checks the
+    seals of pins and trust. Exits 0 unless a check failed (warnings do not count): 7 for the store, the keyring or the
+    vault, 5 for a named reader or bus, 1 for the rest.
     """
     root = click.get_current_context().find_root()
     group = root.command

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 _SHOWN = 20
 _MEANS = {
-    "copy": "A copy: both stations hold the same keys from now on, and either can pose as a node to the other.",
-    "move": "A move: the keys rest here at once. Only when the other station has rotated them at its first contact is"
-    " this one locked out for certain.",
+    "copy": "A copy: both stations will hold the same keys, and either can impersonate a node to the other.",
+    "move": "A move: this station stops using the keys at once. It is only certain to be locked out when the other"
+    " station has rotated them at its first contact.",
 }
 
 
@@ -32,14 +32,20 @@ _MEANS = {
 )
 @click.argument("uuids", metavar="[UUID]…", nargs=-1)
 @click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
-@click.option("--all", "everything", is_flag=True, help="Every node whose key is held and proven.")
-@click.option("--mode", type=click.Choice(["copy", "move"]), default="copy", show_default=True, help="Share, or give.")
+@click.option("--all", "everything", is_flag=True, help="Export every node whose key is held and proven.")
+@click.option(
+    "--mode",
+    type=click.Choice(["copy", "move"]),
+    default="copy",
+    show_default=True,
+    help="Share the keys, or hand them over.",
+)
 @click.option(
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
     required=True,
     metavar="FILE",
-    help="Where the sealed bundle goes.",
+    help="Where to write the sealed bundle.",
 )
 @click.option(
     "--expires",
@@ -47,9 +53,9 @@ _MEANS = {
     default=7,
     show_default=True,
     metavar="DAYS",
-    help="How long it can be imported.",
+    help="How many days it can be imported.",
 )
-@click.option("--ca", metavar="FINGERPRINT", help="Only the nodes that keep this CA key.")
+@click.option("--ca", metavar="FINGERPRINT", help="Only nodes that keep this CA key.")
 @yes_option
 @dry_run_option
 @pass_app
@@ -65,14 +71,14 @@ def export_keys(
     yes: bool,
     dry_run: bool,
 ) -> None:
-    """Hand node keys to other base stations in a bundle, sealed to them and signed by this one.
+    """Hand node keys to other base stations in a bundle sealed to them and signed by this one.
 
-    Nothing is ever written unsealed. A move marks the nodes as given away before the file exists; its receipt closes
-    it ("handover receipt"); before that "handover undo" takes it back. More nodes than one bundle holds go into FILE,
-    FILE.2 and so on, each with a receipt of its own.
+    Nothing is ever written unencrypted. A move marks the nodes as given away before the file exists; its receipt
+    completes it ("handover receipt"), and until then "handover undo" reverts it. If one bundle cannot hold all nodes,
+    they are split into FILE, FILE.2 and so on, each with its own receipt.
     """
     if everything == bool(uuids):
-        raise click.UsageError("Name the nodes, or say --all.")
+        raise click.UsageError("Name the nodes, or use --all.")
     station = app.station()
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
     order = handover.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
@@ -103,9 +109,9 @@ def _tell_export(
         bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
     fresh = any(one.fresh for one in done)
     told |= {"sha256": done[0].sha256, "octets": sum(one.octets for one in done), "fresh": fresh}
-    again = "" if fresh else " (nothing to do, it is there already)"
+    again = "" if fresh else " (nothing to do: it already exists)"
     moved = plans[0].mode == "move"
-    next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if moved else ""
+    next_step = "\nTo complete the move with its receipt: teds-provision handover receipt FILE.receipt" if moved else ""
     files = ", ".join(map(str, outputs))
     app.emit(told, f"{_count(plans)} in {files}, handover {plans[0].id}{again}.{next_step}")
 
@@ -142,8 +148,8 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
     if plan.also_held_by:
         names = ", ".join(handover.pending.peer_name(station, digits) for digits in plan.also_held_by)
-        lines.append(f"  also held, by an earlier copy, by {names}: until the keys are rotated")
-    lines.append("For comparison by voice:")
+        lines.append(f"  also held by {names} from an earlier copy, until the keys are rotated")
+    lines.append("Compare by voice:")
     lines += [f"  to   {record.name}\n       {handover.trust.spoken(record.fingerprint)}" for record in plan.receivers]
     lines.append(f"  from {station.name}\n       {handover.trust.spoken(station.fingerprint)}")
     return "\n".join([*lines, _MEANS[plan.mode]])
@@ -157,4 +163,4 @@ def _node_lines(chosen: Sequence[Leaving], station: Station) -> list[str]:
 def require_same(same: bool) -> None:
     """What a person was shown must still be so under the lock."""
     if not same:
-        raise PolicyRefused("Another command changed the plan while this one waited.", hint="Run it again.")
+        raise PolicyRefused("Another command changed the plan while this one was waiting.", hint="Run it again.")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     epilog=examples("teds-provision group create hand 8d4d 91aa", "teds-provision group list"),
 )
 def group() -> None:
-    """Measurement groups: a name for nodes that are measured together. A running group is frozen."""
+    """Manage groups of nodes that are measured together. A group cannot change while it is measured."""
 
 
 def _told(groups: Sequence[Group]) -> dict[str, object]:
@@ -28,16 +28,17 @@ def _told(groups: Sequence[Group]) -> dict[str, object]:
 
 
 def _tell(app: App, groups: Sequence[Group]) -> None:
-    lines = [f"{one.name}: {', '.join(uuid.hex() for uuid in one.uuids) or 'no node yet'}" for one in groups]
+    lines = [f"{one.name}: {', '.join(uuid.hex() for uuid in one.uuids) or 'no nodes yet'}" for one in groups]
     app.emit(
-        _told(groups), "\n".join(lines) or "There is no group yet. Make one: teds-provision group create NAME UUID …"
+        _told(groups),
+        "\n".join(lines) or "There are no groups yet. To create one: teds-provision group create NAME UUID …",
     )
 
 
 @group.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision group list"))
 @pass_app
 def list_groups(app: App) -> None:
-    """List every group."""
+    """List all groups."""
     _tell(app, app.station().groups.all())
 
 
@@ -47,11 +48,11 @@ def list_groups(app: App) -> None:
 @dry_run_option
 @pass_app
 def create(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
-    """Make a group of these nodes."""
+    """Create a group of these nodes."""
     station = app.station()
     uuids = [station.nodes.resolve(text) for text in nodes]
     if dry_run:
-        app.emit({"groups": [{"name": name, "uuids": [uuid.hex() for uuid in uuids]}]}, f"Would make group {name}.")
+        app.emit({"groups": [{"name": name, "uuids": [uuid.hex() for uuid in uuids]}]}, f"Would create group {name}.")
         return
     with station.lock("group create", app.note):
         _tell(app, [station.groups.create(name, uuids)])
@@ -73,7 +74,7 @@ def add(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
 @dry_run_option
 @pass_app
 def remove(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
-    """Take nodes out of a group."""
+    """Remove nodes from a group."""
     _change(app, name, nodes, "remove", Groups.remove, dry_run=dry_run)
 
 
@@ -100,7 +101,7 @@ def _change(
 @dry_run_option
 @pass_app
 def delete(app: App, name: str, *, dry_run: bool) -> None:
-    """Delete a group; its nodes stay as they are."""
+    """Delete a group; its nodes are not affected."""
     station = app.station()
     if not dry_run:
         with station.lock("group delete", app.note):

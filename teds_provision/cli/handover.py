@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     epilog=examples("teds-provision handover list", "teds-provision handover receipt lab.jwe.receipt"),
 )
 def handover() -> None:
-    """Handovers under way: list them, close them by their receipt, take a move back."""
+    """Manage key handovers: list them, complete them with a receipt, undo a move."""
 
 
 @handover.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover list"))
 @pass_app
 def list_(app: App) -> None:
-    """Every bundle that left or came."""
+    """List every bundle sent or received."""
     from datetime import UTC, datetime
 
     listed = handover_room.pending.list_handovers(app.station(), datetime.now(UTC))
@@ -55,20 +55,20 @@ def list_(app: App) -> None:
         f"  {', '.join(row['names'])}  {local_time(str(row['created']))}{'  expired' if row['expired'] else ''}"  # type: ignore[arg-type]
         for row in rows
     ]
-    app.emit({"handovers": rows}, "\n".join(lines) or "No bundle has left or come.")
+    app.emit({"handovers": rows}, "\n".join(lines) or "No bundles have been sent or received.")
 
 
 @handover.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Close a handover with the receiver's signed receipt.",
+    short_help="Complete a handover with the receiver's receipt.",
     epilog=examples("teds-provision handover receipt lab.jwe.receipt"),
 )
 @click.argument("file", type=click.Path(path_type=Path))
 @pass_app
 def receipt(app: App, file: Path) -> None:
-    """Close a handover with the receiver's signed receipt; the keys of a move are then deleted here.
+    """Complete a handover with the receiver's signed receipt; after a move, the keys are then deleted here.
 
-    FILE may be a folder: every *.receipt in it is taken.
+    FILE may be a directory: every *.receipt in it is used.
     """
     station = app.station()
     files = sorted(file.glob("*.receipt")) if file.is_dir() else [file]
@@ -93,7 +93,7 @@ def _close_all(
             closed.append(handover_room.pending.close(station, octets))
         except TedsProvisionError as error:
             if not go_on and error.message == protocol.handover.jose.NO_COMPACT_JWS:
-                raise BadData(f"{path} is no receipt.", hint="Give the file that import-keys wrote.") from error
+                raise BadData(f"{path} is not a receipt.", hint="Use the file that import-keys wrote.") from error
             if not go_on:
                 raise
             app.warn(f"{path.name}: {error.message}")
@@ -115,17 +115,19 @@ def _closed(done: Closed) -> dict[str, Any]:
 
 def _closed_text(station: Station, done: Closed) -> str:
     imported, refused = done.receipt.imported, done.receipt.refused
-    text = f"Station {handover_room.pending.peer_name(station, done.receipt.sender)} took {count_of(len(imported))} in"
-    text += ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (known before)."
+    text = f"Station {handover_room.pending.peer_name(station, done.receipt.sender)} imported {count_of(len(imported))}"
+    text += (
+        ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (already known)."
+    )
     lines = [f"  refused {one.uuid.hex()}: {one.why}" for one in refused]
     if refused and done.row.mode == "move":
-        lines.append("What was refused is this station's again, to be rotated at the next contact.")
+        lines.append("The refused nodes belong to this station again; their keys are rotated at the next contact.")
     return "\n".join([text, *lines])
 
 
 @handover.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Take a move back before its receipt.",
+    short_help="Undo a move that has no receipt yet.",
     epilog=examples("teds-provision handover undo 3d1a4d1c --yes"),
 )
 @click.argument("id_", metavar="ID")
@@ -133,15 +135,15 @@ def _closed_text(station: Station, done: Closed) -> str:
 @dry_run_option
 @pass_app
 def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
-    """Take a move back before its receipt; each node's key is rotated at the next contact, before anything else."""
+    """Undo a move that has no receipt yet; each node's key is rotated at the next contact, before anything else."""
     station = app.station()
     row = handover_room.pending.find_handover(station, id_)
     if dry_run:
-        app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: take the {row.mode} {row.id} back.")
+        app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: undo the {row.mode} {row.id}.")
         return
-    app.confirm("Take this move back? The receiver may have the keys all the same until they are rotated.", yes=yes)
+    app.confirm("Undo this move? The receiver may still have the keys until they are rotated.", yes=yes)
     with station.lock("handover undo", app.note):
         done = handover_room.pending.undo(station, handover_room.pending.find_handover(station, id_))
     told = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
-    text = f"{count_of(len(done.uuids))} back here; the next contact with each rotates its key first."
-    app.emit(told, text if done.fresh else "Nothing to do: this move was taken back before.")
+    text = f"{count_of(len(done.uuids))} back on this station; each key is rotated at the next contact."
+    app.emit(told, text if done.fresh else "Nothing to do: this move was already undone.")

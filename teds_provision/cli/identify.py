@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     "teds-provision identify --nfc udp:localhost:54321 --add",
     "teds-provision --json identify --via can --can udp_multicast:239.74.163.2",
 )
-@click.option("--watch", is_flag=True, help="Go on: one line per node that comes.")
-@click.option("--add", is_flag=True, help="Whitelist what proves its key.")
+@click.option("--watch", is_flag=True, help="Keep watching: one line per node.")
+@click.option("--add", is_flag=True, help="Whitelist nodes that prove their key.")
 @link_options
 @pass_app
 def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
-    """Wait for a tap; read UUID and key, and have the node prove that it holds it.
+    """Wait for a tap, read the node's UUID and key, and have it prove that it holds the key.
 
-    Over --via can every node on the bus is asked; with --json several are listed under "nodes".
+    With --via can, every node on the bus is asked; --json lists several under "nodes".
     """
     stop = talk.watching.Patience(None)
     if watch:

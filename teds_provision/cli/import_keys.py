@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 _SHOWN = 40
 _PIECE = 64 * 1024
 _CIPHERTEXT = b'"ciphertext"'
-_COPIED = "A copy: the sender keeps the same keys, and either can pose as a node to the other."
-_MOVED = "A move: each key is rotated at the first contact; until then the sender can still use it."
+_COPIED = "A copy: the sender keeps the same keys, and either station can impersonate a node to the other."
+_MOVED = "A move: each key is rotated at the first contact; until then, the sender can still use it."
 
 
 @command(
@@ -41,13 +41,13 @@ _MOVED = "A move: each key is rotated at the first contact; until then the sende
 )
 @click.argument("file", type=options.FileToRead())
 @click.option(
-    "--prove/--no-prove", default=None, help="Meet each node and open a session (default: with link options)."
+    "--prove/--no-prove", default=None, help="Contact each node and open a session (default if a link is named)."
 )
 @click.option(
     "--receipt",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Where the signed receipt goes (default: FILE.receipt).",
+    help="Where to write the signed receipt (default: FILE.receipt).",
 )
 @yes_option
 @dry_run_option
@@ -62,10 +62,10 @@ def import_keys(
     dry_run: bool,
     links: LinkSettings,
 ) -> None:
-    """Take node keys over from a trusted base station: check, show the plan, take in, write the receipt.
+    """Take over node keys from a trusted base station: check, show the plan, import, write the receipt.
 
-    A node counts as taken over when it opened a session here; after a move its key is rotated in it, and only then is
-    the sender locked out. The same bundle again changes nothing and gives the same receipt.
+    A node counts as taken over once it opens a session here; after a move its key is rotated in that session, and only
+    then is the sender locked out. Importing the same bundle again changes nothing and gives the same receipt.
     """
     app = ctx.find_object(App)
     assert app is not None
@@ -81,7 +81,7 @@ def import_keys(
         if not isinstance(shown, handover.incoming.Imported):
             require_new(receipt)
             app.note(_import_text(station, shown))
-            app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
+            app.confirm(f"Import {count_of(len(shown.taken))}?", yes=yes)
         with station.lock("import-keys", app.note):
             plan = shown if station.version() == state else handover.incoming.plan_import(station, bundle)
             done = _take_in(station, plan, shown)
@@ -107,9 +107,9 @@ def _bundle_file(path: Path) -> Iterator[BinaryIO]:
     with open_to_read(path) as file:
         whole = file if file.seekable() else BytesIO(file.read(most + 1))
         if whole.seek(0, os.SEEK_END) > most:
-            raise BadData(f"{path} is larger than {most} octets: that is no bundle.")
+            raise BadData(f"{path} is larger than {most} octets and cannot be a bundle.")
         if not _is_sealed(whole):
-            raise BadData(f"{path} is no handover bundle.", hint="Give the file that export-keys wrote.")
+            raise BadData(f"{path} is not a handover bundle.", hint="Use the file that export-keys wrote.")
         yield whole
 
 
@@ -155,20 +155,18 @@ def _taken_before(done: Imported) -> dict[str, Any]:
 def _import_text(station: Station, plan: ImportPlan | Imported) -> str:
     """The plan for people."""
     if isinstance(plan, handover.incoming.Imported):
-        return f"This bundle was taken in on {plan.row.created}; nothing is left to do."
+        return f"This bundle was imported on {plan.row.created}; there is nothing to do."
     bundle, nodes = plan.opened.bundle, plan.nodes
     lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {handover.pending.peer_name(station, bundle.sender)}"]
     shown = [f"  {one.decision:<8} {one.node.uuid.hex()}  {one.why}".rstrip() for one in nodes[:_SHOWN]]
     lines += first_lines(shown, _SHOWN, len(nodes))
     lines += _noted(nodes)
     lines += [f"  revoked  {one.uuid.hex()}  {one.why}" for one in plan.denied]
-    lines += [f"  its ban of {one.uuid.hex()} does not count: {why}" for one, why in plan.passed_over]
+    lines += [f"  its ban of {one.uuid.hex()} is ignored: {why}" for one, why in plan.passed_over]
     own, sender = handover.trust.spoken(station.fingerprint), handover.trust.spoken(bundle.sender)
-    lines += [f"For comparison by voice:\n  from {sender}\n  to   {own}"]
+    lines += [f"Compare by voice:\n  from {sender}\n  to   {own}"]
     if not plan.ca_is_known:
-        lines.append(
-            f"The CA {protocol.keys.fingerprint(bundle.ca)[:32]} will be trusted for these nodes, and for no others."
-        )
+        lines.append(f"The CA {protocol.keys.fingerprint(bundle.ca)[:32]} will be trusted for these nodes only.")
     return "\n".join([*lines, _COPIED if bundle.mode == "copy" else _MOVED])
 
 
@@ -233,13 +231,13 @@ def _tell_import(
 
 def _import_told(done: Imported, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
     lines = [
-        f"{count_of(len(done.notes.uuids) - len(done.notes.refused))} taken in"
-        + ("." if done.fresh else " before; nothing changed.")
+        f"{count_of(len(done.notes.uuids) - len(done.notes.refused))} imported"
+        + ("." if done.fresh else " earlier; nothing changed.")
     ]
     lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
-    lines += [f"  not met {uuid}: {why}" for uuid, why in not_met.items()]
-    lines += [f"{count_of(rotated)} rotated: the sender is locked out for certain."] if rotated else []
+    lines += [f"  no contact with {uuid}: {why}" for uuid, why in not_met.items()]
+    lines += [f"{count_of(rotated)} rotated: the sender is locked out."] if rotated else []
     if pending:
-        lines.append(f"{count_of(len(pending))} not proven yet: their first contact here proves them (agree UUID).")
+        lines.append(f"{count_of(len(pending))} not proven yet: the first contact here proves them (agree UUID).")
     lines.append(f"Receipt for the sender: {receipt}")
     return "\n".join(lines)

@@ -27,26 +27,30 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "teds-provision init --name lab --request lab.request",
     "teds-provision init --certificate lab.cert",
 )
-@click.option("--name", help="The station's name, shown in every datasheet that it signs.")
+@click.option("--name", help="Station name, shown in every datasheet it signs.")
 @click.option(
-    "--keystore", metavar="keyring|file|pkcs11:URI", help="Where the keys lie (default: the keyring if one works)."
+    "--keystore",
+    metavar="keyring|file|pkcs11:URI",
+    help="Where to keep the keys (default: the OS keyring if available).",
 )
-@click.option("--request", type=_FILE, metavar="FILE", help="Make no CA key; ask for another's signature in FILE.")
 @click.option(
-    "--certificate", type=FileToRead(), metavar="CERT", help='Take in what "trust ca sign" gave for that request.'
+    "--request", type=_FILE, metavar="FILE", help="Create no CA key; write a request for another station's CA to FILE."
+)
+@click.option(
+    "--certificate", type=FileToRead(), metavar="CERT", help='Install the certificate that "trust ca sign" issued.'
 )
 @yes_option
 @pass_app
 def init(
     app: App, name: str | None, keystore: str | None, request: Path | None, certificate: Path | None, yes: bool
 ) -> None:
-    """Make this base station's identity and its CA key; a second run shows them.
+    """Create this base station's identity and CA key; a second run shows them.
 
-    The keys lie in the OS keyring, in a PKCS #11 token, or sealed under a passphrase. Stations of one owner share one
-    CA: --request here, "trust ca sign" where the CA key is, --certificate here.
+    The keys are kept in the OS keyring, in a PKCS #11 token, or encrypted with a passphrase. Stations of one owner
+    share one CA: --request here, "trust ca sign" on the station with the CA key, --certificate here.
     """
     if request is not None and certificate is not None:
-        raise click.UsageError("--request comes first, --certificate when the CA has signed it.")
+        raise click.UsageError("Use --request first, then --certificate once the CA has signed it.")
     if request is not None:
         _request(app, name, keystore, request)
         return
@@ -78,7 +82,7 @@ def init(
 
 def _open_for(app: App) -> str:
     left = asking.seconds_left(app.home)
-    return "" if left is None else f", held open for {left // 60 + 1} min more (teds-provision lock)"
+    return "" if left is None else f", unlocked for {left // 60 + 1} more min (to lock it: teds-provision lock)"
 
 
 def _require_same(station: Station, name: str | None, keystore: str | None) -> None:
@@ -86,8 +90,8 @@ def _require_same(station: Station, name: str | None, keystore: str | None) -> N
     for what, asked, has in (("name", name, station.name), ("keystore", keystore, station.identity.keystore)):
         if asked is not None and asked != has:
             raise UsageFailure(
-                f"There is a station in {station.home} already, its {what} is {has!r}: nothing was changed.",
-                hint=f"Leave --{what} out to see it, or choose another --home.",
+                f"{station.home} already holds a station whose {what} is {has!r}. Nothing was changed.",
+                hint=f"Omit --{what} to show it, or choose another --home.",
             )
 
 
@@ -108,9 +112,9 @@ def _request(app: App, name: str | None, keystore: str | None, path: Path) -> No
     }
     app.emit(
         {**told, "ca": None},
-        f"Station {asked.name} asks for a certificate in {path}.\n"
-        f"For comparison by voice:\n  {handover.trust.spoken(digits)}\n"
-        f"Where the CA key is: teds-provision trust ca sign {path.name} --output {path.stem}.cert",
+        f"Certificate request of station {asked.name}: {path}.\n"
+        f"Compare by voice:\n  {handover.trust.spoken(digits)}\n"
+        f"On the station with the CA key: teds-provision trust ca sign {path.name} --output {path.stem}.cert",
     )
 
 
@@ -127,6 +131,6 @@ def _is_request_of(path: Path, point: bytes) -> bool:
 def _adopt(app: App, path: Path, yes: bool) -> None:
     certificate = handover.trust.read_certificate(read_limited(path, handover.trust.MAX_OCTETS, "certificate"))
     digits = protocol.keys.fingerprint(certificate.ca)
-    app.note(f"The CA of this certificate, for comparison by voice:\n  {handover.trust.spoken(digits)}")
+    app.note(f"The CA that issued this certificate; compare by voice:\n  {handover.trust.spoken(digits)}")
     app.confirm("Trust this CA as the owner of this station's nodes?", yes=yes)
     handover.trust.adopt_certificate(app.home, certificate, ask=app.ask_secret).close()

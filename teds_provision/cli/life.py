@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 @command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")
 @click.argument("uuid")
-@click.option("--why", metavar="TEXT", help="Told to everyone who meets the node; goes into the log.")
-@click.option("--lift", is_flag=True, help="Take the ban back here, whoever made it.")
+@click.option("--why", metavar="TEXT", help="Reason, shown to everyone who meets the node, and logged.")
+@click.option("--lift", is_flag=True, help="Lift the ban on this station, whoever issued it.")
 @yes_option
 @dry_run_option
 @pass_app
 def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run: bool) -> None:
-    """Ban a node: off the whitelist, its keys deleted here, and a signed statement in every bundle from now on.
+    """Ban a node: remove it from the whitelist, delete its keys, and add a signed statement to every future bundle.
 
-    Stations that trust this one and know the node honour it when they import. --lift takes a ban back at this station,
-    also one that another station made; deleted keys do not come back.
+    Stations that trust this one and know the node honor it when they import. --lift lifts a ban on this station, even
+    one issued by another station; deleted keys do not come back.
     """
     if lift == (why is not None):
-        raise click.UsageError("Say --why TEXT to revoke, or --lift alone to take it back.")
+        raise click.UsageError("Use --why TEXT to revoke, or --lift alone to lift a ban.")
     station = app.station()
     octets = station.nodes.resolve(uuid)
     if lift:
@@ -48,7 +48,7 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
         return
     station.unlock()
     if station.policy.revocation(octets) is None:
-        app.confirm(f"Revoke node {octets.hex()}? Its keys are deleted here.", yes=yes)
+        app.confirm(f"Revoke node {octets.hex()}? Its keys will be deleted here.", yes=yes)
     with station.lock("revoke", app.note):
         done = handover.life.revoke(station, octets, why)
     told = {
@@ -58,28 +58,30 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
         "created": done.entry.created,
         "fresh": done.fresh,
     }
-    app.emit(told, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (known before)."))
+    app.emit(told, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (already known)."))
 
 
 def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) -> None:
     entry = station.policy.revocation(uuid)
     told: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why if entry else None, "fresh": entry is not None}
     if entry is None:
-        app.emit(told, f"Nothing to do: node {uuid.hex()} is not banned here.")
+        app.emit(told, f"Nothing to do: node {uuid.hex()} is not revoked here.")
         return
     if dry_run:
-        app.emit({**told, "plan": True}, f"Plan: lift the ban of {uuid.hex()}: {entry.why}")
+        app.emit({**told, "plan": True}, f"Plan: lift the ban on {uuid.hex()}: {entry.why}")
         return
     station.unlock()
-    app.confirm(f"Lift the ban of node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
+    app.confirm(f"Lift the ban on node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
     with station.lock("revoke --lift", app.note):
         handover.deny.lift(station, uuid)
-    app.emit(told, f"The ban of node {uuid.hex()} is lifted here; whitelist it and agree on a key to use it.")
+    app.emit(told, f"The ban on node {uuid.hex()} is lifted here. To use it, whitelist it and agree on a key.")
 
 
 @command("teds-provision decommission 8d4d --yes --via can --can udp_multicast:239.74.163.2")
 @click.argument("uuid")
-@click.option("--force", is_flag=True, help="Take it out of service even where it does not answer: unconfirmed.")
+@click.option(
+    "--force", is_flag=True, help="Take it out of service even if it does not answer (recorded as unconfirmed)."
+)
 @yes_option
 @dry_run_option
 @link_options
@@ -87,7 +89,7 @@ def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) 
 def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Reset a node in a session, keep its signed receipt, and take it out of service.
 
-    One that does not answer is recorded as unconfirmed with --force; its keys stay, and the same command tries again.
+    With --force, a node that does not answer is recorded as unconfirmed; its keys remain, so you can run this again.
     """
     station = app.station()
     octets = station.nodes.resolve(uuid)
@@ -97,13 +99,17 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
         return
     station.unlock(octets)
     if handover.life.is_finished(station, octets):
-        app.emit(_result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is out of service.")
+        app.emit(
+            _result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is already out of service."
+        )
         return
-    app.confirm(f"Take node {octets.hex()} out of service? Its key is erased, there and here.", yes=yes)
+    app.confirm(
+        f"Take node {octets.hex()} out of service? Its key will be erased on the node and on this station.", yes=yes
+    )
     with station.lock("decommission", app.note):
         receipt = _reset(app, station, octets, links, force=force)
         handover.life.retire(station, octets, receipt)
-    state = "is out of service; it signed that it is in factory state" if receipt else "is out of service, unconfirmed"
+    state = "is out of service and signed that it is in factory state" if receipt else "is out of service, unconfirmed"
     app.emit(_result(octets, receipt) | {"fresh": True}, f"Node {octets.hex()} {state}.")
 
 
@@ -124,10 +130,10 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
             return steps.reset.reset_node(station, node, steps.identify.identify(station, node))
     except (LinkFailure, PolicyRefused) as error:
         if not force and not app.interactive:
-            error.hint = "Bring it near, or add --force to record it as unconfirmed."
+            error.hint = "Bring the node within reach, or add --force to record it as unconfirmed."
             raise
-        app.note(f"The node cannot be reset: {error.message}")
-        app.confirm("Take it out of service all the same, unconfirmed?", yes=force)
+        app.note(f"Cannot reset the node: {error.message}")
+        app.confirm("Take it out of service anyway, unconfirmed?", yes=force)
         return None
 
 
@@ -137,7 +143,9 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
 )
 @click.argument("old")
 @click.argument("new")
-@click.option("--copy-calibration", is_flag=True, help="Build OLD's calibration into NEW: only for the same sensor.")
+@click.option(
+    "--copy-calibration", is_flag=True, help="Copy OLD's calibration to NEW; only if the sensor itself moves."
+)
 @yes_option
 @dry_run_option
 @link_options
@@ -145,10 +153,10 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
 def replace(
     ctx: click.Context, old: str, new: str, copy_calibration: bool, yes: bool, dry_run: bool, links: LinkSettings
 ) -> None:
-    """Put the whitelisted spare NEW in the place of OLD: its name, groups and profile.
+    """Replace OLD with the whitelisted spare NEW, which takes over its name, groups and profile.
 
-    A calibration belongs to one sensor and is not copied unless told. With link options OLD is reset when it can be
-    reached, else it goes out of service unconfirmed.
+    A calibration belongs to one sensor, so it is copied only on request. If you name a link, OLD is reset when it can
+    be reached; otherwise it goes out of service unconfirmed.
     """
     app = ctx.find_object(App)
     assert app is not None
@@ -162,7 +170,7 @@ def replace(
             app.emit({**told, "plan": True}, f"Plan: {text}.")
             return
         if plan.done:
-            app.emit({**told, "fresh": False}, "Nothing to do: it has taken over before.")
+            app.emit({**told, "fresh": False}, "Nothing to do: it has already taken over.")
             return
         app.confirm(f"{text}?", yes=yes)
         receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
@@ -170,7 +178,7 @@ def replace(
     for warning in warnings:
         app.warn(warning)
     confirmed = receipt is not None
-    next_step = f"Then: teds-provision provision (or sign and write) for {spare.hex()}."
+    next_step = f"Next, run provision (or sign and write) for {spare.hex()}."
     app.emit({**told, "confirmed": confirmed, "fresh": True, "warnings": list(warnings)}, f"{text}.\n{next_step}")
 
 
@@ -187,4 +195,4 @@ def _takeover(plan: TakeOver) -> tuple[dict[str, Any], str]:
     }
     given = [f"{what} {value}" for what, value in (("name", taken.name), ("profile", taken.profile)) if value]
     text = f"{plan.new.uuid.hex()} takes over from {plan.old.uuid.hex()}"
-    return told, f"{text}: {', '.join(given) or 'without name and profile'}"
+    return told, f"{text}: {', '.join(given) or 'no name or profile'}"

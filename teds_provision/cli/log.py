@@ -30,12 +30,12 @@ _POLL_SECONDS = 0.3
 
 @command("teds-provision log --last 20", "teds-provision log --today --failed", "teds-provision log --follow")
 @click.argument("uuid", required=False)
-@click.option("--follow", "-f", is_flag=True, help="Go on: one line per entry as it comes (with --json one object).")
-@click.option("--last", "-n", type=WholeNumber(min=0), metavar="N", help="Only the last N entries.")
-@click.option("--today", is_flag=True, help="Only entries of today.")
-@click.option("--since", metavar="TIME", help="Only entries since: ISO 8601, today, or 2h, 3d.")
-@click.option("--act", metavar="A", help="Only entries of this act: agree, write, verify, whitelist …")
-@click.option("--failed", is_flag=True, help="Only what was refused or failed.")
+@click.option("--follow", "-f", is_flag=True, help="Follow the log: one line per new entry (one object with --json).")
+@click.option("--last", "-n", type=WholeNumber(min=0), metavar="N", help="Show only the last N entries.")
+@click.option("--today", is_flag=True, help="Show only today's entries.")
+@click.option("--since", metavar="TIME", help="Show only entries since: ISO 8601, today, or 2h, 3d.")
+@click.option("--act", metavar="A", help="Show only this action: agree, write, verify, whitelist …")
+@click.option("--failed", is_flag=True, help="Show only what was refused or failed.")
 @pass_app
 def log(
     app: App,
@@ -47,13 +47,13 @@ def log(
     act: str | None,
     failed: bool,
 ) -> None:
-    """Show who did what to which node, and whether the hash chain of the log holds.
+    """Show who did what to which node, and check the hash chain of the log.
 
-    The chain is checked from the first entry that is shown to the end, the whole of it without --last, --today and
-    --since. Exits 7 where an entry was changed, removed or added by hand.
+    The chain is checked from the first entry shown to the end; in full without --last, --today and --since. Exits 7
+    if an entry was changed, removed or added by hand.
     """
     if today and since is not None:
-        raise UsageFailure("--today and --since are the same thing said twice.", hint="Give one of them.")
+        raise UsageFailure("--today and --since cannot be combined.", hint="Use one of them.")
     station = app.station()
     audit_log = station.audit_log
     choice = store.Choice(station.nodes.resolve(uuid) if uuid else None, act, failed)
@@ -137,8 +137,8 @@ def _follow(app: App, station: Station, choice: Choice, verdict: AuditVerdict, a
 def _require_intact(verdict: AuditVerdict) -> None:
     if not verdict.intact:
         raise StoreFailure(
-            f"The audit log does not hold: {verdict.why}.",
-            hint=f"What stands before entry {verdict.first_bad} holds. Keep a copy, and find out who wrote the file.",
+            f"The audit log is not intact: {verdict.why}.",
+            hint=f"Entries before {verdict.first_bad} are intact. Keep a copy, and find out who changed the file.",
         )
 
 

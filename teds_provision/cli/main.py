@@ -131,28 +131,30 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
         "auto_envvar_prefix": ENVIRONMENT_PREFIX,
         "max_content_width": _WIDEST,
     },
-    epilog="A node is named by its UUID, by four or more of its first digits, or by its name. Every option can also "
-    "stand in TEDS_PROVISION_<NAME> or in config.toml in the home.\n\nStart with: teds-provision demo",
+    epilog="Name a node by its UUID, its first four or more digits, or its name. Every option can also be "
+    "set in TEDS_PROVISION_<NAME> or in config.toml in the home directory.\n\nTo try it out: teds-provision demo",
 )
 @click.option(
     "--home",
     type=_Folder(file_okay=False),
     is_eager=True,
     callback=_read_config,
-    help="Folder of the store (default: the platform's user data folder).",
+    help="Directory of the store (default: the platform's user data directory).",
 )
-@click.option("--json", "as_json", envvar=f"{ENVIRONMENT_PREFIX}_JSON", is_flag=True, help="One JSON object on stdout.")
-@click.option("--verbose", "-v", count=True, help="Log on stderr what is done; twice: every command with its size.")
-@click.option("--quiet", "-q", is_flag=True, help="Say nothing but results and errors.")
+@click.option(
+    "--json", "as_json", envvar=f"{ENVIRONMENT_PREFIX}_JSON", is_flag=True, help="Print one JSON object to stdout."
+)
+@click.option("--verbose", "-v", count=True, help="Log progress to stderr; twice: every command and its size.")
+@click.option("--quiet", "-q", is_flag=True, help="Print only results and errors.")
 @click.option("--debug", is_flag=True, help="Show tracebacks and library logs.")
-@click.option("--no-input", is_flag=True, help="Never prompt; fail where a prompt would be needed.")
+@click.option("--no-input", is_flag=True, help="Never prompt; fail if input would be needed.")
 @click.option("--passphrase-fd", type=int, metavar="N", help="Read the passphrase or PIN from this file descriptor.")
 @click.version_option(__version__, prog_name="teds-provision", message="%(prog)s %(version)s")
 @click.pass_context
 def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
-    """Prove which transducer it is, give it a key, write its datasheet.
+    """Identify smart transducers, key them, and write their IEEE 1451.0 datasheets (TEDS).
 
-    Identify, key, sign and write the IEEE 1451.0 TEDS of smart transducers over NFC and CAN.
+    Works over NFC, CAN and Bluetooth; then measures, publishes and drives actuators.
     """
     ctx.obj = App(as_json=as_json, **options)
     broken = ctx.meta.get(_BROKEN)
@@ -173,7 +175,7 @@ def run(arguments: list[str]) -> int:
     except click.exceptions.Exit as finished:
         return finished.exit_code
     except (click.Abort, KeyboardInterrupt):
-        return _fail(arguments, INTERRUPTED, "interrupted", "Interrupted: the same command carries on from here.", "")
+        return _fail(arguments, INTERRUPTED, "interrupted", "Interrupted. Run the same command again to continue.", "")
     except click.ClickException as error:
         return _misused(arguments, error)
     except TedsProvisionError as error:
@@ -217,12 +219,12 @@ def _untold(arguments: list[str], error: OSError) -> int:
     if error.errno in _NO_NAMES and error.filename is not None:
         name = str(error.filename)
         name = name if len(name) <= 100 else f"{name[:64]}…"
-        told = f"{name!r} is no name of a file: {error.strerror}."
+        told = f"{name!r} is not a valid file name: {error.strerror}."
         return _fail(arguments, NotFound.exit_code, NotFound.code, told, "")
     if error.errno not in _FULL:
         return _bug(arguments, error)
     nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
-    told = f"The result cannot be written to stdout: {error.strerror}."
+    told = f"Cannot write the result to stdout: {error.strerror}."
     if _wants(arguments, "--json"):
         return _fail(arguments, StoreFailure.exit_code, StoreFailure.code, told, "")
     _say(told)
@@ -231,7 +233,7 @@ def _untold(arguments: list[str], error: OSError) -> int:
 
 def _bug(arguments: list[str], error: Exception) -> int:
     _traceback(arguments)
-    hint = "This is a bug: please report it with what --debug prints."
+    hint = "This is a bug. Please report it with the output of --debug."
     return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
 
 

@@ -45,24 +45,32 @@ KINDS = ("periodic", "event", "free")
     "teds-provision measure recover run.mcap",
 )
 @click.argument("what", nargs=-1, required=True, metavar="NAME|UUID …")
-@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Samples a second; else the datasheet's.")
-@click.option("--duration", type=Number(min=0.1), metavar="S", help="Seconds; without it until Ctrl-C.")
-@click.option("--channel", "channels", type=Channel(), multiple=True, metavar="N", help="This channel alone.")
-@click.option("--kind", type=click.Choice(KINDS), help="How the node samples; without it as each channel is.")
-@click.option("--trigger", is_flag=True, help="Begin on all nodes at one moment, by one frame.")
-@click.option("--test-pattern", is_flag=True, help="Stream the test pattern and check it: no measurement.")
-@click.option("--unsigned", is_flag=True, help="Also raw values of nodes whose datasheet nobody has signed, marked.")
-@click.option("--to", "files", multiple=True, metavar="FILE", help="Record: .csv, .txt, .mcap, .jsonl.")
-@click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="recover: the new file.")
+@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Samples per second (default: from the datasheet).")
+@click.option("--duration", type=Number(min=0.1), metavar="S", help="Seconds (default: until Ctrl-C).")
+@click.option(
+    "--channel", "channels", type=Channel(), multiple=True, metavar="N", help="Only this channel; repeatable."
+)
+@click.option("--kind", type=click.Choice(KINDS), help="How the node samples (default: each channel's own kind).")
+@click.option("--trigger", is_flag=True, help="Start all nodes at the same moment, with one frame.")
+@click.option("--test-pattern", is_flag=True, help="Stream and check the test pattern instead of measuring.")
+@click.option(
+    "--unsigned", is_flag=True, help="Also record raw values of nodes with an unsigned datasheet, marked as such."
+)
+@click.option(
+    "--to", "files", multiple=True, metavar="FILE", help="Record to this file: .csv, .txt, .mcap, .jsonl; repeatable."
+)
+@click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="With recover: the new file.")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
-@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Take set points from ROS topics.")
+@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
-              help="An actuator without set points for so long is safe.")  # fmt: skip
-@click.option("--require", type=FileToRead(), metavar="FILE", help="What the task needs.")
+              help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
+@click.option(
+    "--require", type=FileToRead(), metavar="FILE", help="Requirements of the task, checked against the datasheets."
+)
 @click.option("--scalar-rate", type=Number(0, 1000), default=10.0, show_default=True, metavar="HZ",
-              help="Rate of topics of one value.")  # fmt: skip
+              help="Rate of single-value topics.")  # fmt: skip
 @link_options
 @pass_app
 def measure(
@@ -77,19 +85,19 @@ def measure(
     output: Path | None,
     **wished: Any,
 ) -> None:
-    """Measure a group or nodes: session, datasheet verified, claim, stream; ends by Ctrl-C or --duration.
+    """Measure a group or nodes until Ctrl-C or --duration: open sessions, verify datasheets, claim, stream.
 
-    `measure recover FILE` makes a recording whole that was cut. Where it is damaged inside it stays as it is, and all
-    but the damaged chunks goes to FILE.recovered, or to --output (exit 8).
+    `measure recover FILE` repairs a recording that was cut off. If FILE is damaged inside, it stays unchanged, and
+    everything but the damaged chunks is written to FILE.recovered or --output (exit 8).
     """
     if what[0] == "recover":
         _recover(app, what[1:], output)
         return
     if click.get_current_context().get_parameter_source("output") is ParameterSource.COMMANDLINE:
-        raise UsageFailure("--output is for `measure recover`.", hint="Record with --to FILE.")
+        raise UsageFailure("--output only works with `measure recover`.", hint="To record, use --to FILE.")
     links = over_the_bus(links, streams=True)
     if mqtt is not None and not mqtt.startswith(("mqtt://", "mqtts://")):
-        raise UsageFailure(f"--mqtt {mqtt!r} names no broker.", hint="Write it like mqtt://HOST or mqtts://USER@HOST.")
+        raise UsageFailure(f"--mqtt {mqtt!r} is not a broker URL.", hint="Use mqtt://HOST or mqtts://USER@HOST.")
     _require_streams(links, trigger=wished["trigger"])
     station = app.station()
     group, uuids = _who(station, what)
@@ -106,10 +114,11 @@ def measure(
 def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
     if not LINKS[links.via].capabilities.streams:
         raise UsageFailure(
-            "Streams need a bus or the air.", hint="Name it with --can or --ble; over NFC: teds-provision sample UUID"
+            "Streaming needs CAN or Bluetooth.",
+            hint="Add --can or --ble. For one reading over NFC: teds-provision sample UUID",
         )
     if trigger and links.via == "ble":
-        raise UsageFailure("A trigger is a frame on a CAN bus.", hint="Over the air leave --trigger out.")
+        raise UsageFailure("--trigger needs a CAN bus.", hint="Omit --trigger over Bluetooth.")
 
 
 def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Mapping[str, Any]) -> Measurement:
@@ -146,7 +155,7 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
     """The group's name ("" where nodes are named) and the UUIDs."""
     if len(what) == 1 and (group := station.groups.find(what[0])) is not None:
         if not group.uuids:
-            raise UsageFailure(f"Group {group.name!r} has no node.", hint=f"Add one: group add {group.name} UUID")
+            raise UsageFailure(f"Group {group.name!r} has no nodes.", hint=f"Add one: group add {group.name} UUID")
         return group.name, list(group.uuids)
     return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
 
@@ -159,9 +168,13 @@ def _carried_on(app: App, station: Station, asked: Measurement) -> Measurement:
         return asked
     rate = f"{kept.rate:g} Hz" if kept.rate else "the datasheets' rates"
     to = f" to {', '.join(kept.sinks)}" if kept.sinks else ""
-    more = {"test pattern": kept.test_pattern, "unsigned nodes too": kept.unsigned, "with --require": kept.require}
+    more = {
+        "test pattern": kept.test_pattern,
+        "including unsigned nodes": kept.unsigned,
+        "with --require": kept.require,
+    }
     beside = "".join(f", {name}" for name, asked_for in more.items() if asked_for)
-    app.note(f"Carrying on what was begun at {kept.created}: {rate}{to}{beside}.")
+    app.note(f"Continuing the measurement started at {kept.created}: {rate}{to}{beside}.")
     return kept
 
 
@@ -217,7 +230,7 @@ def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
 
 def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
     if len(files) != 1:
-        raise UsageFailure("Name one recording.", hint="teds-provision measure recover FILE.mcap")
+        raise UsageFailure("Name exactly one recording.", hint="teds-provision measure recover FILE.mcap")
     done = measure_room.sinks.mcap.recover.recover(Path(files[0]), output)
     until = measure_room.sinks.lines.iso(done.until) if done.until is not None else None
     result: dict[str, Any] = {
@@ -226,10 +239,10 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
         "cut": done.cut,
         "damaged": [asdict(one) for one in done.damaged],
     }
-    told = "is whole" if done.was_whole else f"made whole ({done.cut} octets of a torn end cut off)"
+    told = "is intact" if done.was_whole else f"repaired ({done.cut} octets of a torn end cut off)"
     if done.output is not None:
         result["output"] = str(done.output)
-        told = f"is not changed; what is whole of it is in {done.output}"
+        told = f"is unchanged; its intact part is in {done.output}"
     error = _damage(files[0], done) if done.damaged else None
     text = f"{files[0]} {told}: {done.messages} messages" + (f" until {until}" if until else "")
     app.conclude(result, text, error)
@@ -240,5 +253,5 @@ def _damage(file: str, done: Recovered) -> BadData:
     more = len(done.damaged) - len(named)
     return BadData(
         f"{file} is damaged inside: {', '.join(named)}{f' and {more} more' if more else ''}.",
-        hint=f"The file is as it was; everything else is in {done.output}. Look after the disk.",
+        hint=f"The file is unchanged; everything else is in {done.output}. Check the disk.",
     )

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     epilog=examples("teds-provision names list", "teds-provision names set 8d4d 1 crane/slew_angle"),
 )
 def names() -> None:
-    """Topics of channels: /STATION/NODE/CHANNEL, unless somebody chose others. Frozen while a node is measured."""
+    """Manage channel topics: /STATION/NODE/CHANNEL unless you choose others. Fixed while a node is measured."""
 
 
 @names.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision names list"))
 @pass_app
 def list_names(app: App) -> None:
-    """List the topic of every channel whose datasheet is known here."""
+    """List the topic of every channel with a known datasheet."""
     _tell(app, app.station())
 
 
@@ -46,15 +46,15 @@ def list_names(app: App) -> None:
 def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> None:
     """Publish a channel under NAME.
 
-    Channel 0 is the node's, or the station's, part of its topics.
+    Channel 0 stands for the node's or station's own part of its topics.
     """
     station = app.station()
     uuid = _who(station, node)
     chosen = name.strip("/")
     if not measure.sinks.names.is_topic(chosen) or (not channel and "/" in chosen):
         raise UsageFailure(
-            f"{name!r} cannot be the name of a topic.",
-            hint="Use letters, digits and single _, beginning with a letter; / between parts of a channel's.",
+            f"{name!r} is not a valid topic name.",
+            hint="Use letters, digits and single _, starting with a letter; / separates the parts of a channel's name.",
         )
     _require_channel(station, uuid, channel)
     if uuid != STATION:
@@ -72,9 +72,9 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
 @dry_run_option
 @pass_app
 def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
-    """Publish a channel under the name made for it.
+    """Publish a channel under its default name.
 
-    Channel 0 is the node's, or the station's, part of its topics.
+    Channel 0 stands for the node's or station's own part of its topics.
     """
     station = app.station()
     uuid = _who(station, node)
@@ -91,7 +91,7 @@ def _require_channel(station: Station, uuid: bytes, channel: int) -> None:
     known = [number for key, number, _ in _channels(station) if key == uuid]
     if channel and (uuid == STATION or (known and channel not in known)):
         has = ", ".join(map(str, known)) or "none"
-        raise NotFound(f"There is no channel {channel} of {uuid.hex()}.", hint=f"Its datasheet has {has}.")
+        raise NotFound(f"{uuid.hex()} has no channel {channel}.", hint=f"Channels in its datasheet: {has}.")
 
 
 def _change(app: App, station: Station, uuid: bytes, channel: int, name: str | None) -> None:
@@ -129,7 +129,7 @@ def _tell(app: App, station: Station) -> None:
         for uuid, number, _ in channels
     ]
     lines = [f"{one['uuid']} {one['channel']}: {one['topic']}{' (chosen)' if one['chosen'] else ''}" for one in told]
-    app.emit({"station": topics.station, "names": told}, "\n".join(lines) or "No datasheet is known here yet.")
+    app.emit({"station": topics.station, "names": told}, "\n".join(lines) or "No datasheets are known yet.")
 
 
 for one in (set_name, reset_name):

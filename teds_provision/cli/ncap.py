@@ -47,29 +47,40 @@ _FILE = FileToRead(exists=True)
     "teds-provision ncap run --can socketcan:can0 --record /var/lib/measured --mqtt mqtt://broker",
     name="run",
 )
-@click.option("--detection", type=click.Choice(["transparent", "whitelist"]), help="Which nodes are taken up.")
-@click.option("--adopt", is_flag=True, help="In transparent mode, agree with factory nodes on a wired bus.")
-@click.option("--http", metavar="HOST:PORT", help="Serve the page and the API there, e.g. 127.0.0.1:8351.")
-@click.option("--http-allow", "allow", multiple=True, metavar="HOST", help="Another name by which browsers may call.")
+@click.option("--detection", type=click.Choice(["transparent", "whitelist"]), help="Which nodes to accept.")
+@click.option("--adopt", is_flag=True, help="In transparent mode, key factory nodes on a wired bus.")
+@click.option("--http", metavar="HOST:PORT", help="Serve the page and the API on this address, e.g. 127.0.0.1:8351.")
+@click.option(
+    "--http-allow",
+    "allow",
+    multiple=True,
+    metavar="HOST",
+    help="Additional host name that browsers may use; repeatable.",
+)
 @click.option("--tls-cert", "certificate", type=_FILE, metavar="FILE", help="Certificate chain, PEM.")
-@click.option("--tls-key", "key", type=_FILE, metavar="FILE", help="Its private key, PEM.")
-@click.option("--record", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Record everything.")
+@click.option("--tls-key", "key", type=_FILE, metavar="FILE", help="Private key of the certificate, PEM.")
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Record every measurement in this directory.",
+)
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST.")
-@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Take set points from ROS topics.")
+@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
-              help="An actuator without set points for so long is safe.")  # fmt: skip
+              help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
 @click.option("--metrics", is_flag=True, help="Serve /metrics for Prometheus.")
-@click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read only.")
-@click.option("--nfc", multiple=True, metavar="PATH", help="A reader: auto, usb, udp:localhost:54321; several times.")
-@click.option("--can", multiple=True, metavar="INTERFACE:CHANNEL", help="A bus: socketcan:can0; several times.")
-@click.option("--ble", multiple=True, metavar="ADAPTER", help="Bluetooth: auto, hci0; several times.")
+@click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read-only.")
+@click.option("--nfc", multiple=True, metavar="PATH", help="Reader: auto, usb, udp:localhost:54321; repeatable.")
+@click.option("--can", multiple=True, metavar="INTERFACE:CHANNEL", help="Bus: socketcan:can0; repeatable.")
+@click.option("--ble", multiple=True, metavar="ADAPTER", help="Bluetooth: auto, hci0; repeatable.")
 @click.option(
     "--trace",
     metavar="FILE",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Write down every frame of every link; it grows without bound. See: trace show.",
+    help="Record every frame of every link; the file grows without limit. See: trace show.",
 )
 @pass_app
 def run(
@@ -87,7 +98,7 @@ def run(
 ) -> None:
     """Run the base station until SIGTERM or Ctrl-C.
 
-    One line is printed when it is ready, then a line for each event.
+    Prints one line when it is ready, then one line per event.
     """
     _require_extra()
     places = [f"{link}:{one}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for one in named]
@@ -175,7 +186,7 @@ class Lines:
 def _sentence(event: dict[str, Any]) -> str:
     if event.get("ready"):
         where = event["url"] or f"the Unix socket {event['api'].removeprefix('unix:')}"
-        return f"Ready on {where}. The page with its token: teds-provision ncap open"
+        return f"Ready on {where}. To open the page: teds-provision ncap open"
     facts = {key: value for key, value in event.items() if key not in ("event", "time", "state") and value}
     told = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
     return f"{event['event']} {event.get('state', '')}: {told}"
@@ -194,20 +205,20 @@ def _text(value: Any) -> str:
     ),
 )
 def ncap() -> None:
-    """The base station as a service: finds nodes, measures what it shall, serves a page and an API."""
+    """Run the base station as a service that finds nodes, measures them, and serves a page and an API."""
 
 
 @command("teds-provision ncap status", name="status")
 @pass_app
 def status(app: App) -> None:
-    """Show what the running base station does."""
+    """Show what the running base station is doing."""
     with client.connect(home=app.home) as station:
         found = {**station.status(), "nodes": station.nodes()}
     app.emit(found, lambda console: _status(console, found))
 
 
 def _status(console: Console, found: dict[str, Any]) -> None:
-    served = found["url"] or "no page; start it with --http"
+    served = found["url"] or "no page (start it with --http)"
     console.print(f"{found['station']['name']}: {found['detection']} mode, {served}", markup=False)
     for link in found["links"]:
         console.print(_link(link), markup=False)
@@ -225,8 +236,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
 
 def _verdict(node: dict[str, Any]) -> str:
     if node["verdict"] is None:
-        return "not looked at yet"
-    kept = " (all but its Security TEDS as last read)" if node["verdict"]["from"] == "kept" else ""
+        return "not verified yet"
+    kept = " (all but the Security TEDS as last read)" if node["verdict"]["from"] == "kept" else ""
     return f"{node['verdict']['verdict']}{kept}"
 
 
@@ -240,19 +251,19 @@ def _link(link: dict[str, Any]) -> str:
 @click.argument("mode", type=click.Choice(["transparent", "whitelist"]))
 @pass_app
 def detection(app: App, mode: Mode) -> None:
-    """Set which nodes are taken up: all, or those on the whitelist."""
+    """Set which nodes to accept: all, or those on the whitelist."""
     with client.connect(home=app.home) as station:
         now = station.set_detection(mode)
     app.emit({"detection": now}, f"Detection: {now}.")
 
 
 @command("teds-provision ncap open", "teds-provision ncap open --read-only", name="open")
-@click.option("--read-only", is_flag=True, help="For somebody who shall see and change nothing.")
+@click.option("--read-only", is_flag=True, help="For someone who may look but change nothing.")
 @pass_app
 def open_page(app: App, *, read_only: bool) -> None:
-    """Print the page's address, with a token that works once.
+    """Print the page's address with a one-time token.
 
-    It is good for five minutes.
+    The token is valid for five minutes.
     """
     with client.connect(home=app.home) as station:
         url = station.login_url(read_only=read_only)
@@ -264,15 +275,15 @@ def open_page(app: App, *, read_only: bool) -> None:
     epilog=examples("teds-provision ncap token add plotter --read-only", "teds-provision ncap token list"),
 )
 def token() -> None:
-    """Tokens for scripts: add, list, remove. Only their digests are kept."""
+    """Manage API tokens for scripts. Only their digests are stored."""
 
 
 @command("teds-provision ncap token add plotter --read-only", name="add")
 @click.argument("name")
-@click.option("--read-only", is_flag=True, help="It may read and change nothing.")
+@click.option("--read-only", is_flag=True, help="The token may read but change nothing.")
 @pass_app
 def add(app: App, name: str, *, read_only: bool) -> None:
-    """Make a token and print it, once.
+    """Create a token and print it; it is not shown again.
 
     Send it as `Authorization: Bearer TOKEN`.
     """
@@ -284,7 +295,7 @@ def add(app: App, name: str, *, read_only: bool) -> None:
 @command("teds-provision ncap token list", name="list")
 @pass_app
 def list_tokens(app: App) -> None:
-    """List every token that is good now, those of browsers too."""
+    """List every valid token, including those of browsers."""
     app.station()
     found = [
         {
@@ -297,16 +308,18 @@ def list_tokens(app: App) -> None:
         for one in tokens.Tokens(app.home).all()
     ]
     lines = [f"{one['name']}  {one['kind']}{'  read-only' if one['read_only'] else ''}" for one in found]
-    app.emit({"tokens": found}, "\n".join(lines) or "There is no token. Make one: teds-provision ncap token add NAME")
+    app.emit(
+        {"tokens": found}, "\n".join(lines) or "There are no tokens. To create one: teds-provision ncap token add NAME"
+    )
 
 
 @command("teds-provision ncap token remove plotter", name="remove")
 @click.argument("name")
 @pass_app
 def remove(app: App, name: str) -> None:
-    """Take a token away.
+    """Revoke a token.
 
-    Who uses it is refused from now on; the name `browser` logs every browser out.
+    Its user is refused from now on; the name `browser` logs out every browser.
     """
     app.station()
     gone = tokens.Tokens(app.home).remove(name)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     ),
 )
 def node() -> None:
-    """A virtual transducer: the whole node half of the profile, its flash in a file."""
+    """Create and run virtual transducers: the complete node side of the profile, with flash in a file."""
 
 
 _NAME_OCTETS = 120
@@ -56,7 +56,7 @@ def _uuid(_ctx: click.Context, _parameter: click.Parameter, text: str | None) ->
     except ValueError:
         octets = b""
     if len(octets) != 10:
-        raise click.BadParameter("a UUID is 20 hex digits.")
+        raise click.BadParameter("a UUID has 20 hex digits.")
     return octets
 
 
@@ -64,7 +64,7 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
     try:
         octets = len(text.encode())
     except UnicodeEncodeError:
-        raise click.BadParameter("it is not valid text in this terminal's encoding.") from None
+        raise click.BadParameter("the name is not valid text in this terminal's encoding.") from None
     if octets > _NAME_OCTETS or not (text.isprintable() or not text):
         raise click.BadParameter(f"a name has at most {_NAME_OCTETS} octets of printable text; this one has {octets}.")
     return text
@@ -76,22 +76,22 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
     "teds-provision node create bench/copy --teds angle.json",
 )
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--uuid", callback=_uuid, metavar="HEX", help="Its UUID, 20 hex digits (default: the file's, or random).")
-@click.option("--name", default="", callback=_name, help="What its maker calls it, at most 120 octets.")
+@click.option("--uuid", callback=_uuid, metavar="HEX", help="UUID, 20 hex digits (default: from the file, or random).")
+@click.option("--name", default="", callback=_name, help="Manufacturer's name for it, at most 120 octets.")
 @click.option(
     "--teds",
     type=FileToRead(),
     metavar="FILE",
-    help="Its datasheet and hardware: an image, XML, JSON, hex or binary file.",
+    help="File with its datasheet and hardware: image, XML, JSON, hex or binary.",
 )
-@click.option("--profile", metavar="P", help="Its datasheet and hardware: those of a transducer type.")
+@click.option("--profile", metavar="P", help="Transducer type that defines its datasheet and hardware.")
 @click.option(
     "--max-message",
     type=WholeNumber(512, 4094),
     default=2048,
     show_default=True,
     metavar="OCTETS",
-    help="Length of its longest frame.",
+    help="Maximum frame length.",
 )
 @pass_app
 def create(
@@ -103,12 +103,14 @@ def create(
     profile: str | None,
     max_message: int,
 ) -> None:
-    """Make a virtual node in DIR, in factory state, with its own key.
+    """Create a virtual node in DIR, in factory state, with its own key.
 
-    With --teds or --profile the channels of that datasheet are its hardware; the TEDS lie on it unsigned.
+    With --teds or --profile, it has the channels of that datasheet and carries its TEDS unsigned.
     """
     if teds is not None and profile is not None:
-        raise UsageFailure("A node has one datasheet.", hint="Give --teds or --profile, not both.")
+        raise UsageFailure(
+            "--teds and --profile cannot be combined.", hint="A node has one datasheet: use one of them."
+        )
     made = node_room.described.create(
         folder,
         uuid=uuid,
@@ -150,7 +152,7 @@ def create(
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @pass_app
 def reset(app: App, folder: Path) -> None:
-    """Reset the node in DIR by hand (button held 5 s) while it is not running."""
+    """Reset the node in DIR by hand (button held for 5 s) while it is not running."""
     node = node_room.virtual.VirtualNode(folder, exclusive=True)
     node.reset_by_hand()
     uuid = node.tim.flash.uuid.hex()
@@ -168,10 +170,10 @@ _DEFAULT_SOURCE = "noise"
     short_help="Run the nodes in DIR … until SIGTERM or Ctrl-C.",
 )
 @click.argument("folders", metavar="DIR…", nargs=-1, required=True, type=click.Path(path_type=Path, file_okay=False))
-@click.option("--nfc", metavar="PATH", help="Lie on this simulated reader: udp:localhost:54321 (one node).")
+@click.option("--nfc", metavar="PATH", help="Simulated reader to place the node on: udp:localhost:54321 (one node).")
 @click.option("--tag", type=click.Choice(["4", "2"]), default="4", show_default=True, help="NFC Forum tag type.")
 @click.option(
-    "--can", metavar="INTERFACE:CHANNEL", help="Hang on this bus; without --nfc it counts as tapped in factory state."
+    "--can", metavar="INTERFACE:CHANNEL", help="Bus to connect to; without --nfc, a factory node counts as tapped."
 )
 @click.option(
     "--ble",
@@ -183,7 +185,7 @@ _DEFAULT_SOURCE = "noise"
     default=_DEFAULT_SOURCE,
     show_default=True,
     metavar="SOURCE",
-    help="Where values come from: noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH, exec:COMMAND.",
+    help="Source of the values: noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH, exec:COMMAND.",
 )
 @click.option("--crypto-delay", type=Number(min=0), default=0, metavar="MS", help="Milliseconds per point operation.")
 @click.option("--flash-delay", type=Number(min=0), default=0, metavar="MS", help="Milliseconds per flash commit.")
@@ -199,9 +201,9 @@ _DEFAULT_SOURCE = "noise"
     "--battery",
     type=Number(0, 100),
     metavar="PERCENT",
-    help="It has a battery, so full: a reader's field charges it (2 % a minute), else it empties (0.1 %).",
+    help="Battery level: a reader's field charges it (2 % a minute), otherwise it drains (0.1 %).",
 )
-@click.option("--pace", is_flag=True, help="Let every NFC frame last as long as at 106 kbit/s.")
+@click.option("--pace", is_flag=True, help="Make every NFC frame take as long as at 106 kbit/s.")
 @pass_app
 def run(
     app: App,
@@ -213,9 +215,9 @@ def run(
     battery: float | None,
     **links: Any,
 ) -> None:
-    """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 is their reset by hand.
+    """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 resets them by hand.
 
-    Prints one line when the links are up, then a line for what an actuator does.
+    Prints one line when the links are up, then one line per actuator change.
     """
     _check(len(folders), source, **links)
     delays = node_room.virtual.Delays(crypto_delay / 1000, flash_delay / 1000)
@@ -256,7 +258,7 @@ def _check(count: int, source: str, *, nfc: str | None, can: str | None, ble: st
     if not alone and node_room.sources.kind_of(source) in node_room.sources.ONE_NODE_ONLY:
         alone = f"--source {source}"
     if count > 1 and alone:
-        raise UsageFailure(f"{alone} is for one node.", hint="Run the others in processes of their own.")
+        raise UsageFailure(f"{alone} supports one node only.", hint="Run the others in separate processes.")
 
 
 def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:
@@ -264,7 +266,7 @@ def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) 
         uuid, hardware = file.load().uuid, file.hardware
         if not hardware and source != _DEFAULT_SOURCE:
             app.warn(
-                f"Node {uuid.hex()} has no channels, so --source is of no use: create it with --teds or --profile."
+                f"Node {uuid.hex()} has no channels, so --source has no effect: create it with --teds or --profile."
             )
         if not hardware and percent is None:
             return None

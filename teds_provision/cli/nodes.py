@@ -33,18 +33,18 @@ _GAP = "  "
 
 @command("teds-provision nodes", "teds-provision nodes finger --state provisioned", "teds-provision --json nodes 8d4d")
 @click.argument("text", required=False, metavar="[UUID|TEXT]")
-@click.option("--state", type=click.Choice(STATES), help="Only nodes in this state.")
-@click.option("--profile", metavar="P", help="Only nodes of this type.")
-@click.option("--group", metavar="G", help="Only nodes of this group.")
+@click.option("--state", type=click.Choice(STATES), help="Show only nodes in this state.")
+@click.option("--profile", metavar="P", help="Show only nodes of this type.")
+@click.option("--group", metavar="G", help="Show only nodes in this group.")
 @click.option(
     "--due",
     type=WholeNumber(min=0, max=36500),
     metavar="DAYS",
-    help="Only nodes with a calibration that ends within so many days, or has ended.",
+    help="Show only nodes whose calibration expires within DAYS, or has expired.",
 )
-@click.option("--since", metavar="TIME", help="Only nodes seen since: ISO 8601, today, or 2h, 3d.")
+@click.option("--since", metavar="TIME", help="Show only nodes seen since: ISO 8601, today, or 2h, 3d.")
 @click.option(
-    "--fits", metavar="EXPR", help='Judge datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
+    "--fits", metavar="EXPR", help='Check datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
 )
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), help="Default: table.")
 @pass_app
@@ -59,10 +59,10 @@ def nodes(
     fits: str | None,
     form: str | None,
 ) -> None:
-    """Show every node that this station has met, listed or been given, or all about one.
+    """List every node that this station has met, whitelisted or received, or show one in detail.
 
-    TEXT is any part of UUID, name or profile; a whole UUID or an exact name means that one node. Nothing is asked of
-    the nodes themselves.
+    TEXT matches any part of UUID, name or profile; a full UUID or an exact name shows that node. The nodes themselves
+    are not contacted.
     """
     station = app.station()
     day = (datetime.now(UTC) + timedelta(days=due)).strftime("%Y-%m-%d") if due is not None else None
@@ -87,8 +87,8 @@ def nodes(
 def _none(station: Station) -> None:
     """Say why the list is empty."""
     known = bool(search(station))
-    print("No node that is known fits that." if known else "No node is known yet.", end=" ")
-    print("All of them: teds-provision nodes" if known else "Tap one: teds-provision identify --add")
+    print("No known node matches." if known else "No nodes are known yet.", end=" ")
+    print("To list all: teds-provision nodes" if known else "To add one by tap: teds-provision identify --add")
 
 
 _FIELDS = (
@@ -180,15 +180,15 @@ def _verdict(node: dict[str, Any]) -> str:
         return node["verdict"] or "never verified"
     how = {
         "session": "read in a session",
-        "kept": "its Security TEDS read in a session, the rest kept since",
-        "plain": "read in no session",
+        "kept": "Security TEDS read in a session, the rest from the stored copy",
+        "plain": "read without a session",
     }
     return f"{node['verdict']} ({how[read['from']]} {local_time(read['at'])}, by {read['by']})"
 
 
 def _charge(charging: dict[str, Any] | None) -> str:
     """What the node last said of it; nobody vouches for that."""
-    return f"{shown(charging['text'])} (at {local_time(charging['at'])}, as it says)" if charging else ""
+    return f"{shown(charging['text'])} (reported by the node at {local_time(charging['at'])})" if charging else ""
 
 
 def _link_keys(node: dict[str, Any]) -> list[str]:
@@ -238,13 +238,13 @@ def _one(node: dict[str, Any]) -> None:
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE.svg|png",
-    help="Where it goes; the ending says which kind.",
+    help="Output file; the extension selects the format.",
 )
 @pass_app
 def label(app: App, uuid: str, output: Path) -> None:
-    """Write a label: a QR code with UUID and the whole fingerprint of the node's key, and the same as text.
+    """Write a label with the node's UUID and full key fingerprint, as QR code and text.
 
-    What a scanner reads of it is taken by whitelist add, and pins the key before the first tap.
+    Pass the scanned text to whitelist add to pin the key before the first tap.
     """
     station = app.station()
     made = label_of(station, station.nodes.resolve(uuid))

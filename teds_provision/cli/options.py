@@ -73,7 +73,7 @@ class WholeNumber(click.IntRange):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Read a whole number; raises BadParameter."""
         if isinstance(value, str) and not value.strip().lstrip("+-").isdecimal():
-            self.fail(f"{value!r} is no {self.means}.", param, ctx)
+            self.fail(f"{value!r} is not a {self.means}.", param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -104,7 +104,7 @@ class Channel(WholeNumber):
     """The number of a TransducerChannel, 1 to 255; says so where it is none."""
 
     name = "channel"
-    means = "number of a channel, 1 to 255"
+    means = "channel number, 1 to 255"
 
     def __init__(self) -> None:
         super().__init__(1, 255)
@@ -120,7 +120,7 @@ class Seconds(Number):
         try:
             float(value)
         except (TypeError, ValueError):
-            self.fail(f"{value!r} is no number of seconds, e.g. 30 or 2.5.", param, ctx)
+            self.fail(f"{value!r} is not a number of seconds, e.g. 30 or 2.5.", param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -166,7 +166,7 @@ def link_options(function: Function) -> Function:
             metavar="PATH",
             multiple=True,
             cls=_Several,
-            help="Reader: auto (the one that is there), usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321; "
+            help="Reader: auto (the one that is connected), usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321; "
             "several with --watch.",
         ),
         click.option(
@@ -179,8 +179,8 @@ def link_options(function: Function) -> Function:
         click.option(
             "--ble",
             metavar="ADAPTER",
-            help="Bluetooth: auto, hci0, 'hci0?address=C1:D8:57:00:01:01'; with --nfc: the reader for identify and "
-            "agree, the air for the rest.",
+            help="Bluetooth: auto, hci0, 'hci0?address=C1:D8:57:00:01:01'; with --nfc, identify and agree use the "
+            "reader and the rest uses Bluetooth.",
         ),
         click.option(
             "--timeout",
@@ -188,13 +188,13 @@ def link_options(function: Function) -> Function:
             default=60.0,
             show_default=True,
             metavar="SECONDS",
-            help="How long to wait for the node; identify and provision --all over CAN or BLE listen as long as that.",
+            help="How long to wait for the node; also how long identify and provision --all listen on CAN or BLE.",
         ),
         click.option(
             "--trace",
             metavar="FILE",
             type=click.Path(path_type=Path, dir_okay=False),
-            help="Write down every frame, sealed ones opened beside; FILE.pcapng for Wireshark. See: trace show.",
+            help="Record every frame, with sealed ones decrypted; use FILE.pcapng for Wireshark. See: trace show.",
         ),
     ]
     wrapped: Any = with_links
@@ -222,7 +222,7 @@ def fingerprint_option(says: str) -> Callable[[Function], Function]:
     def read(_ctx: click.Context, _parameter: click.Parameter, text: str | None) -> str | None:
         digits = None if text is None else read_fingerprint(text)
         if text is not None and digits is None:
-            raise click.BadParameter("a fingerprint is 64 hex digits; the first 32 or more of them will do.")
+            raise click.BadParameter("a fingerprint has 64 hex digits; give at least the first 32.")
         return digits
 
     return click.option("--fingerprint", "-f", callback=read, metavar="F", help=says)
@@ -230,12 +230,12 @@ def fingerprint_option(says: str) -> Callable[[Function], Function]:
 
 def yes_option(function: Function) -> Function:
     """Add --yes: no question is asked."""
-    return click.option("--yes", "-y", is_flag=True, help="Do not ask.")(function)
+    return click.option("--yes", "-y", is_flag=True, help="Do not ask for confirmation.")(function)
 
 
 def dry_run_option(function: Function) -> Function:
     """Add --dry-run: print the plan, change nothing."""
-    return click.option("--dry-run", is_flag=True, help="Print the plan and change nothing.")(function)
+    return click.option("--dry-run", is_flag=True, help="Print the plan without changing anything.")(function)
 
 
 # ``--trace FILE``: the file is made before anything is waited for, and ended with the command.

@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     epilog=examples("teds-provision profile list", "teds-provision profile show magnetic-angular-position-sensor"),
 )
 def profile() -> None:
-    """Transducer types: one TOML file each, in ./profiles, in the home's profiles, or shipped."""
+    """Manage transducer types: one TOML file each, in ./profiles, in the home's profiles, or built in."""
 
 
 @profile.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision profile list"))
 @pass_app
 def list_(app: App) -> None:
-    """Name every known type."""
+    """List the known types."""
     entries = [listed(entry) for entry in list_profiles(default_folders(app.home))]
 
     def human(console: Console) -> None:
@@ -75,7 +75,7 @@ def list_(app: App) -> None:
 @click.argument("name")
 @pass_app
 def show(app: App, name: str) -> None:
-    """Show one type: channels with units, ranges, and what is asked of a calibration."""
+    """Show one type: channels, units, ranges, and calibration requirements."""
     data = describe(load_profile(name, default_folders(app.home)))
     app.emit({"profiles": [data]}, lambda console: _show(console, data))
 
@@ -143,7 +143,7 @@ def _demand(demand: dict[str, Any]) -> str:
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
 @pass_app
 def check(app: App, names: tuple[str, ...]) -> None:
-    """Look for every mistake: file, line, field, and what is wrong. Exits 8 where there is one."""
+    """Report every mistake with file, line and field. Exits 8 if there is one."""
     folders = default_folders(app.home)
     told: list[dict[str, Any]] = []
     errors: list[Problem] = []
@@ -156,10 +156,10 @@ def check(app: App, names: tuple[str, ...]) -> None:
         for problem in problems:
             app.note(f"{problem.severity}: {problem}")  # not with --json, where they stand in the object
     if errors:
-        more = f" ({len(errors) - 1} more, all above)" if len(errors) > 1 and not app.json else ""
+        more = f" ({len(errors) - 1} more, listed above)" if len(errors) > 1 and not app.json else ""
         raise BadData(f"{errors[0]}{more}")
     good = ", ".join(entry["name"] for entry in told)
-    app.emit({"profiles": told}, _plain(f"{good}: no mistakes."))
+    app.emit({"profiles": told}, _plain(f"{good}: no mistakes found."))
 
 
 def _problem(one: Problem) -> dict[str, Any]:
@@ -174,36 +174,39 @@ profile.add_command(check)
     "teds-provision profile new wrist-torque", "teds-provision profile new my-finger --extends tactile-finger-sensor"
 )
 @click.argument("name")
-@click.option("--extends", metavar="PROFILE", help="Begin with another type and say only what differs.")
+@click.option("--extends", metavar="PROFILE", help="Start from another type and state only the differences.")
 @click.option(
     "--output",
     "-o",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Where to write it (default: ./profiles where there is such a folder, else the home's profiles).",
+    help="Where to write it (default: ./profiles if it exists, otherwise the home's profiles).",
 )
 @dry_run_option
 @pass_app
 def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: bool) -> None:
-    """Write a commented template of a new type, every key in it."""
+    """Write a commented template for a new type, with every key."""
     import re
 
     if not re.fullmatch(r"[a-z0-9][a-z0-9._-]{0,63}", name):
         raise UsageFailure(
-            f'"{name}" is no name of a profile.', hint="Use lower-case letters, digits and dashes, like wrist-torque."
+            f'"{name}" is not a valid profile name.',
+            hint="Use lower-case letters, digits and dashes, like wrist-torque.",
         )
     text = template(name)
     if extends is not None:
         base = find_profile(extends, default_folders(app.home)).stem
         text = (
-            f"# Transducer type {name}: as {base}, but for what is said here.\n"
-            f'# What can be said: teds-provision profile new --dry-run {name}\n\nextends = "{base}"\ntitle = "{name}"\n'
+            f"# Transducer type {name}: like {base}, except for the settings below.\n"
+            f'# For all settings: teds-provision profile new --dry-run {name}\n\nextends = "{base}"\ntitle = "{name}"\n'
             f"\n[channel.1]\n# high-limit = 20.0\n"
         )
     path = output or _place(app.home, name)
     done = holds(path, text.encode())
     if path.exists() and not done:
-        raise UsageFailure(f"{path} exists already and says something else.", hint="Take another name, or --output.")
+        raise UsageFailure(
+            f"{path} already exists with different content.", hint="Choose another name, or use --output."
+        )
     if dry_run:
         app.emit({"profiles": [{"name": name, "file": str(path)}], "text": text}, _plain(text.rstrip("\n")))
         return
@@ -211,7 +214,7 @@ def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: 
         if output is None:
             _make(path.parent)
         write_new(path, text.encode("utf-8"), mode=SHARED)
-    said = _plain(f"{path} {'is there already' if done else 'written'}.")
+    said = _plain(f"{path} {'already exists' if done else 'written'}.")
     app.emit({"profiles": [{"name": name, "file": str(path)}]}, said)
 
 
@@ -233,4 +236,4 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
-        raise StoreFailure(f"{folder} cannot be made: {error.strerror}.") from error
+        raise StoreFailure(f"Cannot create {folder}: {error.strerror}.") from error

@@ -49,20 +49,20 @@ _CHANGES_SHOWN = 20
 )
 @click.argument("uuid", required=False)
 @order_options
-@click.option("--watch", is_flag=True, help="Tap after tap, until Ctrl-C.")
+@click.option("--watch", is_flag=True, help="Provision board after board until Ctrl-C.")
 @click.option(
     "--batch",
     type=FileToRead(),
     metavar="FILE",
-    help="A sheet says which board gets what: uuid, name, profile, calibration, fingerprint.",
+    help="Sheet of boards: uuid, name, profile, calibration, fingerprint.",
 )
 @click.option(
     "--report",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Write how the batch went, as .csv or .html.",
+    help="Write a report of the batch, .csv or .html.",
 )
-@click.option("--all", "everything", is_flag=True, help="Every whitelisted node of the bus, at once.")
+@click.option("--all", "everything", is_flag=True, help="Provision every whitelisted node on the bus in parallel.")
 @yes_option
 @dry_run_option
 @link_options
@@ -79,10 +79,10 @@ def provision(
     dry_run: bool,
     links: LinkSettings,
 ) -> None:
-    """Identify, whitelist, agree, build, sign, write and verify; carries on where an earlier run stopped.
+    """Identify, whitelist, agree, build, sign, write and verify; continues where an earlier run stopped.
 
-    --yes accepts the node that lies on the reader. A finished node is left as it is: what it has changes only in what
-    this command names (--profile, --calibration, --name), or after a yes to the changes that are shown.
+    --yes accepts the node on the reader. A finished node keeps its datasheet: only what you name (--profile,
+    --calibration, --name) changes, or what you confirm after seeing the changes.
     """
     request = many.boards.Request(uuid, order, watch, everything, batch, report)
     several = everything or len(links.places) > 1
@@ -144,27 +144,28 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
             return
         if not app.interactive:
             raise NotWhitelisted(
-                f"Node {who.uuid.hex()} is not on the whitelist, and nobody can be asked.",
+                f"Node {who.uuid.hex()} is not on the whitelist, and there is no terminal to ask on.",
                 hint=f"Add --yes, or: teds-provision whitelist add {who.uuid.hex()} --fingerprint {who.fingerprint}",
             )
         with turn:
             if not app.ask_for_key(
-                f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:32]}?", who.fingerprint
+                f"Node {who.uuid.hex()}, key {who.fingerprint[:32]}\nTrust this board and add it to the whitelist?",
+                who.fingerprint,
             ):
-                raise many.board.Declined(
-                    f"You said no: node {who.uuid.hex()} was not whitelisted, nothing was changed."
-                )
+                raise many.board.Declined(f"Cancelled. Node {who.uuid.hex()} was not whitelisted; nothing was changed.")
         accepted.add((who.uuid, who.fingerprint))
 
     def confirm(uuid: bytes, changes: tuple[Change, ...]) -> None:
         with turn:
-            app.note(f"Node {uuid.hex()} has another datasheet. What this command does not name would change:")
+            app.note(
+                f"Node {uuid.hex()} has a different datasheet. This would also change, although you did not name it:"
+            )
             for change in changes[:_CHANGES_SHOWN]:
                 app.note(f"  {change.text}")
             if len(changes) > _CHANGES_SHOWN:
                 app.note(f"  and {len(changes) - _CHANGES_SHOWN} more")
             if not app.ask("Write it?"):
-                raise many.board.Declined(f"You said no: node {uuid.hex()} keeps its datasheet.")
+                raise many.board.Declined(f"Cancelled. Node {uuid.hex()} keeps its datasheet.")
 
     def low(question: str) -> None:
         with turn:
@@ -173,7 +174,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
     def take_over(question: str) -> None:
         with turn:
             if not app.ask(question):
-                raise many.board.Declined("You said no: the node keeps its key, nothing was changed.")
+                raise many.board.Declined("Cancelled. The node keeps its key; nothing was changed.")
 
     asked = app.interactive
     retype = app.asks_retype(yes=yes or several)
@@ -184,7 +185,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
 
 
 def _tell_plan(app: App, plan: Plan) -> None:
-    changes = "".join(f"\n  {text}" for text in plan.changes) or "\n  no change of what it has"
+    changes = "".join(f"\n  {text}" for text in plan.changes) or "\n  no changes"
     text = f"Plan for {plan.uuid.hex()} ({plan.state.name.lower()}): {', '.join(plan.steps)}.{changes}"
     for warning in plan.warnings:
         app.warn(warning)
@@ -256,10 +257,10 @@ def _tell_totals(app: App, boards: Boards) -> None:
     if totals.error is not None:
         error = totals.error
         result["error"] = {"code": error.code, "message": error.message, "hint": error.hint}
-    share = "" if totals.first_pass is None else f", {totals.first_pass:.1%} at the first try"
+    share = "" if totals.first_pass is None else f", {totals.first_pass:.1%} at the first attempt"
     steps = "".join(f"\n  {name:<11} {seconds:6.2f} s" for name, seconds in totals.steps.items())
     counts = f"{totals.passed} passed, {totals.failed} failed, {totals.skipped} skipped"
-    app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in all.{steps}")
+    app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in total.{steps}")
 
 
 def _summary(console: Console, done: Provisioned) -> None:

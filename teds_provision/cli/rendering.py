@@ -212,7 +212,7 @@ def duration(text: str) -> float:
     """Seconds of a time span as people give it: ``90s``, ``15m``, ``2h``; raises UsageFailure."""
     found = re.fullmatch(r"(\d{1,6})\s*([smhdw])", text.strip().lower())
     if found is None:
-        raise UsageFailure(f"{text!r} is no span of time.", hint="Give 90s, 15m or 2h.")
+        raise UsageFailure(f"{text!r} is not a valid time span.", hint="Use 90s, 15m or 2h.")
     return timedelta(**{_UNITS[found[2]]: int(found[1])}).total_seconds()
 
 
@@ -234,5 +234,5 @@ def moment(text: str, now: datetime | None = None) -> str:
         return found.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError) as error:
         raise UsageFailure(
-            f"{text!r} is no point in time.", hint="Give 2026-01-31, 2026-01-31T12:00, today, or how long ago: 2h, 3d."
+            f"{text!r} is not a valid time.", hint="Use 2026-01-31, 2026-01-31T12:00, today, or a time ago: 2h, 3d."
         ) from error

@@ -73,9 +73,9 @@ def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *
 @link_options
 @pass_app
 def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) -> None:
-    """Take one reading now: datasheet verified, values calibrated. Without channels every sensor is read.
+    """Take one reading, with the datasheet verified and the values calibrated. By default every sensor is read.
 
-    Where the node has started since its datasheet was read, the Security TEDS alone is read anew ("from": "kept" with
+    If the node has restarted since its datasheet was read, only the Security TEDS is read again ("from": "kept" with
     --json); values come from the signed copy. verify UUID reads all of it.
     """
     station = app.station()
@@ -104,7 +104,7 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
 @link_options
 @pass_app
 def mode(app: App, node: str, links: LinkSettings) -> None:
-    """What a node claims and does: mode, the state of each channel, power."""
+    """Show a node's operating mode, the state of each channel, and power."""
     station = app.station()
     uuid = station.nodes.resolve(node)
     power: operation.commands.Power | None = None
@@ -165,15 +165,15 @@ def _mode(console: Console, found: Operation, names: dict[int, str], power: Powe
 @click.argument("node", metavar="UUID")
 @click.argument("channel", type=Channel())
 @click.argument("value", type=float)
-@click.option("--unit", metavar="U", help="Unit of VALUE; without it the SI unit of the datasheet.")
-@click.option("--hold", type=Number(min=0), metavar="S", help="Seconds; without it until Ctrl-C.")
+@click.option("--unit", metavar="U", help="Unit of VALUE (default: the SI unit of the datasheet).")
+@click.option("--hold", type=Number(min=0), metavar="S", help="Seconds to hold the value (default: until Ctrl-C).")
 @click.option(
     "--dead-man",
     type=WholeNumber(20, 10_000),
     default=1000,
     show_default=True,
     metavar="MS",
-    help="Safe state after.",
+    help="Time without set points before the safe state.",
 )
 @link_options
 @pass_app
@@ -187,9 +187,10 @@ def set_value(
     hold: float | None,
     dead_man: int,
 ) -> None:
-    """Operate an actuator, hold the value, let go: safe state. The limits of the datasheet are kept (exit 6).
+    """Drive an actuator, hold the value, then return it to its safe state.
 
-    This is no safety function: see docs/actuators.md.
+    Limits come from the signed datasheet and cannot be exceeded (exit 6). This is not a safety function: see
+    docs/actuators.md.
     """
     if not math.isfinite(value):
         raise UsageFailure("VALUE is not a finite number.")
@@ -220,7 +221,8 @@ def set_value(
     station.audit("set", uuid, "done", channel=channel, safe=actuator.safe)
     if actuator.safe is None:
         raise LinkFailure(
-            "The node did not say that its actuator is safe.", hint="Its dead-man brings it there; look: mode UUID."
+            "The node did not confirm that its actuator is in its safe state.",
+            hint="Its dead-man timer brings it there. To check: teds-provision mode UUID",
         )
     app.emit({"event": "end", "safe": actuator.safe}, "safe" if actuator.safe else "NOT in its safe state")
 

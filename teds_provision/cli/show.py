@@ -55,13 +55,15 @@ _POLICY = 6
     "teds-provision show image.json --plot curve.svg",
 )
 @click.argument("files", metavar="FILE…", nargs=-1)
-@click.option("--format", "form", type=click.Choice(CHOICES), default="table", show_default=True, help="Of the output.")
+@click.option("--format", "form", type=click.Choice(CHOICES), default="table", show_default=True, help="Output format.")
 @click.option(
-    "--edition", type=click.Choice(["2007", "2024"]), help="Convert to this edition; say what it cannot hold."
+    "--edition", type=click.Choice(["2007", "2024"]), help="Convert to this edition and list what it cannot represent."
 )
-@click.option("--diff", nargs=2, metavar="A B", help="Say in physical terms what changes from A to B.")
-@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw the calibrations, .png or .svg.")
-@click.option("--strict", is_flag=True, help="Exit 8 for any error finding, 6 for a calibration that would hurt.")
+@click.option("--diff", nargs=2, metavar="A B", help="Show in physical terms what changes from A to B.")
+@click.option(
+    "--plot", metavar="FILE", type=click.Path(path_type=Path), help="Plot the calibrations to this file, .png or .svg."
+)
+@click.option("--strict", is_flag=True, help="Exit 8 for any error finding, 6 for a harmful calibration.")
 @pass_app
 def show(
     app: App,
@@ -74,7 +76,7 @@ def show(
 ) -> None:
     """Decode TEDS (binary, hex, Intel HEX, JSON, XML), images, profiles, bundle headers and messages.
 
-    A file of - is standard input. Exits 0 where it could decode, 8 where not even the tuples close, 3 for no such file.
+    Use - for standard input. Exits 0 if everything could be decoded, 8 if a TEDS is malformed, 3 if a file is missing.
     """
     plain = form in {"table", "json"}
     if diff is not None:
@@ -82,9 +84,9 @@ def show(
         _diff(app, *diff, as_json=form == "json")
         return
     if not files:
-        raise UsageFailure("There is nothing to show.", hint="Name a file, or - for standard input.")
+        raise UsageFailure("No file given.", hint="Name a file, or - for standard input.")
     if app.json and not plain:
-        raise UsageFailure("--json and --format ask for different outputs.", hint="Leave one of them out.")
+        raise UsageFailure("--json and --format cannot be combined.", hint="Omit one of them.")
     wanted = cast("Edition", int(edition)) if edition else None
     shown = [load(name, wanted) for name in files]
     if plot is not None:
@@ -95,7 +97,7 @@ def show(
 
 def _require_nothing_else(files: tuple[str, ...], plot: Path | None, plain: bool) -> None:
     if files or plot or not plain:
-        raise UsageFailure("--diff compares two files and goes with nothing else.")
+        raise UsageFailure("--diff compares two files and cannot be combined with anything else.")
 
 
 def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
@@ -114,7 +116,7 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
 def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
     for file in files:
         if file.bundle is not None:
-            raise BadData(f"{file.name} holds no TEDS that could be written as {form}.")
+            raise BadData(f"{file.name} contains no TEDS that could be written as {form}.")
         for finding in chain.from_iterable(file.conversions.values()):
             if finding.severity == "error":
                 app.warn(f"{file.name}: {finding.message}")
@@ -124,7 +126,9 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
 def _write(app: App, blocks: Sequence[Block], form: Format) -> None:
     written = teds.formats.write_blocks(blocks, form)
     if isinstance(written, bytes) and sys.stdout.isatty():
-        raise UsageFailure("Octets are not for a terminal.", hint="Send them to a file: … --format binary > FILE")
+        raise UsageFailure(
+            "Binary output cannot go to a terminal.", hint="Redirect it to a file: … --format binary > FILE"
+        )
     for sentence in teds.formats.lost(blocks, form):
         app.warn(f"{form} cannot hold {sentence}")
     if isinstance(written, str) and sys.stdout.isatty():
@@ -166,9 +170,9 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
     if len(files) != 1:
-        raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
+        raise UsageFailure("--plot works with one file.", hint="Run show once per file.")
     channels = teds.plot.plot_blocks(placed(files[0].blocks), path)
-    app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")
+    app.note(f"Plotted in {path}: channel {', '.join(map(str, channels))}.")
 
 
 # For people: rich tables of fields, findings and what they mean.
@@ -233,7 +237,7 @@ def _rows(fields: Iterable[ShownField], depth: int) -> Iterator[tuple[str, ...]]
     for one in fields:
         meaning = escape(one.meaning)
         if one.weak:
-            meaning = f"[bold red]{meaning}: weak, refused wherever a TEDS is built or trusted[/]"
+            meaning = f"[bold red]{meaning}: weak, refused when building or trusting a TEDS[/]"
         yield str(one.offset), str(one.type), "  " * depth + escape(one.name), escape(one.text), meaning
         yield from _rows(one.children, depth + 1)
 
@@ -248,7 +252,7 @@ def _print_findings(console: Console, findings: Iterable[Finding], prefix: str) 
 def _print_message(console: Console, message: Message) -> None:
     where = "" if message.channel is None else f" · channel {message.channel}"
     group = f"{message.group_name}: " if message.group_name else ""
-    name = message.name or "no message that is known here"
+    name = message.name or "unknown message"
     school = " · tagged arguments" if message.school == "tagged" else ""
     failed = " · [red]failed[/]" if message.ok is False else ""
     console.print(f"[bold]{escape(group + name)}[/] · {message.kind}, {message.edition} edition{where}{school}{failed}")

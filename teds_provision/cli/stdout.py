@@ -96,7 +96,11 @@ def ended(code: int, output: GuardedOutput | None, *, as_json: bool) -> int:
     if output is None or not output.failure:
         return code
     with suppress(OSError):
-        print(f"Error: What was done could not be told on stdout: {output.failure}.", file=sys.stderr, flush=True)
+        print(
+            f"Error: The work is done, but its result could not be written to stdout: {output.failure}.",
+            file=sys.stderr,
+            flush=True,
+        )
     return _NOT_TOLD if as_json and code == 0 else code
 
 

@@ -28,12 +28,12 @@ _SHOWN = 24
 
 @click.group(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trace show bench.trace"))
 def trace() -> None:
-    """What --trace FILE wrote: every frame and message of a link. docs/trace.md says what stands in the file."""
+    """Show traces: every frame and message that --trace FILE recorded. docs/trace.md describes the file."""
 
 
 @trace.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Show a trace in words.",
+    short_help="Show a trace in readable form.",
     epilog=examples(
         "teds-provision trace show bench.trace",
         "teds-provision trace show bench.pcapng --messages",
@@ -41,19 +41,21 @@ def trace() -> None:
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--messages", is_flag=True, help="Only whole commands and replies, not the frames that carried them.")
-@click.option("--whole", is_flag=True, help="Show all octets of each, not the first 24.")
+@click.option(
+    "--messages", is_flag=True, help="Show only whole commands and replies, not the frames that carried them."
+)
+@click.option("--whole", is_flag=True, help="Show all octets, not just the first 24.")
 @pass_app
 def show(app: App, file: Path, messages: bool, whole: bool) -> None:
-    """Show each frame and message of FILE with time, direction and meaning; what was sealed is shown opened.
+    """Show each frame and message of FILE with time, direction and meaning; sealed ones are shown decrypted.
 
-    FILE is what --trace wrote, in either form, or another program's pcapng of a CAN bus. Exit 8 where it is no trace.
+    FILE is a trace in either format, or another program's pcapng of a CAN bus. Exits 8 if it is not a trace.
     """
     records = (record for record in recorder.read_trace(file) if not messages or record.layer == "message")
     if app.json:
         print_json_list("frames", (record.as_json() for record in records))
         return
-    app.emit({}, "\n".join(_lines(records, whole=whole)) or "Nothing went over the link.")
+    app.emit({}, "\n".join(_lines(records, whole=whole)) or "The trace is empty.")
 
 
 def _lines(records: Iterator[Record], *, whole: bool) -> Iterator[str]:

@@ -35,9 +35,9 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     epilog=examples("teds-provision trust add lab keys/lab.pem", "teds-provision trust list"),
 )
 def trust() -> None:
-    """Public keys of other stations and CAs that count here; nothing else does.
+    """Manage the public keys of other stations and CAs that this station trusts; nothing else is trusted.
 
-    Files, also those under version control in keys/, count only once they were added.
+    Key files, including those under version control in keys/, count only after you add them.
     """
 
 
@@ -48,10 +48,14 @@ def trust() -> None:
 )
 @click.argument("name", required=False)
 @click.argument("file", type=FileToRead(), required=False)
-@click.option("--from", "folder", type=click.Path(path_type=Path), metavar="DIR", help="Every key of a folder.")
-@click.option("--role", type=click.Choice(["station", "ca"]), default="station", show_default=True, help="Whose key.")
+@click.option(
+    "--from", "folder", type=click.Path(path_type=Path), metavar="DIR", help="Add every key in this directory."
+)
+@click.option(
+    "--role", type=click.Choice(["station", "ca"]), default="station", show_default=True, help="Whose key it is."
+)
 @fingerprint_option(
-    "Trust it without a question where its fingerprint begins so: 32 to 64 digits, as its owner reads them."
+    "Trust it without asking if its fingerprint starts with these 32 to 64 digits, as read out by its owner."
 )
 @yes_option
 @dry_run_option
@@ -66,9 +70,10 @@ def add(
     yes: bool,
     dry_run: bool,
 ) -> None:
-    """Trust the public key of a station or CA: a PEM file, or the certificate that "trust ca sign" gave.
+    """Trust the public key of a station or CA: a PEM file, or a certificate from "trust ca sign".
 
-    Compare the fingerprint with its owner by voice. In a folder NAME.pem and NAME.cert are stations, NAME.ca.pem CAs.
+    Compare the fingerprint with its owner by voice. In a directory, NAME.pem and NAME.cert are stations, NAME.ca.pem
+    CAs.
     """
     station = app.station()
     found = _candidates(station, name, file, folder, role, fingerprint)
@@ -88,7 +93,7 @@ def _add(app: App, station: Station, chosen: list[Candidate]) -> None:
         added = handover.trust.add(station, chosen)
     told = {"trusted": [_record(one.record) for one in chosen], "added": added}
     names = ", ".join(one.record.name for one in fresh)
-    app.emit(told, f"Trusted from now on: {names}." if added else "Nothing to do.")
+    app.emit(told, f"Now trusted: {names}." if added else "Nothing to do.")
 
 
 def _candidates(
@@ -101,7 +106,7 @@ def _candidates(
 ) -> list[Candidate]:
     """The keys that are meant: NAME and FILE, held against ``fingerprint`` where one is given, or all of a folder."""
     if folder is not None and (name is not None or fingerprint is not None):
-        raise click.UsageError("--from DIR goes with no NAME and no --fingerprint.")
+        raise click.UsageError("--from DIR cannot be combined with NAME or --fingerprint.")
     if folder is not None:
         return handover.trust.candidates_of(station, folder, role)
     if name is None or file is None:
@@ -110,7 +115,7 @@ def _candidates(
     if fingerprint is not None and not same_key(fingerprint, found.record.fingerprint):
         raise OtherKey(
             f"{file} holds the key {found.record.fingerprint[:32]}, not {fingerprint[:32]}.",
-            hint="Nothing was changed. Compare with its owner again.",
+            hint="Nothing was changed. Compare it with its owner again.",
         )
     return [found]
 
@@ -127,7 +132,7 @@ def _agreed(app: App, one: Candidate, yes: bool) -> bool:
 def _shown(found: list[Candidate]) -> str:
     lines = []
     for one in found:
-        lines.append(f"{one.record.role} {one.record.name}  ({one.path}){'  trusted already' if one.known else ''}")
+        lines.append(f"{one.record.role} {one.record.name}  ({one.path}){'  already trusted' if one.known else ''}")
         lines.append(f"  {handover.trust.spoken(one.record.fingerprint)}")
         if one.certificate is not None:
             lines.append(f"  certified by the CA {protocol.keys.fingerprint(one.certificate.ca)[:32]}")
@@ -144,10 +149,10 @@ def _record(record: TrustRecord) -> dict[str, str]:
 @dry_run_option
 @pass_app
 def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
-    """Trust a key no more, and end what hung on it; it is listed before.
+    """Stop trusting a key and undo what depends on it; the consequences are listed first.
 
-    Nodes whose key that station holds are rotated at the next contact; CAs that it alone brought count no more for the
-    nodes that keep them; bans that it made are lifted.
+    Nodes whose key that station holds are rotated at the next contact; CAs that only it introduced no longer count for
+    the nodes that keep them; bans that it issued are lifted.
     """
     station = app.station()
     record = handover.trust.find_trusted(station, name)
@@ -155,14 +160,14 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     told = {"removed": _record(record), "ends": _ends(plan)}
     text = f"{record.role} {record.name}, {record.fingerprint[:32]}"
     if dry_run:
-        app.emit({**told, "plan": True}, "\n".join([f"Plan: trust the {text} no more.", *_ended(plan)]))
+        app.emit({**told, "plan": True}, "\n".join([f"Plan: stop trusting the {text}.", *_ended(plan)]))
         return
     app.note("\n".join([f"Trusted as {text}", *_ended(plan)]))
-    app.confirm(f"Trust the {text} no more?", yes=yes)
+    app.confirm(f"Stop trusting the {text}?", yes=yes)
     station.unlock()
     with station.lock("trust remove", app.note):
         done = handover.trust.remove(station, handover.trust.find_trusted(station, name))
-    app.emit({**told, "ends": _ends(done)}, "\n".join([f"Not trusted any more: {text}.", *_ended(done)]))
+    app.emit({**told, "ends": _ends(done)}, "\n".join([f"No longer trusted: {text}.", *_ended(done)]))
 
 
 def _ends(removal: Removal) -> dict[str, Any]:
@@ -179,20 +184,22 @@ def _ended(removal: Removal) -> list[str]:
     """What ends with it, for people."""
     lines = []
     if removal.shared:
-        lines.append(f"  {count_of(len(removal.shared))} whose key it holds: rotated at the next contact")
+        lines.append(f"  {count_of(len(removal.shared))} whose key it holds: to be rotated at the next contact")
         lines += [f"    {uuid.hex()}" for uuid in removal.shared[:20]]
-    lines += [f"  the CA {protocol.keys.fingerprint(ca)[:32]} counts no more" for ca in removal.cas]
+    lines += [f"  the CA {protocol.keys.fingerprint(ca)[:32]} is no longer trusted" for ca in removal.cas]
     if removal.under:
-        lines.append(f"    {count_of(removal.under)} keep it: reset them and provision them anew")
+        lines.append(f"    {count_of(removal.under)} keep it: reset and provision them again")
     lines += [f"  its ban of node {uuid.hex()} is lifted" for uuid in removal.bans]
-    lines += [f"  handover {id_} to it is open: it may have these keys; see handover list" for id_ in removal.open]
+    lines += [
+        f"  handover {id_} to it is still open, so it may have these keys; see handover list" for id_ in removal.open
+    ]
     return lines
 
 
 @trust.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust list"))
 @pass_app
 def list_(app: App) -> None:
-    """Every key that counts here besides this station's own."""
+    """List the trusted keys, besides this station's own."""
     station = app.station()
     records = station.policy.listed()
     ca, certificate = station.ca, station.identity.certificate
@@ -214,13 +221,13 @@ def list_(app: App) -> None:
 @trust.group(
     "ca",
     context_settings=COMMAND_SETTINGS,
-    short_help="The owner's CA key: show, sign with it, export, drop, import.",
+    short_help="Show, use, export, drop and import the owner's CA key.",
     epilog=examples("teds-provision trust ca sign lab.request --output lab.cert"),
 )
 def ca() -> None:
-    """The owner's CA key: it signs station keys, so that stations of one owner write and rekey each other's nodes.
+    """Manage the owner's CA key, which signs station keys so that one owner's stations can write each other's nodes.
 
-    The public key is no secret; the private one stays in the vault, or in the encrypted file that export makes.
+    The public key is not secret; the private key stays in the vault, or in the encrypted file that export writes.
     """
 
 
@@ -229,7 +236,7 @@ def ca() -> None:
 )
 @pass_app
 def create(app: App) -> None:
-    """Show the CA key, which init made; a station that another CA certified has none."""
+    """Show the CA key that init created; a station certified by another CA has none."""
     station = app.station()
     handover.trust.require_ca(station)
     digits, pem = protocol.keys.fingerprint(station.ca), protocol.keys.to_pem(station.ca)
@@ -242,12 +249,12 @@ def create(app: App) -> None:
     epilog=examples("teds-provision trust ca sign lab.request --output lab.cert --yes"),
 )
 @click.argument("request", type=FileToRead())
-@click.option("--output", type=_FILE, required=True, metavar="CERT", help="Where the certificate goes.")
+@click.option("--output", type=_FILE, required=True, metavar="CERT", help="Where to write the certificate.")
 @yes_option
 @dry_run_option
 @pass_app
 def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> None:
-    """Certify the station that made REQUEST (init --request): it may then key and write this owner's nodes."""
+    """Certify the station that made REQUEST (init --request); it can then key and write this owner's nodes."""
     station = app.station()
     wanted = handover.trust.read_request(read_limited(request, handover.trust.MAX_OCTETS, "request"))
     digits = protocol.keys.fingerprint(wanted.station)
@@ -263,14 +270,15 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
         return
     station.unlock()
     app.note(shown)
-    app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
+    app.confirm("Certify it? Whoever holds its key can then write and rekey all of this owner's nodes.", yes=yes)
     with station.lock("trust ca sign", app.note):
         octets = handover.trust.write_certificate(handover.trust.sign_request(station, wanted))
         fresh = not holds(output, octets)
         if fresh:
             write_new(output, octets)
-    text = f"{wanted.name} ({digits[:16]}) is certified: {output}. There: teds-provision init --certificate {output}"
-    app.emit({**told, "fresh": fresh}, text if fresh else f"Nothing to do, {output} is there already.")
+    there = f"On that station: teds-provision init --certificate {output}"
+    text = f"{wanted.name} ({digits[:16]}) is certified: {output}. {there}"
+    app.emit({**told, "fresh": fresh}, text if fresh else f"Nothing to do: {output} already exists.")
 
 
 @ca.command(
@@ -291,31 +299,31 @@ def export(app: App, file: Path) -> None:
     passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):
         handover.trust.export_ca(station, vault, file, passphrase)
-    app.emit({"file": str(file)}, f"The CA key is in {file}. Keep it away, then: teds-provision trust ca drop")
+    app.emit({"file": str(file)}, f"The CA key is in {file}. Store it offline, then: teds-provision trust ca drop")
 
 
 @ca.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca drop --yes"))
 @yes_option
 @pass_app
 def drop(app: App, yes: bool) -> None:
-    """Take the CA key out of the vault for good. Export it first: without it no station can be certified any more."""
+    """Permanently remove the CA key from the vault. Export it first: no station can be certified without it."""
     station = app.station()
     station.unlock()
-    app.confirm("Delete the CA key from this vault? Only its exported file can bring it back.", yes=yes)
+    app.confirm("Delete the CA key from this vault? You can only restore it from its exported file.", yes=yes)
     with station.lock("trust ca drop", app.note):
         dropped = handover.trust.drop_ca(station)
-    app.emit({"dropped": dropped}, "The CA key is not in this vault any more." if dropped else "Nothing to do.")
+    app.emit({"dropped": dropped}, "The CA key was removed from this vault." if dropped else "Nothing to do.")
 
 
 @ca.command("import", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca import owner-ca.pem"))
 @click.argument("file", type=FileToRead())
 @pass_app
 def import_(app: App, file: Path) -> None:
-    """Bring the CA key back from the file that "trust ca export" wrote."""
+    """Import the CA key from a file written by "trust ca export"."""
     station = app.station()
     vault = station.vault
     passphrase = app.ask_secret("Passphrase of the CA key's file")
     with station.lock("trust ca import", app.note):
         handover.trust.import_ca(station, vault, file, passphrase)
     digits = protocol.keys.fingerprint(station.ca)
-    app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is in this vault.")
+    app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is now in this vault.")

@@ -19,12 +19,12 @@ from teds_provision.vault.agent import asking
     epilog=examples("teds-provision vault passphrase", "teds-provision vault rewrap"),
 )
 def vault() -> None:
-    """Where this station's secrets lie: give it a new passphrase, or wrap every node key under a new master key."""
+    """Manage this station's secrets: change the passphrase, or rewrap every node key under a new master key."""
 
 
 @vault.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Set a new passphrase, or PIN of the token.",
+    short_help="Change the passphrase or the token's PIN.",
     epilog=examples(
         "teds-provision vault passphrase",
         "teds-provision vault passphrase --new-passphrase-fd 4",
@@ -34,15 +34,17 @@ def vault() -> None:
 @dry_run_option
 @pass_app
 def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
-    """Give the passphrase file a new passphrase, or the token a new PIN; the keys stay the same.
+    """Change the passphrase of the vault file, or the PIN of the token; the keys stay the same.
 
-    Copies of the old file, and backups, still open with the old passphrase. Where that has leaked, see the page "when
+    Copies of the old file, and backups, still open with the old passphrase. If it has leaked, see the page "when
     something went wrong".
     """
     station = app.station()
     kind = station.identity.keystore.partition(":")[0]
     if dry_run:
-        app.emit({"keystore": kind, "rewrapped": 0, "plan": True}, f"Plan: a new passphrase for the {kind} keystore.")
+        app.emit(
+            {"keystore": kind, "rewrapped": 0, "plan": True}, f"Plan: change the passphrase of the {kind} keystore."
+        )
         return
     station.use_agent = False  # who walks up to an unlocked desk shall not lock its owner out
     opened = station.vault
@@ -59,23 +61,23 @@ def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
         station.audit("vault", None, "new passphrase")
     app.emit(
         {"keystore": kind, "rewrapped": 0},
-        f"{opened.description} opens with the new passphrase. Copies and backups made before open with the old one.",
+        f"{opened.description} now opens with the new passphrase. Existing copies and backups keep the old one.",
     )
 
 
 @vault.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Make a new master key and wrap every node key anew.",
+    short_help="Rewrap every node key under a new master key.",
     epilog=examples("teds-provision vault rewrap"),
 )
 @yes_option
 @dry_run_option
 @pass_app
 def rewrap(app: App, yes: bool, dry_run: bool) -> None:
-    """Make a new master key, wrap every node key under it, and forget the old one.
+    """Create a new master key, rewrap every node key under it, and delete the old one.
 
-    Who has an old copy of the store and the old master key still has the node keys of that day: agree anew with the
-    nodes (agree UUID --rotate) where that matters. A run that was cut is carried on by the same command.
+    Anyone with an old copy of the store and the old master key still has the node keys of that time; if that matters,
+    rotate them (agree UUID --rotate). If interrupted, run the same command again to continue.
     """
     del yes  # nothing here is lost: the old master key goes when nothing needs it any more
     station = app.station()
@@ -83,39 +85,40 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
     if dry_run:
         count = sum(1 for _ in station.keys.all())
         app.emit(
-            {"keystore": kind, "rewrapped": count, "plan": True}, f"Plan: wrap {count} keys under a new master key."
+            {"keystore": kind, "rewrapped": count, "plan": True}, f"Plan: rewrap {count} keys under a new master key."
         )
         return
     station.unlock()
     with station.lock("vault rewrap", app.note):
         done = station_room.rewrap.rewrap(station)
     if done.damaged:
-        app.warn(f"{done.damaged} keys in the store open under no master key; run teds-provision doctor.")
+        app.warn(
+            f"{done.damaged} keys in the store cannot be decrypted with any master key; run teds-provision doctor."
+        )
     app.emit(
         {"keystore": kind, "rewrapped": done.keys, "damaged": done.damaged},
-        f"{done.keys} keys are wrapped under a new master key in the {kind} keystore.",
+        f"Rewrapped {done.keys} keys under a new master key in the {kind} keystore.",
     )
 
 
 @command("teds-provision unlock --for 15m")
 @click.option(
-    "--for", "span", default="15m", show_default=True, metavar="TIME", help="How long: 90s, 15m, 2h (to 12h)."
+    "--for", "span", default="15m", show_default=True, metavar="TIME", help="How long: 90s, 15m, 2h (at most 12h)."
 )
 @pass_app
 def unlock(app: App, span: str) -> None:
-    """Ask for the passphrase (or PIN) once, and hold what opens the vault in memory until the time is over.
+    """Ask for the passphrase or PIN once, and keep the vault unlocked in memory for the given time.
 
-    Every command of this user in this home opens the vault then without asking. "lock" ends it at once. A new
-    passphrase and the export of the CA key ask all the same. A keyring needs none of this: it is open while the desktop
-    is.
+    Until then, this user's commands in this home open the vault without asking; "lock" ends it at once. Changing the
+    passphrase and exporting the CA key still ask. A keyring does not need this: it is open while you are logged in.
     """
     seconds = duration(span)
     if not 1 <= seconds <= asking.MOST_SECONDS:
-        raise UsageFailure(f"The vault is held open for 1 s to {asking.MOST_SECONDS // 3600} h, not for {span}.")
+        raise UsageFailure(f"The vault can stay unlocked for 1 s to {asking.MOST_SECONDS // 3600} h, not {span}.")
     station = app.station()
     kind = station.identity.keystore.partition(":")[0]
     if kind not in asking.KINDS:
-        text = f"Nothing to do: the keys of this station lie in the {kind}, which asks for itself."
+        text = f"Nothing to do: this station's keys are in the {kind}, which handles unlocking itself."
         app.emit({"unlocked": False, "until": None, "keystore": kind}, text)
         return
     station.use_agent = False
@@ -130,13 +133,13 @@ def unlock(app: App, span: str) -> None:
     opened = station.vault
     opener = opened.opener() or said.encode()
     if not opener:
-        raise UsageFailure("The token has a PIN pad of its own: there is nothing that could be held.")
+        raise UsageFailure("The token has its own PIN pad, so there is nothing to keep in memory.")
     with station.lock("unlock", app.note):
         opened.refresh()  # an old passphrase is not held, and an old PIN costs no try
         asking.start(app.home, kind, opener, int(seconds))
         station.audit("vault", None, "unlocked", seconds=int(seconds))
     until = (datetime.now(UTC) + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%SZ")
-    text = f"The vault is open until {local_time(until)}, for this user alone. Close it: teds-provision lock"
+    text = f"The vault is unlocked until {local_time(until)}, for this user only. To lock it: teds-provision lock"
     app.emit({"unlocked": True, "until": until, "keystore": kind}, text)
 
 

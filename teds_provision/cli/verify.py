@@ -29,22 +29,24 @@ if TYPE_CHECKING:
     "teds-provision --json verify datasheets/",
 )
 @click.argument("what", metavar="UUID|IMAGE…|DIR", nargs=-1, required=True)
-@click.option("--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged.")
+@click.option(
+    "--accept-calibration", metavar='"WHY"', help="Accept a calibration that the guard refuses; the reason is logged."
+)
 @link_options
 @pass_app
 def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibration: str | None) -> None:
-    """Read a node (or an image file) and check its datasheet; a node must also sign a fresh challenge.
+    """Read a node or an image file and check its datasheet; a node must also sign a fresh challenge.
 
-    A file is judged alone; with --can, --nfc or --ble here a node's name goes before that of a file or folder.
-    A node whose key is held here must open a session, else nothing is proven.
-    Several files, or a folder, give a line each and at last the totals; on every core.
+    A file is checked by itself; with --can, --nfc or --ble, a name means a node rather than a file or directory.
+    A node whose key this station holds must open a session, otherwise nothing is proven.
+    Several files, or a directory, are checked on all cores, with one line each and totals at the end.
     Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration;
-    of several the worst.
+    for several files, with the worst.
     """
     node = len(what) == 1 and bool(said_here("via", "nfc", "can", "ble"))
     if not node and are_files(what):
         if accept_calibration is not None:
-            raise UsageFailure("--accept-calibration is for one image.", hint="Verify that one by itself.")
+            raise UsageFailure("--accept-calibration applies to a single image.", hint="Verify that image by itself.")
         verify_many(app, what)
         return
     done = visits.at_node.verify_at(

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     ),
 )
 def whitelist() -> None:
-    """The nodes that may be keyed and written: UUID, and the fingerprint of the node's key.
+    """Manage the nodes that may be keyed and written, by UUID and key fingerprint.
 
-    An entry without fingerprint is pinned at the first tapped contact in which the node proves its key.
+    An entry without a fingerprint is pinned at the first tap in which the node proves its key.
     """
 
 
@@ -43,21 +43,21 @@ def whitelist() -> None:
     epilog=examples("teds-provision whitelist add 8d4d9da65281f7000000 --name finger-1"),
 )
 @click.argument("uuid", metavar="UUID|LABEL")
-@fingerprint_option("Fingerprint of the node's key: its first 32 to 64 digits.")
-@click.option("--name", help="What people call it.")
+@fingerprint_option("Fingerprint of the node's key: the first 32 to 64 digits.")
+@click.option("--name", help="Name of the node.")
 @dry_run_option
 @pass_app
 def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run: bool) -> None:
-    """Whitelist one node; a key that is pinned already is never replaced (exit 6).
+    """Whitelist one node; a pinned key is never replaced (exit 6).
 
-    What a scanner reads of a label (see: label) is taken in place of the UUID, and pins the key.
+    Instead of the UUID you can pass the scanned text of a label (see: label), which also pins the key.
     """
     station = app.station()
     scanned = read_label(uuid)
     octets = station.nodes.resolve(uuid) if scanned is None else scanned[0]
     if scanned is not None:
         if fingerprint is not None and not same_key(fingerprint, scanned[1]):
-            raise click.BadParameter("the label names another key.", param_hint="--fingerprint")
+            raise click.BadParameter("the label carries a different key.", param_hint="--fingerprint")
         fingerprint = scanned[1]
     steps.whitelist_files.require_name(name)
     wanted = steps.whitelist_files.Listed(0, octets, fingerprint, name)
@@ -74,7 +74,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 
 @whitelist.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Take a node off the whitelist and forget its pinned key.",
+    short_help="Remove a node and forget its pinned key.",
     epilog=examples("teds-provision whitelist remove 8d4d --yes"),
 )
 @click.argument("uuid")
@@ -82,7 +82,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 @dry_run_option
 @pass_app
 def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
-    """Take a node off the whitelist and forget its pinned key, so that a replaced board can be pinned anew."""
+    """Remove a node from the whitelist and forget its pinned key, so that a replaced board can be pinned again."""
     station = app.station()
     octets = station.nodes.resolve(uuid)
     entry = station.pins.entry(octets)
@@ -91,23 +91,20 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     if entry is None and not steps.whitelist.is_pinned(station, octets):
         text = f"{told} is not on the whitelist (nothing to do)."
     elif dry_run:
-        text = f"Plan: take {told} off the whitelist, forget its key {(pinned or 'that it showed')[:32]}."
+        text = f"Plan: remove {told} from the whitelist and forget its key {(pinned or 'as last seen')[:32]}."
     else:
-        app.confirm(f"Take {told} off the whitelist and forget its pinned key?", yes=yes)
+        app.confirm(f"Remove {told} from the whitelist and forget its pinned key?", yes=yes)
         station.unlock()
         with station.lock("whitelist remove", app.note):
             steps.whitelist.remove(station, octets)
-        text = f"{told} is off the whitelist{'' if entry else ' as before, and its key is forgotten'}."
+        text = f"{told} is {'no longer on the whitelist' if entry else 'not on the whitelist; its key is forgotten'}."
     _emit(app, station, text, removed=entry is not None and not dry_run)
 
 
 @whitelist.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision whitelist list"))
 @pass_app
 def list_entries(app: App) -> None:
-    """Show every entry.
-
-    UUID, the pinned key, how well it was proven, when the entry was added, and the node's name.
-    """
+    """List every entry: UUID, pinned key, how it was proven, when it was added, and the name."""
     station = app.station()
     entries = station.pins.each()
     if app.json:
@@ -133,14 +130,14 @@ def list_entries(app: App) -> None:
     epilog=examples("teds-provision whitelist import ncap.xml --dry-run", "teds-provision whitelist import ncap.xml"),
 )
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: by extension or content.")
+@click.option("--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: from extension or content.")
 @dry_run_option
 @pass_app
 def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
-    """Add every entry of an XML (NCAP), CSV or JSON file, all or none.
+    """Add every entry of an XML (NCAP), CSV or JSON file, or none.
 
-    One wrong line refuses the whole file (exit 8), one UUID that is pinned to another key too (exit 6). Taken are UUID,
-    fingerprint and name; when it was added, and with which assurance, is this station's to say.
+    One invalid line rejects the whole file (exit 8), and so does a UUID pinned to a different key (exit 6). UUID,
+    fingerprint and name are imported; this station sets the date and the assurance.
     """
     station = app.station()
     listed = steps.whitelist_files.read_whitelist(file, form)
@@ -161,11 +158,13 @@ def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     epilog=examples("teds-provision whitelist export whitelist.csv"),
 )
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: by extension, else xml.")
+@click.option(
+    "--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: from the extension, otherwise xml."
+)
 @dry_run_option
 @pass_app
 def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
-    """Write every entry, sorted, to a file in one piece; a file of that name is replaced."""
+    """Write all entries, sorted, to a file; an existing file is replaced in one step."""
     station = app.station()
     form = steps.whitelist.form_of(file, form)
     if not dry_run:
@@ -178,7 +177,7 @@ def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
 
 def _emit_plan(app: App, station: Station, plan: Plan, *, dry_run: bool) -> None:
     changed = len(plan.write) - plan.new
-    what = f"{plan.new} new, {changed} changed, {plan.unchanged} as they were"
+    what = f"{plan.new} new, {changed} changed, {plan.unchanged} unchanged"
     text = f"Plan: {what}." if dry_run else f"Whitelist: {what}{'' if plan.write else ' (nothing to do)'}."
     _emit(app, station, text, added=plan.new, changed=changed, unchanged=plan.unchanged, dry_run=dry_run)
 

@@ -77,7 +77,7 @@ def test_a_merge_shows_its_plan_and_asks(home: Path, sealed: Path) -> None:
     call(home, "whitelist", "remove", ONE.hex(), "--yes")
     refused = spawn("--home", home, "restore", sealed, passphrase=PASSPHRASE)
     assert refused.code == 6
-    assert "comes back: whitelist: 1" in refused.err
+    assert "restored: whitelist: 1" in refused.err
     assert "an older state" in refused.err
     assert call(home, "--json", "whitelist", "list").json == {"whitelist": []}
     code, told = restore(home, sealed, "--yes")

@@ -157,10 +157,10 @@ def test_nodes_are_found_by_every_part(fleet: Path, words: list[str], names: lis
 
 
 def test_a_filter_that_nothing_fits_is_not_taken_for_an_empty_store(fleet: Path) -> None:
-    """It said "No node is known yet. Tap one"."""
+    """It said that no nodes are known yet, and to tap one."""
     for words in (["--group", "nowhere"], ["--profile", "no-such-type"], ["--since", "2099-01-01"]):
         said = call(fleet, "nodes", *words)
-        assert (said.code, said.out.startswith("No node that is known fits that.")) == (0, True), said
+        assert (said.code, said.out.startswith("No known node matches.")) == (0, True), said
 
 
 def test_due_counts_days_from_today_and_what_is_overdue(fleet: Path) -> None:

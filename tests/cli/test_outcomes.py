@@ -120,7 +120,7 @@ def test_an_interrupted_command_says_so_in_json_too(
     said = call(tmp_path, "--json", "nodes")
     assert (said.code, said.json["error"]["code"]) == (130, "interrupted")
     told = call(tmp_path, "nodes")
-    assert (told.code, told.out, told.err) == (130, "", "Interrupted: the same command carries on from here.\n")
+    assert (told.code, told.out, told.err) == (130, "", "Interrupted. Run the same command again to continue.\n")
 
 
 def test_options_are_read_from_environment_and_config_by_the_name_that_people_type(

@@ -128,5 +128,5 @@ def test_each_key_of_a_folder_is_asked_for(home: Path, pem: Path) -> None:
     done = on_terminal(home, *words, streams=["stdin"], answers=["n", "y"], passphrase=PASSPHRASE)
     assert done.code == 0, done
     assert spoken(DIGITS) in done.err
-    assert done.out == "Trusted from now on: west.\n"
+    assert done.out == "Now trusted: west.\n"
     assert [one["name"] for one in call(home, "--json", "trust", "list").json["trusted"]] == ["west"]

@@ -55,7 +55,7 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
     "words", [("measure", "recover"), ("measure", "recover", "."), ("measure", "recover", "none.mcap")]
 )
 def test_recover_names_what_it_is(hall: Hall, words: tuple[str, ...]) -> None:
-    code, told = {2: (2, "Name one recording"), 3: (3, "none.mcap")}[2 if len(words) == 2 else 3]
+    code, told = {2: (2, "Name exactly one recording"), 3: (3, "none.mcap")}[2 if len(words) == 2 else 3]
     told = "is a folder" if words[-1] == "." else told
     outcome = hall.station.start("--json", *words).end()
     assert outcome.code == code

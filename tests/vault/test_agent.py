@@ -68,7 +68,7 @@ def test_asked_once_and_closed_by_lock(home: Path) -> None:
     assert [opens(home) for _ in range(2)] == [0, 0]
     (seen,) = [check for check in run(home, "doctor").json["checks"] if check["name"] == "unlock"]
     assert (seen["result"], seen["fix"]) == ("warning", "teds-provision lock")
-    assert "held open" in spawn("--home", home, "init").out
+    assert "unlocked for" in spawn("--home", home, "init").out
     assert run(home, "lock").json == {"locked": True, "was_open": True}
     assert not (home / asking.SOCKET).exists()
     assert opens(home, "0f" * 10) == 7
