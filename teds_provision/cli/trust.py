@@ -143,7 +143,11 @@ def _record(record: TrustRecord) -> dict[str, str]:
     return {"name": record.name, "role": record.role, "fingerprint": record.fingerprint}
 
 
-@trust.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust remove lab --yes"))
+@trust.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Stop trusting a key and undo what depends on it.",
+    epilog=examples("teds-provision trust remove lab --yes"),
+)
 @click.argument("name", metavar="NAME|FINGERPRINT")
 @yes_option
 @dry_run_option

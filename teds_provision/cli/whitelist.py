@@ -101,7 +101,12 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     _emit(app, station, text, removed=entry is not None and not dry_run)
 
 
-@whitelist.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision whitelist list"))
+@whitelist.command(
+    "list",
+    context_settings=COMMAND_SETTINGS,
+    short_help="List every entry.",
+    epilog=examples("teds-provision whitelist list"),
+)
 @pass_app
 def list_entries(app: App) -> None:
     """List every entry: UUID, pinned key, how it was proven, when it was added, and the name."""

@@ -155,8 +155,8 @@ def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Ho
         assert done.code == 0
         assert all(digits in done.err for digits in both)
         told[mode] = done.err
-    assert "can pose as a node to the other" in told["copy"]
-    assert "Only when the other station has rotated them" in told["move"]
+    assert "can impersonate a node to the other" in told["copy"]
+    assert "when the other station has rotated them" in told["move"]
     done = spawn("--home", homes.south, "import-keys", homes.folder / "move.jwe", "--yes", passphrase=PASSPHRASE)
     assert all(digits in done.err for digits in both)
     assert "will be trusted for these nodes only" in done.err

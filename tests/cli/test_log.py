@@ -69,7 +69,7 @@ def test_a_broken_chain_is_exit_7_and_named(home: Path, statement: str, first_ba
     assert (told.code, told.json["intact"], told.json["first_bad"]) == (7, False, first_bad)
     shown = call(home, "log")
     assert shown.code == 7
-    assert "does not hold" in shown.err
+    assert "is not intact" in shown.err
     assert call(home, "log", "--follow").code == 7
 
 

@@ -38,22 +38,22 @@ UUID = "8d4d9da65281f7000000"
         (["import-keys", "hello.txt"], 8, "hello.txt is not a handover bundle", "export-keys"),
         (["import-keys", "some.json"], 8, "some.json is not a handover bundle", "export-keys"),
         (["restore", "hello.txt"], 8, "This is not a backup", "backup"),
-        (["identify", "--timeout", "abc"], 2, "'abc' is no number of seconds", ""),
+        (["identify", "--timeout", "abc"], 2, "'abc' is not a number of seconds", ""),
         (["identify", "--nfc", "tty:NONE7:pn532", "--timeout", "1"], 5, "serial line tty:NONE7", "ls /dev/ttyUSB*"),
         (["provision", "--report", "x.pdf", "--batch", "hello.txt"], 2, "neither CSV nor HTML", "FILE.html"),
         (["provision", "--batch", "hello.txt"], 8, "hello.txt:1: there is no column 'hello'", "Mend the sheet"),
         (["provision", "--name", "", "-p", "load-cell"], 2, "A name has 1 to 120 octets", ""),
         (["provision", "--name", "a\nb", "-p", "load-cell"], 2, "A name is one line of printable characters", ""),
-        (["handover", "receipt", "hello.txt"], 8, "hello.txt is no receipt", "import-keys"),
+        (["handover", "receipt", "hello.txt"], 8, "hello.txt is not a receipt", "import-keys"),
         (["whitelist", "import", "empty"], 8, "empty is empty: it lists no node", "CSV"),
         (["verify", "empty"], 8, "empty is no TEDS image: The TEDS image is empty", "build, sign and read"),
         (["verify", "octets"], 8, "octets is no TEDS image: The TEDS image is no text", "build, sign and read"),
         (["sign", "folder"], 3, "folder is a folder", ""),
         (["verify", "/dev/null"], 3, "/dev/null is no regular file", ""),
-        (["nodes", "--due", "soon"], 2, "'soon' is no whole number", ""),
-        (["write", "8d4d", "--from", "last"], 2, "'last' is no whole number", ""),
-        (["init", "--name", "another"], 2, "There is a station", "--name"),
-        (["init", "--keystore", "keyring"], 2, "There is a station", "--keystore"),
+        (["nodes", "--due", "soon"], 2, "'soon' is not a whole number", ""),
+        (["write", "8d4d", "--from", "last"], 2, "'last' is not a whole number", ""),
+        (["init", "--name", "another"], 2, "already holds a station", "--name"),
+        (["init", "--keystore", "keyring"], 2, "already holds a station", "--keystore"),
     ],
 )
 def test_a_message_names_what_it_is(
@@ -122,7 +122,7 @@ def test_replacing_a_node_without_name_prints_no_none(home: Path) -> None:
     station.nodes.remember(bytes.fromhex(UUID), channels=1)
     station.close()
     told = spawn("--home", home, "replace", UUID, UUID[:-1] + "1", "--dry-run", passphrase=PASSPHRASE)
-    assert (told.code, "None" in told.out, "without name and profile" in told.out) == (0, False, True), told
+    assert (told.code, "None" in told.out, "no name or profile" in told.out) == (0, False, True), told
 
 
 def test_a_name_that_no_file_can_have_is_called_that_and_is_no_bug(home: Path, tmp_path: Path) -> None:

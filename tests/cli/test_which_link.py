@@ -79,7 +79,7 @@ def test_measure_takes_the_bus_that_is_kept_beside_a_reader(home: Path, monkeypa
     monkeypatch.setenv("TEDS_PROVISION_NFC", "udp:127.0.0.1:9")
     monkeypatch.setenv("TEDS_PROVISION_CAN", "socketcan:can7")
     told = call(home, "--json", "measure", "8d4d9da65281f7000000", "--timeout", "1")
-    assert "Streams need a bus" not in told.out
+    assert "Streaming needs CAN" not in told.out
     assert told.code == 5
 
 
