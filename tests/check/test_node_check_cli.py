@@ -60,7 +60,7 @@ def test_explain_prints_a_test_agreement_and_no_key_of_anybody(desk: Desk) -> No
     where = ("--via", "can", "--can", desk.links.can)
     words = spawn("--home", desk.folder / "bench", "node", "check", "--explain", *where, passphrase=PASSPHRASE)
     assert "never confirmed" in words.out
-    assert "tagN, due" in words.out
+    assert "tagN, expected" in words.out
 
 
 def test_without_a_word_nothing_is_keyed(desk: Desk) -> None:

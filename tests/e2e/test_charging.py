@@ -17,7 +17,7 @@ def test_the_charge_is_remembered_and_shown_with_its_time(desk: Desk) -> None:
     assert known["charging"]["battery_percent"] in (80, 81, 82)
     assert known["charging"]["at"].endswith("Z")
     shown = station.run("nodes", node.uuid).out
-    assert "as it says" in shown
+    assert "reported by the node" in shown
     over_the_bus = station.ask("mode", node.uuid, *desk.links.over("can"))["charging"]
     assert over_the_bus == known["charging"], "the bus says nothing of it: what was said at the tap, and when"
     tapped = station.ask("mode", node.uuid, *desk.links.over("nfc"))["charging"]

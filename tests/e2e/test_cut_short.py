@@ -170,7 +170,7 @@ def test_ctrl_c_ends_at_once_and_loses_nothing(station: Station, node: Node, mom
     assert outcome.code == 130
     assert time.monotonic() - began < 5
     node.process.signal(signal.SIGCONT)
-    assert outcome.err.rstrip().endswith("the same command carries on from here.")
+    assert outcome.err.rstrip().endswith("Run the same command again to continue.")
     assert "Traceback" not in outcome.err
     carries_on(station, node, via)
 
