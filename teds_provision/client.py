@@ -137,7 +137,7 @@ class Client:
             self.close()
             if not again:
                 raise LinkFailure(
-                    f"The base station does not answer: {error}.", hint="Is it running? teds-provision ncap status"
+                    f"The base station is not responding: {error}.", hint="Is it running? teds-provision ncap status"
                 ) from error
         return self._exchange(method, path, body, headers)
 

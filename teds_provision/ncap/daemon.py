@@ -228,7 +228,7 @@ class Daemon:
         What was found in another mode is forgotten until it is found again; in the same one it stays.
         """
         if mode not in get_args(Detection):
-            raise UsageFailure(f"{mode!r} is no mode of detection.", hint="Use transparent or whitelist.")
+            raise UsageFailure(f"{mode!r} is not a detection mode.", hint="Use transparent or whitelist.")
         changes = mode != self.station.measurements.detection
         with self.station.durable("detection"):
             self.station.measurements.detection = mode  # type: ignore[assignment]
@@ -250,7 +250,7 @@ class Daemon:
         """The UUID that a path names, of a node that something is known of; raises NotFound, UsageFailure."""
         uuid = self.resolve(text)
         if not self.roster.known(uuid) and not self.station.nodes.is_known(bytes.fromhex(uuid)):
-            raise NotFound(f"Nothing is known of node {uuid}.", hint="See /nodes.")
+            raise NotFound(f"No node matches {uuid!r}.", hint="See /nodes.")
         return uuid
 
     def resolve(self, text: str) -> str:
@@ -269,7 +269,9 @@ class Daemon:
     def login_url(self, *, read_only: bool = False) -> str:
         """The page's address with a token that works once; raises UsageFailure where no page is served."""
         if self.url is None:
-            raise UsageFailure("The page is not served.", hint="Start it with --http: ncap run --http 127.0.0.1:8351")
+            raise UsageFailure(
+                "The station is not serving its page.", hint="Restart it with --http: ncap run --http 127.0.0.1:8351"
+            )
         return f"{self.url}/login?token={self.tokens.login_link(read_only=read_only)}"
 
     # -- groups ------------------------------------------------------------------------------------------------------
@@ -312,7 +314,9 @@ class Daemon:
 
     def _require_thawed(self, name: str) -> None:
         if self.measuring.group_is_measured(name):
-            raise Frozen(f"Group {name!r} is being measured: it stays as it is.", hint="End that measurement first.")
+            raise Frozen(
+                f"Group {name!r} is being measured and cannot be changed now.", hint="End the measurement first."
+            )
 
     def _group_changed(self, name: str) -> None:
         self.roster.refresh()
@@ -332,7 +336,7 @@ class Daemon:
     def drop_virtual(self, uuid: str) -> None:
         """End one, and its key with it; raises NotFound, Frozen while it is measured."""
         if self.measuring.of(uuid) is not None:
-            raise Frozen(f"Node {uuid} is being measured.", hint="End that measurement first.")
+            raise Frozen(f"Node {uuid} is being measured.", hint="End the measurement first.")
         self.virtuals.remove(uuid)
         self.roster.note(uuid, "left", present=False)
         self.roster.refresh()

@@ -209,7 +209,8 @@ class Live:
             one.credit -= len(times)
             self.values += len(times)
             if len(times):
-                out[f"{key[0]}/{key[1]}"] = [np.round(times, 4).tolist(), _numbers(values)]
+                numbers = [float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()]
+                out[f"{key[0]}/{key[1]}"] = [np.round(times, 4).tolist(), numbers]
         return out
 
     def _put_aside(self, blocks: Iterable[Block]) -> set[Key]:
@@ -271,7 +272,3 @@ def _extremes(times: NDArray[Any], values: NDArray[Any], most: int) -> tuple[NDA
             continue
         kept += sorted({int(begin + np.nanargmin(part)), int(begin + np.nanargmax(part))})
     return times[kept], values[kept]
-
-
-def _numbers(values: NDArray[Any]) -> list[float | None]:
-    return [float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()]

@@ -117,7 +117,7 @@ class Measuring:
         is measured already).
         """
         if (group is None) == (not uuids):
-            raise UsageFailure("A measurement names a group, or nodes.", hint='Give "group" or "uuids".')
+            raise UsageFailure("A measurement needs either a group or nodes.", hint='Give "group" or "uuids".')
         kept = Measurement(
             "",
             group=group,
@@ -133,11 +133,13 @@ class Measuring:
         )
         nodes = self._station.measurements.nodes_of(kept)
         if not nodes:
-            raise UsageFailure(f"Group {group!r} has no node.", hint="Add one to it first.")
+            raise UsageFailure(f"Group {group!r} is empty.", hint="Add a node to it first.")
         for uuid in nodes:
             other = self.of(uuid.hex())
             if other is not None:
-                raise NodeBusy(f"Node {uuid.hex()} is measured already ({other}).", hint="End that measurement first.")
+                raise NodeBusy(
+                    f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first."
+                )
             self._require_plan(uuid, kept)
         for spec in kept.sinks:
             self._sinks.open(spec)
@@ -163,13 +165,13 @@ class Measuring:
         with self._guard:
             one = self._running.pop(measurement_id, None)
         if one is None and self._station.measurements.all() == []:
-            raise NotFound(f"There is no measurement {measurement_id!r}.")
+            raise NotFound(f"No measurement has the ID {measurement_id!r}.")
         if one is not None:
             one.stop.set()
             self._end(one)
         with self._station.durable("measure"):
             if not self._station.measurements.forget(measurement_id) and one is None:
-                raise NotFound(f"There is no measurement {measurement_id!r}.")
+                raise NotFound(f"No measurement has the ID {measurement_id!r}.")
             self._station.audit("measure", None, "ended", id=measurement_id)
         self._live.event("measurement", state="deleted", id=measurement_id)
 

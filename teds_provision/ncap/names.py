@@ -64,7 +64,7 @@ class Names:
         """Publish it under this name; None: under the one that is made for it. Raises UsageFailure, Frozen."""
         if name is not None and not is_topic(name):
             raise UsageFailure(
-                f"{name!r} cannot be the name of a topic.",
+                f"{name!r} is not a valid topic name.",
                 hint="Use letters, digits and single _, beginning with a letter; / between parts.",
             )
         if name is not None:
@@ -74,7 +74,9 @@ class Names:
                 raise UsageFailure(f"{name!r} is published already.", hint="Choose another name.")
         raw = bytes.fromhex(uuid)
         if self._is_measured(uuid) or self._station.measurements.is_running(raw):
-            raise Frozen(f"Node {uuid} is being measured: its names stay.", hint="End that measurement first.")
+            raise Frozen(
+                f"Node {uuid} is being measured, so its names cannot be changed now.", hint="End the measurement first."
+            )
         with self._station.durable("rename"):
             self._station.measurements.rename(raw, channel, name.strip("/") if name is not None else None)
             self._station.audit("rename", raw, "done", channel=channel, name=name)

@@ -41,8 +41,8 @@ class Presence:
             pid = os.pread(descriptor, 20, 0).decode(errors="replace").strip()
             os.close(descriptor)
             raise StoreLocked(
-                f"The base station of {self._home} runs already (pid {pid or 'unknown'}).",
-                hint="See it: teds-provision ncap status. End it: kill -TERM its pid.",
+                f"A base station is already running for {self._home} (pid {pid or 'unknown'}).",
+                hint="Show it: teds-provision ncap status. Stop it: kill -TERM PID.",
             ) from None
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
@@ -102,7 +102,9 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
             tls = daemon.settings.certificate is not None
             named = front(daemon.settings.allow, port, tls=tls)
             await servers.serve(Guard(app, daemon.tokens, named), tcp, daemon.settings)
-            daemon.url = f"{'https' if tls else 'http'}://{_shown(daemon.settings, host)}:{port}"
+            allowed = daemon.settings.allow  # on every address, people call it by the first name that is allowed
+            name = allowed[0] if allowed and host in ("0.0.0.0", "::") else host
+            daemon.url = f"{'https' if tls else 'http'}://{f'[{name}]' if ':' in name else name}:{port}"
         socket_path = str(Path(daemon.station.home) / SOCKET)
         tell({"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid()})
         daemon.live.told = tell
@@ -118,12 +120,6 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
     finally:
         watchdog.cancel()
         await servers.stop()
-
-
-def _shown(settings: Settings, host: str) -> str:
-    """The name under which people call it."""
-    name = settings.allow[0] if settings.allow and host in ("0.0.0.0", "::") else host
-    return f"[{name}]" if ":" in name else name
 
 
 def _ending(stop: asyncio.Event) -> Callable[[], None]:

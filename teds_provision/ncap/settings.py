@@ -71,7 +71,7 @@ def parse_http(text: str) -> tuple[str, int]:
     host, colon, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if colon else "127.0.0.1"
     if not port.isdecimal() or int(port) > 0xFFFF or not host:
-        raise UsageFailure(f"--http {text!r} is no HOST:PORT.", hint="Write it like 127.0.0.1:8351.")
+        raise UsageFailure(f"--http {text!r} is not HOST:PORT.", hint="Use, for example, 127.0.0.1:8351.")
     return host, int(port)
 
 
@@ -87,7 +87,9 @@ def _require_pair(certificate: Path, key: Path) -> None:
     """Raise BadData where OpenSSL cannot serve with these two files; an encrypted key is not asked for."""
 
     def no_passphrase() -> str:
-        raise BadData(f"{key} is encrypted.", hint="A service starts without a person: decrypt it, mode 0600.")
+        raise BadData(
+            f"{key} is encrypted.", hint="A service starts unattended: store the key decrypted, with mode 0600."
+        )
 
     for path in (certificate, key):
         if len(read_limited(path, _MOST_PEM, "PEM file")) == 0:
@@ -96,8 +98,8 @@ def _require_pair(certificate: Path, key: Path) -> None:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, no_passphrase)
     except (ssl.SSLError, OSError) as error:
         raise BadData(
-            f"{certificate} and {key} are no certificate with its key: {getattr(error, 'reason', None) or error}.",
-            hint="Both are PEM; the certificate comes first in its file.",
+            f"{certificate} and {key} are not a certificate and its key: {getattr(error, 'reason', None) or error}.",
+            hint="Both must be PEM files, and the certificate must come first in its file.",
         ) from error
 
 
@@ -114,18 +116,18 @@ def require_places(settings: Settings) -> None:
 def require_safe(settings: Settings) -> None:
     """Raise UsageFailure where the page would go to other machines without TLS, or with half of it."""
     if (settings.certificate is None) != (settings.key is None):
-        raise UsageFailure("--tls-cert and --tls-key belong together.", hint="Give both, or neither.")
+        raise UsageFailure("--tls-cert and --tls-key must be used together.", hint="Give both, or neither.")
     if settings.certificate is not None and settings.key is not None:
         _require_pair(settings.certificate, settings.key)
     if settings.http is None or is_loopback(settings.http[0]):
         return
     if settings.certificate is None:
         raise UsageFailure(
-            f"--http {settings.http[0]} would send values and tokens over the network in the clear.",
+            f"--http {settings.http[0]} would send values and tokens over the network unencrypted.",
             hint="Add --tls-cert and --tls-key, or serve 127.0.0.1 and use an SSH tunnel.",
         )
     if not settings.allow:
         raise UsageFailure(
-            f"--http {settings.http[0]} needs to know by which names browsers may call it.",
-            hint="Add --http-allow HOST for each.",
+            f"--http {settings.http[0]} needs the names under which browsers may reach it.",
+            hint="Add --http-allow HOST for each of them.",
         )

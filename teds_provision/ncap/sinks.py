@@ -62,7 +62,7 @@ class DaemonSinks:
         if not _NAME.match(spec) or Path(spec).suffix.lower() not in FILES:
             named = ", ".join(sorted(_ROS | self._brokers.keys()))
             raise UsageFailure(
-                f"{spec!r} is no sink that a request may name.",
+                f"{spec!r} is not a sink that a request may name.",
                 hint=f"Use {named}, or a file name in {', '.join(FILES)}. Brokers: config.toml, [ncap.brokers]",
             )
         return str(self._folder() / spec)
@@ -71,7 +71,7 @@ class DaemonSinks:
         """The sink of a kept measurement, not yet opened; raises UsageFailure, also for a name that is gone."""
         if spec not in self._brokers and _BROKER.match(spec) and spec not in _ROS:
             raise UsageFailure(
-                f"There is no broker {spec!r} any more.",
+                f"Broker {spec!r} is no longer configured.",
                 hint=f'Name it in config.toml: [ncap.brokers], {spec} = "mqtts://HOST".',
             )
         return open_sink(self._brokers.get(spec, spec), take)
@@ -85,7 +85,8 @@ class DaemonSinks:
         specs = [spec for spec in self._specs if spec not in own]
         if self._record is not None:
             stamp = time.strftime("%Y%m%d-%H%M%S")
-            specs.append(str(self._folder() / f"{_plain(kept.group or kept.id)}-{stamp}.csv"))
+            name = re.sub(r"[^A-Za-z0-9_-]+", "_", kept.group or kept.id)[:60] or "measurement"
+            specs.append(str(self._folder() / f"{name}-{stamp}.csv"))
         return [open_sink(spec, take) for spec in specs]
 
     def moves(self, kept: Measurement) -> bool:
@@ -106,11 +107,11 @@ class DaemonSinks:
 def _require_broker(name: str, url: str) -> None:
     if not _BROKER.match(name) or name in _ROS or name == STARTED:
         raise UsageFailure(
-            f"{name!r} cannot be the name of a broker.",
+            f"{name!r} is not a valid broker name.",
             hint="Use letters, digits, _ and -, beginning with a letter; not ros1, ros2, mqtt.",
         )
     if urlsplit(url).scheme not in ("mqtt", "mqtts"):
-        raise UsageFailure(f"The broker {name!r} of config.toml has no MQTT URL.", hint='Write "mqtts://USER@HOST".')
+        raise UsageFailure(f"Broker {name!r} in config.toml has no MQTT URL.", hint='Use "mqtts://USER@HOST".')
     open_sink(url)
 
 
@@ -140,7 +141,3 @@ def for_readers(told: Any) -> Any:
     if isinstance(told, dict):
         return {key: for_readers(value) for key, value in told.items()}
     return [for_readers(one) for one in told] if isinstance(told, list | tuple) else told
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:60] or "measurement"

@@ -200,7 +200,7 @@ def test_a_measurement_gives_values_freezes_its_nodes_and_ends(service: Service,
         ("DELETE", f"/virtual/{hand}", None),
     ):
         refused(asked, 409, "frozen", method, path, body)
-    assert "measured already" in refused(asked, 423, "node-busy", "POST", "/measurements", {"uuids": [hand]})
+    assert "already being measured" in refused(asked, 423, "node-busy", "POST", "/measurements", {"uuids": [hand]})
     assert asked.request("GET", f"/nodes/{hand}/teds")["verdict"] == "authentic", "reading goes on meanwhile"
 
     def running() -> Any:
@@ -322,7 +322,7 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
     refused(asked, 404, "not-found", "DELETE", f"/virtual/{made['uuid']}")
     refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "source": "exec:true"})
     taken = refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "noise"})
-    assert f"Node {hand} has the name 'hand' already." in taken
+    assert f"Node {hand} already has the name 'hand'." in taken
     refused(asked, 422, "bad-request", "POST", "/virtual", {"source": "noise"})
     refused(asked, 404, "not-found", "POST", "/virtual", {"profile": "no-such-type", "source": "noise"})
 

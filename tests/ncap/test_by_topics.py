@@ -129,7 +129,7 @@ def test_a_request_and_a_topic_do_not_pull_at_one_actuator(
             return None
 
         error = until(refused, "a request takes it from a topic")
-        assert (error.status, "set points of a topic" in error.message) == (423, True), error
+        assert (error.status, "set points from a topic" in error.message) == (423, True), error
         service.end()
 
 

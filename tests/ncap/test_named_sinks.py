@@ -46,7 +46,7 @@ def test_a_name_stands_for_its_url_when_it_is_opened_and_is_told_where_it_is_gon
     kept = Measurement("m", sinks=("mqtt",))
     assert sinks.more(kept, None) == [], "the daemon's own broker is not served twice"
     assert [sink.name for sink in sinks.more(Measurement("m", sinks=("lab",)), None)] == ["mqtt://own"]
-    with pytest.raises(UsageFailure, match="no broker 'lab' any more"):
+    with pytest.raises(UsageFailure, match="'lab' is no longer configured"):
         DaemonSinks(tmp_path, actuators=True).open("lab")
 
 

@@ -85,7 +85,7 @@ def test_a_token_that_is_removed_ends_its_open_channel_and_no_other(service: Ser
         with pytest.raises(ConnectionClosed) as ended:
             read_on(goes)
         assert ended.value.rcvd is not None
-        assert (ended.value.rcvd.code, ended.value.rcvd.reason) == (1008, "This token is not good any more.")
+        assert (ended.value.rcvd.code, ended.value.rcvd.reason) == (1008, "This token is invalid or has expired.")
         assert json.loads(stays.recv(PATIENCE))["type"] in ("beat", "event", "values")
 
 

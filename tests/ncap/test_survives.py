@@ -102,7 +102,7 @@ def test_one_daemon_in_a_home_and_without_one_nobody_answers(lab: Lab) -> None:
     station = lab.service.station
     assert station.refuses("ncap", "open", code=5)["hint"].endswith("ncap run")
     lab.service.start()
-    assert "runs already" in station.refuses("ncap", "run", code=7)["message"]
+    assert "already running" in station.refuses("ncap", "run", code=7)["message"]
     lab.service.end()
     assert not (station.home / "ncap.sock").exists()
     lab.service.start()

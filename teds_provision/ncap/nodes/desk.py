@@ -46,14 +46,12 @@ class Turns:
             while uuid in self._holders:
                 if uuid in self._frozen:
                     raise Frozen(
-                        f"Node {uuid} is being measured ({self._holders[uuid]}): it stays as it is.",
-                        hint="End that measurement first.",
+                        f"Node {uuid} is being measured ({self._holders[uuid]}) and cannot be changed now.",
+                        hint="End the measurement first.",
                     )
                 left = until - time.monotonic()
                 if left <= 0:
-                    raise NodeBusy(
-                        f"Node {uuid} is busy: {self._holders[uuid]}.", hint="Try again when that has ended."
-                    )
+                    raise NodeBusy(f"Node {uuid} is busy: {self._holders[uuid]}.", hint="Try again when that is done.")
                 self._news.wait(left)
             self._holders[uuid] = what
             if frozen:
@@ -131,8 +129,8 @@ class Desk:
             self.cancel(errand)
             if not errand.done.is_set():
                 raise NoNode(
-                    f"Node {uuid} is on no bus of this station, and was not held to a reader within {wait:.0f} s.",
-                    hint="Hold it to the reader, or connect it to the bus.",
+                    f"Node {uuid} is on no bus of this station and was not placed on a reader within {wait:.0f} s.",
+                    hint="Place it on the reader, or connect it to the bus.",
                 )
             errand.done.wait()
         if errand.error is not None:

@@ -109,7 +109,7 @@ class Holding:
         if not held.crossed:
             held.crossed = True
             self._live.event("actuator", uuid=command.uuid, state="refused", channel=command.channel,
-                             why="A set point came by a topic while a request holds the actuator.")  # fmt: skip
+                             why="A set point arrived by topic while a request holds the actuator.")  # fmt: skip
         return False
 
     def put(self, uuid: str, channel: int, value: float, unit: str | None, hold: float | None) -> dict[str, Any]:
@@ -132,7 +132,9 @@ class Holding:
             held.order = _Order(value, unit, mine)
             held.news.notify_all()
             if fresh:
-                self._start(held, value, unit)
+                who = contextvars.copy_context()  # on whose word, for the audit log
+                work = (self._run, held, value, unit)
+                threading.Thread(target=who.run, args=work, name=f"hold {held.uuid[:8]}", daemon=True).start()
             held.news.wait_for(lambda: held.answered >= mine or held.ended, _STARTING)
             return self._answer(held, mine, seconds)
 
@@ -146,17 +148,12 @@ class Holding:
             held = self._held[key] = _Held(uuid, channel, 0.0, _Order(value, unit, 1))
             return held, True
 
-    def _start(self, held: _Held, value: float, unit: str | None) -> None:
-        name = f"hold {held.uuid[:8]}"
-        who = contextvars.copy_context()  # on whose word, for the audit log
-        threading.Thread(target=who.run, args=(self._run, held, value, unit), name=name, daemon=True).start()
-
     @staticmethod
     def _answer(held: _Held, mine: int, seconds: float) -> dict[str, Any]:
         if held.error is not None and held.answered <= mine:
             raise held.error
         if held.answered < mine or held.applied is None:
-            raise LinkFailure("The actuator did not answer in time.", hint="Its dead-man brings it to its safe state.")
+            raise LinkFailure("The actuator did not answer in time.", hint="Its dead-man takes it to its safe state.")
         held.until = time.monotonic() + seconds
         return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
 
@@ -230,7 +227,7 @@ class Holding:
     def _own_session(self, uuid: str) -> Iterator[Trusted]:
         contact = self._desk.contact(uuid)
         if contact is None:
-            raise NoNode(f"Node {uuid} is on no bus of this station.", hint="Connect it; see /nodes.")
+            raise NoNode(f"Node {uuid} is not on any bus of this station.", hint="Connect it to a bus.")
         with self._turns.of(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
             yield open_trusted(self._station, node, by="ncap")
 
@@ -248,7 +245,7 @@ class Holding:
                     return
                 with session(held.uuid) as trusted:
                     if trusted is None:
-                        raise LinkFailure("The node is not there now.", hint="See /nodes.")
+                        raise LinkFailure("The node is not connected now.", hint="Connect it to a bus.")
                     if actuator is None or order.unit != unit:
                         actuator, unit = self._claimed(trusted, held, order, again=actuator is not None), order.unit
                     applied = actuator.apply(order.value)
@@ -287,8 +284,8 @@ class Holding:
                     raise
                 # It is claimed in this very session: by the set points of a topic, which only a measurement takes.
                 raise NodeBusy(
-                    f"Channel {held.channel} is driven by set points of a topic.",
-                    hint="End what publishes them, then ask again.",
+                    f"Channel {held.channel} is controlled by set points from a topic.",
+                    hint="Stop the publisher, then try again.",
                 ) from refusal
         return actuator
 

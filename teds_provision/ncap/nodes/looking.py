@@ -87,7 +87,9 @@ def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
             continue
         octets = read_block(node, block, until=until)
         if len(octets) > STRANGERS_OCTETS:
-            raise BadData(f"TEDS {block[1]} of channel {block[0]} has {len(octets)} octets: too long for a stranger's.")
+            raise BadData(
+                f"TEDS {block[1]} of channel {block[0]} has {len(octets)} octets: too long for an untrusted node."
+            )
         blocks[block] = octets
     image = Image(node.uuid, blocks)
     why = "the node opens no session under any key that is held here" if is_keyed(station, node.uuid) else ""

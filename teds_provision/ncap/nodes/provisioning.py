@@ -27,7 +27,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build_order import BuildOrder, prepare
-from teds_provision.steps.identify import Identified, identify
+from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, newcomer, provision
 from teds_provision.steps.verify import Verified, require_authentic
 from teds_provision.steps.visits.sheet_file import write_sheet
@@ -73,7 +73,7 @@ class Provisioning:
         with self._guard:
             run = self._runs.get(uuid)
         if run is None:
-            raise NotFound(f"Nobody asked to provision node {uuid}.", hint="POST to this resource.")
+            raise NotFound(f"No provisioning was requested for node {uuid}.", hint="Start one with POST.")
         return run.as_json()
 
     def begin(
@@ -86,7 +86,7 @@ class Provisioning:
         with self._guard:
             before = self._runs.get(uuid)
             if before is not None and before.state in ("waiting", "running"):
-                raise UsageFailure(f"Node {uuid} is being provisioned already.", hint="Cancel that one first.")
+                raise UsageFailure(f"Node {uuid} is already being provisioned.", hint="Cancel that first.")
             run = self._runs[uuid] = Run(uuid)
         folder = tempfile.TemporaryDirectory(prefix="ncap-")
         try:
@@ -123,7 +123,7 @@ class Provisioning:
         with self._guard:
             run = self._runs.get(uuid)
         if run is None:
-            raise NotFound(f"Nobody asked to provision node {uuid}.")
+            raise NotFound(f"No provisioning was requested for node {uuid}.")
         if run.errand is not None and self._desk.cancel(run.errand):
             run.state, run.waits_for, run.until = "cancelled", None, None
             run.errand.done.set()
@@ -139,7 +139,12 @@ class Provisioning:
 
         def watch() -> None:
             if not errand.done.wait(WAITING) and self._desk.cancel(errand):
-                self._fail(run, _no_tap(run.uuid))
+                problem = {
+                    "code": "no-node",
+                    "message": f"Node {run.uuid} was not placed on a reader within {WAITING:.0f} s.",
+                    "hint": "Try again, and hold its NFC antenna flat on the reader.",
+                }
+                self._fail(run, problem)
             else:
                 errand.done.wait()
                 if errand.error is not None:
@@ -174,7 +179,8 @@ class Provisioning:
         self._tell(run)
         reporter = _Told(run, self._live)
         try:
-            done: Provisioned = provision(self._station, node, order, accept=_accepted, reporter=reporter)
+            # Whoever asks for this very node, or for the one that they are about to tap, has accepted its key.
+            done: Provisioned = provision(self._station, node, order, accept=lambda _who: None, reporter=reporter)
         except SessionLost as lost:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
@@ -226,18 +232,6 @@ class _Told:
         self._live.event("provision", uuid=self._run.uuid, state="running", step=name, result=result, detail=detail)
 
 
-def _accepted(_who: Identified) -> None:
-    """Whoever asks for this very node, or for the one that he is about to tap, has said yes to it."""
-
-
-def _no_tap(uuid: str) -> dict[str, str]:
-    return {
-        "code": "no-node",
-        "message": f"Node {uuid} was not held to a reader within {WAITING:.0f} s.",
-        "hint": "Ask again, and hold its NFC antenna flat on the reader.",
-    }
-
-
 def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
     """A calibration that came as text, as the file that the steps read; its ending says which form it has."""
     if text is None:
@@ -245,7 +239,7 @@ def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
     suffix = Path(name or "calibration.csv").suffix.lower()
     if suffix not in _SUFFIXES:
         raise UsageFailure(
-            f"A calibration named {name!r} cannot be read.", hint=f"Let it end in {', '.join(_SUFFIXES)}."
+            f"Unsupported calibration file: {name!r}.", hint=f"Its name must end in {', '.join(_SUFFIXES)}."
         )
     path = folder / f"calibration{suffix}"
     path.write_text(text, encoding="utf-8")
@@ -273,7 +267,9 @@ class Adopting:
         uuid = node.uuid.hex()
         if uuid in self._virtuals:
             verified = self._virtual(node, uuid)
-            self._note(uuid, verified=time.time(), verdict=verified)
+            self._roster.show_sheet(uuid, None)
+            self._roster.refresh([uuid])
+            self._roster.note(uuid, "verified", problem=None, verdict=verified.verdict, heard=None, looked=time.time())
             return True
         if (
             self._adopts()
@@ -303,9 +299,3 @@ class Adopting:
         if self._virtuals.name_of(uuid):
             station.nodes.remember(node.uuid, name=self._virtuals.name_of(uuid))
         return done.verified
-
-    def _note(self, uuid: str, *, verified: float, verdict: Verified) -> None:
-        facts: dict[str, Any] = {"verdict": verdict.verdict, "heard": None, "looked": verified}
-        self._roster.show_sheet(uuid, None)
-        self._roster.refresh([uuid])
-        self._roster.note(uuid, "verified", problem=None, **facts)

@@ -245,7 +245,7 @@ class Roster:
                 "power": seen.power,
             }
         out["virtual"] = self.virtual(uuid)
-        out["mode"] = _mode(seen)
+        out["mode"] = "measuring" if seen.measurement else "idle" if seen.present else None
         out["channels"] = [{**one, **self._now(uuid, one["number"])} for one in channels]
         return out
 
@@ -274,12 +274,6 @@ class Roster:
         age = max(0.0, time.time() - last.time)
         value = last.value if last.value is None or math.isfinite(last.value) else None
         return {"value": value, "raw": last.raw, "valid": value is not None, "time": last.time, "age": round(age, 3)}
-
-
-def _mode(seen: Seen) -> str | None:
-    """``measuring``, ``idle``; None for a node that is not there."""
-    idle = "idle" if seen.present else None
-    return "measuring" if seen.measurement else idle
 
 
 def channel_facts(one: Channel) -> dict[str, Any]:

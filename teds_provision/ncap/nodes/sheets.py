@@ -21,7 +21,7 @@ from teds_provision.steps.verify import Verified, known_of, session, verify_imag
 from teds_provision.steps.visits.sheet_file import SheetPlan, plan_sheet, write_sheet
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent, StepResult
+from teds_provision.talk.progress import Silent
 from teds_provision.teds.calibration.model import is_finite
 from teds_provision.teds.channel import TURN
 from teds_provision.teds.formats import Block, placed, write_blocks
@@ -66,7 +66,8 @@ class Sheets:
         judged = verdict_of(self._station, bytes.fromhex(uuid))
         if kept is None or judged is None:
             raise NotFound(
-                f"The datasheet of node {uuid} was never read.", hint="Connect it to the bus, or hold it to the reader."
+                f"The datasheet of node {uuid} has never been read.",
+                hint="Connect it to the bus, or place it on the reader.",
             )
         return ReadSheet(kept, judged, now=held is not None)
 
@@ -84,7 +85,7 @@ class Sheets:
     def document(self, uuid: str, form: str) -> tuple[str, str]:
         """The datasheet as a document, and its media type; raises UsageFailure for a format that is none of ours."""
         if form not in FORMATS:
-            raise UsageFailure(f"{form!r} is no format of a datasheet.", hint=f"Use {', '.join(FORMATS)}.")
+            raise UsageFailure(f"Unsupported datasheet format: {form!r}.", hint=f"Use {', '.join(FORMATS)}.")
         image = self.read(uuid).image
         blocks = [Block(channel, code, image.blocks[channel, code]) for channel, code in image]
         text = write_blocks(blocks, form)  # type: ignore[arg-type]
@@ -132,7 +133,10 @@ class Sheets:
         def work(node: Conversation) -> dict[str, Any]:
             with self._station.turn(node.uuid):
                 done = write_sheet(self._station, node, blocks, Silent(), accept_calibration=accept, retype=retype)
-            steps = [_step(one) for one in done.steps]
+            steps = [
+                {"name": one.name, "result": one.result, "seconds": one.seconds, "detail": one.detail}
+                for one in done.steps
+            ]
             return {**_plan_json(done.plan), "steps": steps, "verdict": done.verified.verdict}
 
         done = self._desk.with_node(uuid, "a datasheet is written", work)
@@ -166,10 +170,6 @@ def _plan_json(plan: SheetPlan) -> dict[str, Any]:
 
 def _warning(text: str) -> dict[str, str]:
     return {"severity": "warning", "message": text, "hint": ""}
-
-
-def _step(one: StepResult) -> dict[str, Any]:
-    return {"name": one.name, "result": one.result, "seconds": one.seconds, "detail": one.detail}
 
 
 def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:

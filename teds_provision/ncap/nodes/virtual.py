@@ -109,7 +109,7 @@ class Virtuals:
         for one in list(self._all.values()):
             if not one.kept:
                 one.kept = True
-                self._keep(one)
+                threading.Thread(target=self._run, args=(one,), name=f"virtual {one.uuid[:8]}", daemon=True).start()
 
     def stop(self) -> None:
         """End them all."""
@@ -126,9 +126,9 @@ class Virtuals:
         """
         _check_source(source)
         if (content is None) == (profile is None):
-            raise UsageFailure("A virtual transducer needs a datasheet or a profile.", hint="Give one of the two.")
+            raise UsageFailure("A virtual transducer needs a datasheet or a profile.", hint="Give exactly one of them.")
         if len(self._all) >= MOST:
-            raise UsageFailure(f"There are {MOST} virtual transducers already.", hint="Remove one.")
+            raise UsageFailure(f"This station already has {MOST} virtual transducers.", hint="Remove one first.")
         folder = self._home / secrets.token_hex(6)
         try:
             one = self._made(folder, name or "", source, content, profile)
@@ -158,25 +158,26 @@ class Virtuals:
         if profile is not None and (lines := ideal_calibration(sheet)):
             write_whole(folder / _CALIBRATION, lines.encode())
         write_whole(folder / _FACTS, json.dumps({**one.as_json(), "profile": profile}).encode())
-        self._whitelist(state.uuid, fingerprint(state.node_key), one.name)
+        key = fingerprint(state.node_key)
+        with self._station.durable("virtual"):
+            self._station.pins.put(WhitelistEntry(state.uuid, key, assurance="import", name=one.name or None))
+            self._station.audit("virtual", state.uuid, "made", fingerprint=key)
         return one
 
     def _require_free(self, uuid: bytes, address: int, name: str) -> None:
         """Refuse a UUID, an address or a name that another node has: that one would be tried again for ever."""
         if uuid.hex() in self._all or self._station.nodes.is_known(uuid):
             raise UsageFailure(
-                f"Node {uuid.hex()} is there already.",
-                hint="Take the UUID out of its Meta-TEDS: a new one is made.",
+                f"Node {uuid.hex()} already exists.",
+                hint="Clear the UUID in its Meta-TEDS; a new one is generated.",
             )
         if address in self._addresses():
             raise UsageFailure(
-                f"Another virtual transducer has CAN address 0x{address:02X}.",
-                hint="Take the UUID out of the datasheet's Meta-TEDS: one that fits is made.",
+                f"Another virtual transducer already uses CAN address 0x{address:02X}.",
+                hint="Clear the UUID in the datasheet's Meta-TEDS; a suitable one is generated.",
             )
         if name and (others := self._station.nodes.all_named(name)):
-            raise UsageFailure(
-                f"Node {others[0].hex()} has the name {name!r} already.", hint="Give this one another name."
-            )
+            raise UsageFailure(f"Node {others[0].hex()} already has the name {name!r}.", hint="Choose another name.")
 
     def _addresses(self) -> set[int]:
         return {default_can_address(bytes.fromhex(uuid)) for uuid in self._all}
@@ -188,11 +189,6 @@ class Virtuals:
             uuid = secrets.token_bytes(UUID_OCTETS)
             if default_can_address(uuid) not in taken:
                 return uuid
-
-    def _whitelist(self, uuid: bytes, key: str, name: str) -> None:
-        with self._station.durable("virtual"):
-            self._station.pins.put(WhitelistEntry(uuid, key, assurance="import", name=name or None))
-            self._station.audit("virtual", uuid, "made", fingerprint=key)
 
     def profile_of(self, uuid: str) -> str | None:
         """The profile that one was made from; None: from a datasheet."""
@@ -229,13 +225,10 @@ class Virtuals:
         with self._guard:
             found = self._all.get(uuid)
         if found is None:
-            raise NotFound(f"{uuid} is no virtual transducer of this station.")
+            raise NotFound(f"{uuid} is not a virtual transducer of this station.")
         return found
 
     # -- the processes -----------------------------------------------------------------------------------------------
-
-    def _keep(self, one: Virtual) -> None:
-        threading.Thread(target=self._run, args=(one,), name=f"virtual {one.uuid[:8]}", daemon=True).start()
 
     def _run(self, one: Virtual) -> None:
         """Run it, and again when it ended, until it is removed or the daemon ends."""
@@ -306,10 +299,10 @@ def _check_source(text: str) -> None:
     kind, _, rest = text.partition(":")
     if not _SOURCES.match(text):
         raise UsageFailure(
-            f"{text!r} is no source.", hint="Use noise, sine:SECONDS, ramp:SECONDS, file:/PATH or unix:/PATH."
+            f"{text!r} is not a valid source.", hint="Use noise, sine:SECONDS, ramp:SECONDS, file:/PATH or unix:/PATH."
         )
     if kind in ("sine", "ramp") and seconds_of(rest, kind) > _LONGEST_PERIOD:
-        raise UsageFailure(f"{text!r} takes longer than a day.", hint=f"Write seconds: {kind}:2.")
+        raise UsageFailure(f"{text!r} is longer than a day.", hint=f"Give seconds, such as {kind}:2.")
 
 
 def _end(process: subprocess.Popen[bytes] | None) -> None:

@@ -184,7 +184,7 @@ class Watch:
                 self._down(error)
             except Exception:  # noqa: BLE001 - a bug here must not end the watch on a link for good
                 _log.exception("The watch on %s failed; it begins anew.", self.place)
-                self._down(TedsProvisionError("Unexpected failure of the watch on this link.", hint="See the log."))
+                self._down(TedsProvisionError("This link failed unexpectedly.", hint="See the log."))
             if self.port is None:
                 self._stop.wait(pause)
                 pause = min(2 * pause, LAST_PAUSE)
@@ -229,25 +229,22 @@ class Watch:
             if isinstance(port, CanPort) and failure is None:
                 port.tell_of_rivals(self._notice)
             if asked is not None and failure is None:
-                self._ask_who_is_there(asked)
+                for uuid, sighting in asked.look(dict(self._known)):
+                    if sighting is not None:
+                        self.saw(sighting)
+                    elif not self._is_held(uuid):
+                        self._gone(uuid)
             else:
                 self._see_who_left(GONE_POLLS * POLL_AIR)
             self._tell_of_strangers()
             self._anew.wait(LOOK)
 
     def _look_for_all(self) -> None:
-        """Look at everybody who answers from now on; who does not is still one that was there, and is seen to leave."""
+        """Look at all who answer from now on; who does not is still known, and so is seen to leave."""
         self._looked_for = set(self._known)
 
     def _is_held(self, uuid: str) -> bool:
         return self._turns.holder(uuid) is not None
-
-    def _ask_who_is_there(self, asked: StillThere) -> None:
-        for uuid, sighting in asked.look(dict(self._known)):
-            if sighting is not None:
-                self.saw(sighting)
-            elif not self._is_held(uuid):
-                self._gone(uuid)
 
     def saw(self, sighting: Sighting) -> None:
         """A node answered on this bus; called from the look-out's thread."""
@@ -274,7 +271,7 @@ class Watch:
 
     def _gone(self, uuid: str) -> None:
         self._known.pop(uuid, None)
-        text = f"Node {uuid} does not answer any more."
+        text = f"Node {uuid} no longer answers."
         self._notice(Notice("node-left", text, uuid=bytes.fromhex(uuid)))
 
     # -- a reader is one command's at a time ---------------------------------------------------------------------------

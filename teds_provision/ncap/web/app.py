@@ -104,17 +104,17 @@ class _Page(StaticFiles):
 
 
 def _no_page(_request: Request, _error: Exception) -> Response:
-    error = {"code": "not-found", "message": "There is no such page.", "hint": "See /api/v1/openapi.json."}
+    error = {"code": "not-found", "message": "Page not found.", "hint": "See /api/v1/openapi.json."}
     return JSONResponse({"error": error}, 404)
 
 
 def _no_method(request: Request, error: Exception) -> Response:
-    told = {"code": "usage", "message": f"{request.method} is not for this resource.", "hint": ""}
+    told = {"code": "usage", "message": f"{request.method} is not allowed for this resource.", "hint": ""}
     return JSONResponse({"error": told}, 405, headers=getattr(error, "headers", None))
 
 
 async def _nothing(_request: Request) -> Response:
-    raise NotFound("There is no such resource.", hint="See /api/v1/openapi.json.")
+    raise NotFound("Resource not found.", hint="See /api/v1/openapi.json.")
 
 
 class Places:
@@ -187,9 +187,9 @@ async def _end_in_time(socket: WebSocket, tokens: Tokens, caller: Caller, leavin
         with suppress(TimeoutError):
             await asyncio.wait_for(leaving.wait(), LOOK_AT_TOKEN)
         if leaving.is_set():
-            code, why = _FULL, "Another token has too few places."
+            code, why = _FULL, "This connection was closed to make room for another token."
         elif caller.kind != "socket" and not _is_good(tokens, caller.digest):
-            code, why = _NOT_GOOD, "This token is not good any more."
+            code, why = _NOT_GOOD, "This token is invalid or has expired."
         else:
             continue
         with suppress(WebSocketDisconnect, RuntimeError, OSError):  # it has gone by itself

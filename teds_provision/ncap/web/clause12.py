@@ -49,7 +49,7 @@ class Clause12:
         path = request.path_params["path"].removesuffix(".htm")
         name = next((one for one in self._resources if one.lower() == path.lower()), None)
         if name is None:
-            raise NotFound("There is no such path of clause 12 here.", hint=f"There is: {', '.join(self._resources)}.")
+            raise NotFound("This clause 12 path is not supported.", hint=f"Supported: {', '.join(self._resources)}.")
         given = {key.lower(): value for key, value in request.query_params.items()}
         try:
             fields = {"errorCode": NO_ERROR, **await reading(self._resources[name], given)}
@@ -133,7 +133,7 @@ class Clause12:
 def _integer(given: dict[str, str], name: str) -> int:
     word = given.get(name.lower(), "")
     if not word.isdecimal() or int(word) > 0xFFFF:
-        raise UsageFailure(f"{name} has to be a number.")
+        raise UsageFailure(f"{name} must be a number.")
     return int(word)
 
 

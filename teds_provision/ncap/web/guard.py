@@ -148,19 +148,19 @@ class Guard:
         cookie, bearer = _cookie(headers, self.front.cookie), _bearer(headers)
         given = bearer or cookie
         if not given:
-            raise Refusal(401, "no-token", "This needs a token.", "Open the page by: teds-provision ncap open")
+            raise Refusal(401, "no-token", "A token is required.", "Open the page with: teds-provision ncap open")
         found = await asyncio.to_thread(self.tokens.find, given)
         if found is None:
             raise await self._wrong_token()
         if scope["type"] == "websocket" and found.kind == "browser" and "origin" not in headers:
-            raise Refusal(403, "no-origin", "A browser says where a WebSocket comes from; this one does not.")
+            raise Refusal(403, "no-origin", "The WebSocket request has no Origin header.")
         return Caller(found.name, found.kind, found.read_only, found.digest)
 
     async def _login(self, scope: Scope) -> Refusal:
         """Trade the token of `ncap open` for a cookie; told as a redirection to the page without it."""
         assert self.front is not None
         if scope["method"] != "GET":
-            return Refusal(405, "usage", "The login is a link.")
+            return Refusal(405, "usage", "The login address takes GET requests only.")
         given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
         cookie = await asyncio.to_thread(self.tokens.login, given)
         if cookie is None:
@@ -179,7 +179,9 @@ class Guard:
                 self._wrong.popleft()
             await self._slow_down()  # a right token is never slowed down: nobody can lock the others out
             return Refusal(429, "too-many", "Too many wrong tokens.", headers=((b"retry-after", b"60"),))
-        return Refusal(401, "wrong-token", "This token is not good (any more).", "A new one: teds-provision ncap open")
+        return Refusal(
+            401, "wrong-token", "This token is invalid or has expired.", "Get a new one: teds-provision ncap open"
+        )
 
     async def _slow_down(self) -> None:
         if self._slowed < _MOST_SLOWED:
@@ -195,10 +197,15 @@ def _headers(scope: Scope) -> dict[str, str]:
     for name, value in scope["headers"]:
         key = name.decode("latin-1").lower()
         if key in found and key in ("host", "origin", "content-length", "content-type", "authorization"):
-            raise Refusal(400, "usage", f"The header {key} comes twice.")
+            raise Refusal(400, "usage", f"Header {key} appears twice.")
         found[key] = value.decode("latin-1") if key not in found else f"{found[key]}; {value.decode('latin-1')}"
     if "content-length" in found and "transfer-encoding" in found:  # RFC 9112, section 6.3: who reads which is unknown
-        raise Refusal(400, "usage", "A body has one length.", headers=((b"connection", b"close"),))
+        raise Refusal(
+            400,
+            "usage",
+            "A request must not have both Content-Length and Transfer-Encoding.",
+            headers=((b"connection", b"close"),),
+        )
     return found
 
 
@@ -207,13 +214,13 @@ def _require_origin(named: Front, headers: Mapping[str, str]) -> None:
         raise Refusal(
             421,
             "foreign-host",
-            "This server is not called so.",
+            "This host name is not allowed.",
             "Use the address that ncap open prints; see --http-allow.",
         )
     if "origin" in headers and headers["origin"].lower() not in named.origins:
-        raise Refusal(403, "foreign-origin", "Another page may not use this server.")
+        raise Refusal(403, "foreign-origin", "Requests from another origin are not allowed.")
     if headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
-        raise Refusal(403, "foreign-origin", "Another site may not use this server.")
+        raise Refusal(403, "foreign-origin", "Requests from another site are not allowed.")
 
 
 def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> None:
@@ -222,14 +229,18 @@ def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> N
         return
     length = headers.get("content-length", "")
     if length.isdecimal() and int(length) > LARGEST_BODY:
-        raise Refusal(413, "too-large", f"At most {LARGEST_BODY} octets are taken.")
+        raise Refusal(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
     if scope["method"] in SAFE:
         return
     if caller.read_only:
-        raise Refusal(403, "read-only", f"The token {caller.name!r} may only read.", "Use one without --read-only.")
+        raise Refusal(
+            403, "read-only", f"Token {caller.name!r} is read-only.", "Use a token that was added without --read-only."
+        )
     empty = scope["method"] == "DELETE" and length in ("", "0") and "transfer-encoding" not in headers
     if not empty and headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise Refusal(415, "not-json", "What changes anything comes as JSON.", "Send Content-Type: application/json.")
+        raise Refusal(
+            415, "not-json", "Requests that change something must be JSON.", "Send Content-Type: application/json."
+        )
 
 
 def _limited(receive: Receive) -> Receive:
@@ -241,7 +252,7 @@ def _limited(receive: Receive) -> Receive:
         message = await receive()
         taken += len(message.get("body", b""))
         if taken > LARGEST_BODY:
-            raise Refusal(413, "too-large", f"At most {LARGEST_BODY} octets are taken.")
+            raise Refusal(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
         return message
 
     return next_message

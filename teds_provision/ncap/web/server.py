@@ -123,7 +123,7 @@ def listen(host: str, port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         listener.close()
         raise LinkFailure(
-            f"The page cannot be served on {host}:{port}: {getattr(error, 'strerror', None) or error}.",
+            f"Cannot serve the page on {host}:{port}: {getattr(error, 'strerror', None) or error}.",
             hint="Choose another address with --http.",
         ) from error
     return listener

@@ -63,10 +63,10 @@ class Tokens:
     def add(self, name: str, *, read_only: bool = False) -> str:
         """Make a token for a script; it is given back once and nowhere else. Raises UsageFailure for a taken name."""
         if not name.strip() or not name.isprintable() or len(name) > _LONGEST_NAME:
-            raise UsageFailure(f"{name!r} cannot be the name of a token.", hint="Use up to 64 printable characters.")
+            raise UsageFailure(f"{name!r} is not a valid token name.", hint="Use up to 64 printable characters.")
         with self._changing() as tokens:
             if any(one.name == name and one.kind == "script" for one in tokens):
-                raise UsageFailure(f"There is a token {name!r} already.", hint=f"Remove it: ncap token remove {name}")
+                raise UsageFailure(f"Token {name!r} already exists.", hint=f"Remove it: ncap token remove {name}")
             token = secrets.token_urlsafe(32)
             tokens.append(Token(name, "script", digest_of(token), read_only, time.time()))
         return token
@@ -78,7 +78,7 @@ class Tokens:
             gone = len(tokens) - len(kept)
             if not gone:
                 known = ", ".join(dict.fromkeys(one.name for one in tokens)) or "none"
-                raise NotFound(f"There is no token {name!r}.", hint=f"There is: {known}.")
+                raise NotFound(f"No token is named {name!r}.", hint=f"Known tokens: {known}.")
             tokens[:] = kept
         return gone
 
@@ -165,5 +165,6 @@ def _parsed(octets: bytes) -> list[Token]:
         return [Token(**row) for row in rows]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreFailure(
-            f"{FILE} cannot be read: nobody is let in.", hint="Remove it, and make new tokens: ncap token add NAME"
+            f"{FILE} cannot be read, so no token is accepted.",
+            hint="Remove the file and create new tokens: ncap token add NAME",
         ) from error
