@@ -32,12 +32,12 @@ from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.ports import free_port
 from teds_provision.measure.blocks import Block, StationFacts
 from teds_provision.measure.clock import ClockMap, Exchange, Monotone, Wall
-from teds_provision.measure.facts import facts_of
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.hearing import CanHearing, HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.runner import BEAT
 from teds_provision.measure.sinks import Sink, open_sink
+from teds_provision.measure.trusting import facts_of
 from teds_provision.protocol.operation.can_frames import Assembly, DataAddress, cut
 from teds_provision.protocol.operation.datagram import Sealer, stream_key
 from teds_provision.protocol.operation.stream_commands import Subscribed

@@ -26,10 +26,10 @@ import numpy as np
 
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
-from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.buses import Buses
+from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.job import Job
-from teds_provision.measure.wish import Wish
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.described import create
 from teds_provision.node.hardware.board import Board
@@ -116,7 +116,7 @@ class Bench:
         uuids = tuple(self.nodes)[:count]
         file = self.folder / f"run-{count}-{time.monotonic_ns()}.csv"
         kept = Measurement("", uuids=uuids, rate=RATE, sinks=(str(file),), lasting=False)
-        job = Job(self.station, kept, wish=Wish(timeout=60.0))
+        job = Job(self.station, kept, request=MeasurementRequest(timeout=60.0))
         came: list[tuple[int, Block]] = []
         stop, port = threading.Event(), CanPort(self.can)
         with ExitStack() as stack:

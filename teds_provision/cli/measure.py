@@ -26,9 +26,9 @@ from teds_provision.store import Measurement
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view
+    from teds_provision.measure.request import Requirements
     from teds_provision.measure.runner import Ended
     from teds_provision.measure.running.job import Job
-    from teds_provision.measure.running.requirements import Requirements
     from teds_provision.measure.sinks.mcap.recover import Recovered
     from teds_provision.station.station import Station
 else:  # loads the sinks and numpy
@@ -105,10 +105,12 @@ def measure(
     kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished | {"require": _requirements(require)})
     if group and duration is None:
         kept = _carried_on(app, station, kept)
-    job = measure_room.running.job.Job(station, kept, wish=measure_room.wish.Wish(timeout=links.timeout))
+    job = measure_room.running.job.Job(
+        station, kept, request=measure_room.request.MeasurementRequest(timeout=links.timeout)
+    )
     for uuid in uuids:
         station.unlock(uuid)
-    _tell_end(app, _run(app, job, links, uuids, duration), job.wish.require)
+    _tell_end(app, _run(app, job, links, uuids, duration), job.request.require)
 
 
 def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
@@ -188,11 +190,11 @@ def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], durati
     try:
         with ExitStack() as stack:
             stack.enter_context(
-                measure_room.finding.sources.sole_user(station, buses_alone, f"measure {group or ', '.join(nodes)}")
+                measure_room.sources.sole_user(station, buses_alone, f"measure {group or ', '.join(nodes)}")
             )
             watcher = stack.enter_context(measure_view.watcher_for(app, station, job.sinks, stop))
             stack.enter_context(ending(stop))
-            buses = stack.enter_context(measure_room.finding.buses.Buses(ports, note=app.warn))
+            buses = stack.enter_context(measure_room.buses.Buses(ports, note=app.warn))
             station.audit("measure", None, "begun", nodes=nodes, group=group)
             ended = job.run(buses, stop, watcher=watcher, duration=duration)
     finally:

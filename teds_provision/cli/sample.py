@@ -200,7 +200,7 @@ def set_value(
     stop = threading.Event()
     links = over_the_bus(links)
     with (
-        measure.finding.sources.beside(station, links, f"set {uuid.hex()}"),
+        measure.sources.beside(station, links, f"set {uuid.hex()}"),
         trusted_node(app, station, links, uuid, by="set") as trusted,
         ending(stop),
     ):

@@ -46,11 +46,12 @@ from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, StepResult, Steps
 
 if TYPE_CHECKING:
-    from teds_provision.measure import blocks, finding, held_actuator, runner, sinks, trusting, wish
+    from teds_provision.measure import blocks, held_actuator, request, runner, sinks, trusting
+    from teds_provision.measure import buses as buses_room
 else:  # numpy and what measuring needs are loaded when the demo gets there
-    blocks, finding, held_actuator, runner, sinks, trusting, wish = (
+    blocks, buses_room, held_actuator, runner, sinks, trusting, request = (
         late(f"teds_provision.measure.{name}")
-        for name in ("blocks", "finding", "held_actuator", "runner", "sinks", "trusting", "wish")
+        for name in ("blocks", "buses", "held_actuator", "runner", "sinks", "trusting", "request")
     )
 
 
@@ -188,8 +189,8 @@ def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> Non
         try:
             sink = sinks.open_sink(str(file))
             facts = blocks.StationFacts(station.name, group="robot", started=time.time())
-            asked = wish.Wish(rate=RATE, timeout=15.0)
-            with finding.buses.Buses([port]) as buses:
+            asked = request.MeasurementRequest(rate=RATE, timeout=15.0)
+            with buses_room.Buses([port]) as buses:
                 ended = runner.Measurement(station, buses, uuids, asked, [sink], facts).run(threading.Event(), SECONDS)
         finally:
             port.close()

@@ -7,23 +7,25 @@ from teds_provision.lazy import lazy
 if TYPE_CHECKING:
     from teds_provision.measure import (
         blocks,
+        buses,
         clock,
-        facts,
-        finding,
         grid,
         hearing,
         held_actuator,
         interpreter,
         keeper,
+        lookout,
         planning,
+        request,
         rest,
         runner,
         running,
         sampling,
+        sightings,
         sinks,
+        sources,
         topic_actuators,
         trusting,
-        wish,
     )
 else:
     __getattr__ = lazy(__name__)

@@ -25,17 +25,17 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.measure.blocks import Command, NodeReport, State
+from teds_provision.measure.buses import Bus, Buses
 from teds_provision.measure.clock import AT_FIRST, HostClock
-from teds_provision.measure.finding.buses import Bus, Buses
-from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
+from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.rest import Rest
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.patience import Patience
 from teds_provision.measure.running.streams import NodeStreams, added
+from teds_provision.measure.sightings import Sighting
 from teds_provision.measure.topic_actuators import TopicActuators
 from teds_provision.measure.trusting import Standing, Trusted, claim, open_trusted
-from teds_provision.measure.wish import Events, Wish
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
@@ -62,7 +62,7 @@ class NodeKeeper:
         station: Station,
         buses: Buses,
         uuid: bytes,
-        wish: Wish,
+        request: MeasurementRequest,
         host: HostClock,
         events: Events,
         common_start: CommonStart,
@@ -78,7 +78,7 @@ class NodeKeeper:
         self.done = threading.Event()
         self._station, self._buses = station, buses
         self.bus: Bus | None = None  # where it is, once it was found
-        self._wish, self._events, self._common_start = wish, events, common_start
+        self._request, self._events, self._common_start = request, events, common_start
         self._stop = threading.Event()
         self._anew = threading.Event()
         self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
@@ -114,7 +114,7 @@ class NodeKeeper:
 
     def _run(self) -> None:
         pause = FIRST_PAUSE
-        patience = self._patience = Patience(None if self._wish.patient else self._wish.timeout)
+        patience = self._patience = Patience(None if self._request.patient else self._request.timeout)
         try:
             while not self._stop.is_set():
                 self._anew.clear()
@@ -135,8 +135,8 @@ class NodeKeeper:
             self._say("ended")
         finally:
             self._common_start.gone(self.uuid)
-            if self._wish.require is not None:
-                self._wish.require.gone(self.uuid)
+            if self._request.require is not None:
+                self._request.require.gone(self.uuid)
             for bus in self._buses.all():
                 bus.share.gone(self.uuid)
             self.done.set()
@@ -167,7 +167,7 @@ class NodeKeeper:
         return None
 
     def _once(self) -> None:
-        seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._wish.timeout, self._patience.left), 1))
+        seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._request.timeout, self._patience.left), 1))
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self._sighting = sighting
         self.bus = self._buses.of(sighting)
@@ -185,11 +185,11 @@ class NodeKeeper:
         standing = Standing(self._station, self.uuid)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
             try:
-                trusted = open_trusted(self._station, node, by=self._wish.by, unsigned=self._wish.unsigned)
+                trusted = open_trusted(self._station, node, by=self._request.by, unsigned=self._request.unsigned)
             finally:
                 self._proven = node.sealed
-            if self._wish.require is not None:
-                self._wish.require.offer(self.uuid, trusted.sheet, self._stop)
+            if self._request.require is not None:
+                self._request.require.offer(self.uuid, trusted.sheet, self._stop)
             self.trusted, self._announced = trusted, 0.0
             self._buses.sightings.on_announce(sighting, self._heard_announce)
             answers = False
@@ -226,9 +226,9 @@ class NodeKeeper:
 
     def _actuators(self, trusted: Trusted) -> list[Channel]:
         """Actuators that set points may come for: of a signed datasheet on the whitelist, with a way to raw values."""
-        if trusted.unsigned or not self._wish.actuators or self._station.pins.entry(self.uuid) is None:
+        if trusted.unsigned or not self._request.actuators or self._station.pins.entry(self.uuid) is None:
             return []
-        wanted = self._wish.channels
+        wanted = self._request.channels
         return [
             one
             for one in trusted.sheet.channels
@@ -238,25 +238,25 @@ class NodeKeeper:
     def _sensors(self, every: Sequence[Channel], actuators: list[Channel]) -> list[Channel]:
         """Sensors to measure; none where only actuators were asked for, or the node has nothing else."""
         moved = {one.number for one in actuators}
-        asked = [number for number in self._wish.channels if number not in moved]
-        nothing_else = all(one.actuator for one in every) or (self._wish.channels and not asked)
+        asked = [number for number in self._request.channels if number not in moved]
+        nothing_else = all(one.actuator for one in every) or (self._request.channels and not asked)
         if actuators and nothing_else:
             return []
-        return sensors_of(every, asked, self._wish.kind)
+        return sensors_of(every, asked, self._request.kind)
 
     def _claim(self, trusted: Trusted, channels: list[Channel]) -> None:
         """Claim the sensors one by one, or the whole node at once where every sensor is measured."""
         sensors = [one for one in trusted.sheet.channels if not one.actuator]
         whole = bool(channels) and len(channels) == len(sensors)
         for number in [0] if whole else [one.number for one in channels]:
-            claim(trusted, number, lease=self._wish.lease)
+            claim(trusted, number, lease=self._request.lease)
 
     def _take_up(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> TopicActuators:
         return TopicActuators(
             trusted,
             functools.partial(bus.drive, address),
             tuple(sorted(one.number for one in actuators)),
-            dead_man=self._wish.dead_man,
+            dead_man=self._request.dead_man,
             clock=self.streams.clock,
             turn=self.turn,
             mapping=self.streams.mapping,
@@ -265,7 +265,7 @@ class NodeKeeper:
         )
 
     def _subscribe(self, bus: Bus, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
-        rate, share = self._wish.rate, bus.share
+        rate, share = self._request.rate, bus.share
         if rate is None:
             share.want(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
         start = self._common_start.start(self.uuid, self.streams.clock)
@@ -293,16 +293,16 @@ class NodeKeeper:
         return plan_node(
             channels,
             bus,
-            rate=self._wish.rate,
-            kind=self._wish.kind,
-            test_pattern=self._wish.test_pattern,
+            rate=self._request.rate,
+            kind=self._request.kind,
+            test_pattern=self._request.test_pattern,
             start=start,
             slower=2**self._halved,
         )
 
     def _keep(self, bus: Bus, trusted: Trusted, standing: Standing) -> None:
         """Clock every lease / 3 until the end, or until the node is lost, or may not be measured any more."""
-        rest = Rest(self._station, trusted, bus, by=self._wish.by) if trusted.kept else None
+        rest = Rest(self._station, trusted, bus, by=self._request.by) if trusted.kept else None
         try:
             self._watch(bus, trusted, standing, rest)
         finally:
@@ -311,7 +311,7 @@ class NodeKeeper:
 
     def _watch(self, bus: Bus, trusted: Trusted, standing: Standing, rest: Rest | None) -> None:
         told = time.monotonic()
-        every = self._wish.lease / 3
+        every = self._request.lease / 3
         lied = False
         while not self._stop.is_set():
             self._anew.wait(LOOK)

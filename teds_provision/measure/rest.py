@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from teds_provision.errors import BadData, BadDatasheet, Garbled, NodeRefused, NodeSilent
-from teds_provision.measure.finding.buses import Bus
+from teds_provision.measure.buses import Bus
 from teds_provision.measure.trusting import Trusted
 from teds_provision.station.station import Station
 from teds_provision.steps import reading

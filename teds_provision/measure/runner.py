@@ -17,15 +17,15 @@ from typing import Any
 
 from teds_provision.errors import LinkFailure, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.buses import Buses
 from teds_provision.measure.clock import HostClock
-from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.keeper import NodeKeeper
+from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running import trigger
 from teds_provision.measure.running.common_start import TOGETHER, CommonStart
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import Trusted
-from teds_provision.measure.wish import Events, Wish
 from teds_provision.station.station import Station
 
 BEAT = 0.02  # seconds between rows of the group
@@ -63,7 +63,7 @@ class Measurement:
     station: Station
     buses: Buses
     uuids: Sequence[bytes]
-    wish: Wish
+    request: MeasurementRequest
     sinks: Sequence[Sink]
     facts: StationFacts
     watcher: Watcher = field(default_factory=Watcher)
@@ -82,7 +82,7 @@ class Measurement:
         self._for_grid: deque[Block] = deque()
         self._shown: dict[str, str] = {}  # what was told of each sink last, and since when one waits
         self._waits: dict[str, float] = {}
-        self._common_start = CommonStart(self.uuids, trigger=self.wish.trigger)
+        self._common_start = CommonStart(self.uuids, trigger=self.request.trigger)
         opened: list[Sink] = []
         try:
             for sink in self.sinks:
@@ -93,11 +93,11 @@ class Measurement:
                 sink.close()
             raise
         self.buses.expect(self.uuids)
-        if self.wish.require is not None:
-            self.wish.require.expect(self.uuids)
+        if self.request.require is not None:
+            self.request.require.expect(self.uuids)
         events = Events(self._block, self._describe, self._report)
         self.keepers = [
-            NodeKeeper(self.station, self.buses, uuid, self.wish, self._host, events, self._common_start)
+            NodeKeeper(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
         ]
         for keeper in self.keepers:

@@ -6,12 +6,13 @@ import hashlib
 import math
 import time
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 
 from teds_provision.errors import BadData, PolicyRefused
 from teds_provision.links.ports import Timed
 from teds_provision.measure.blocks import ChannelFacts
+from teds_provision.measure.blocks import Kind as KindWord
 from teds_provision.measure.clock import ClockMap, Exchange
-from teds_provision.measure.facts import facts_of
 from teds_provision.protocol.operation import commands
 from teds_provision.protocol.operation.commands import Operation
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
@@ -21,7 +22,44 @@ from teds_provision.steps.board_type import operate
 from teds_provision.steps.verify import require_authentic
 from teds_provision.steps.verify_node import look_in_session
 from teds_provision.talk.conversation import Conversation
-from teds_provision.teds.sheet import Channel, Sheet
+from teds_provision.teds.sheet import Channel, Kind, Sheet
+
+# From a signed datasheet to the facts that go with every value.
+
+_WORDS: dict[Kind, KindWord] = {Kind.SENSOR: "sensor", Kind.ACTUATOR: "actuator", Kind.EVENT_SENSOR: "event"}
+
+
+def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, period: float | None) -> ChannelFacts:
+    """Facts of one channel; ``name`` of the node, ``fingerprint`` of its Security TEDS (64 hex digits).
+
+    Values, limits and uncertainty are in the SI unit of the datasheet; ``period`` in seconds, which events do not have.
+    """
+    calibrated, due = channel.calibrated_at, channel.due
+    return ChannelFacts(
+        uuid=sheet.uuid.hex(),
+        node=name or sheet.meta.name,
+        number=channel.number,
+        name=channel.name,
+        kind=_WORDS.get(channel.kind or Kind.SENSOR, "sensor"),
+        unit=channel.si_unit,
+        units=channel.units,
+        shown_unit=channel.unit.text,
+        low=_known(channel.low),
+        high=_known(channel.high),
+        uncertainty=_known(channel.stated_uncertainty),
+        calibrated=calibrated.date().isoformat() if calibrated else None,
+        due=due.date().isoformat() if due else None,
+        overdue=channel.overdue(datetime.now(UTC)),
+        fingerprint=fingerprint,
+        sample_form=channel.sample.name if channel.sample else "",
+        period=None if channel.kind == Kind.EVENT_SENSOR else period,
+        vector=next((group for group in sheet.meta.vectors if channel.number in group), ()),
+    )
+
+
+def _known(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
 
 LEASE = 10  # seconds that a claim holds without a word of this station
 DEAD_MAN = 1000  # milliseconds without a set point after which an actuator is safe

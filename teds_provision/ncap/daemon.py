@@ -13,8 +13,8 @@ from teds_provision import __version__
 from teds_provision.errors import Frozen, NotFound, UsageFailure
 from teds_provision.links import Port
 from teds_provision.measure.blocks import Command
-from teds_provision.measure.finding.buses import Buses
-from teds_provision.measure.finding.sightings import Sighting
+from teds_provision.measure.buses import Buses
+from teds_provision.measure.sightings import Sighting
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measuring import Measuring
 from teds_provision.ncap.names import Names

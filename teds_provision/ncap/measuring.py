@@ -15,13 +15,13 @@ from typing import Any, Final
 
 from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport, StationFacts
-from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.buses import Buses
 from teds_provision.measure.planning import period_of, sensors_of
+from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.job import Job
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
-from teds_provision.measure.wish import Wish
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import as_problem
@@ -291,7 +291,7 @@ class Measuring:
                 one.kept,
                 more=lambda take: self._sinks.more(one.kept, take),
                 admits=self._admits if self._sinks.moves(one.kept) else None,
-                wish=Wish(patient=True, by="ncap"),
+                request=MeasurementRequest(patient=True, by="ncap"),
                 opened=self._sinks.open,
             )
             one.job = job

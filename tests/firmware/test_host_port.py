@@ -65,8 +65,8 @@ def test_its_stream_loses_nothing(desk: Desk, station: Station, node: CNode, kin
     node.start("--source", "sine:2")
     links = desk.links.over("can")
     assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
-    wish = ["--rate", "500", "--duration", "2", "--kind", kind, "--test-pattern"]
-    said = station.run("measure", node.uuid, *wish, *links)
+    request = ["--rate", "500", "--duration", "2", "--kind", kind, "--test-pattern"]
+    said = station.run("measure", node.uuid, *request, *links)
     assert said.code == 0, said
     counts = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", said.out + said.err)
     assert counts is not None, said

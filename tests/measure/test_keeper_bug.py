@@ -10,8 +10,8 @@ import pytest
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.clock import HostClock
 from teds_provision.measure.keeper import NodeKeeper
+from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running.common_start import CommonStart
-from teds_provision.measure.wish import Events, Wish
 
 UUID = bytes(range(10))
 
@@ -20,7 +20,8 @@ def test_a_foreign_exception_ends_the_node_with_an_error(monkeypatch: pytest.Mon
     reports: list[NodeReport] = []
     events = Events(lambda _block: None, lambda _facts: None, reports.append)
     buses: Any = SimpleNamespace(all=list)
-    keeper = NodeKeeper(None, buses, UUID, Wish(), HostClock(), events, CommonStart([UUID]))  # type: ignore[arg-type]
+    host = HostClock()
+    keeper = NodeKeeper(None, buses, UUID, MeasurementRequest(), host, events, CommonStart([UUID]))  # type: ignore[arg-type]
 
     def broken() -> None:
         raise ValueError("cannot convert float NaN to integer")

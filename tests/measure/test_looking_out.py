@@ -16,9 +16,8 @@ import pytest
 from teds_provision.errors import AddressConflict, LinkFailure
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.finding.asking import LEAST, Pace
-from teds_provision.measure.finding.lookout import BELIEVED, SOON, Lookout
-from teds_provision.measure.finding.sightings import Sighting, Sightings
+from teds_provision.measure.lookout import BELIEVED, LEAST, SOON, Lookout, Pace
+from teds_provision.measure.sightings import Sighting, Sightings
 from teds_provision.ncap.nodes.watching import CHECK, MAX_PARALLEL, StillThere
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState

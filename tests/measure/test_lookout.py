@@ -14,11 +14,11 @@ import pytest
 from teds_provision.errors import AddressConflict, NodeRefused, NoNode, PolicyRefused
 from teds_provision.links.ports import Contact
 from teds_provision.measure.clock import ClockMap, Exchange
-from teds_provision.measure.finding.air import AirLookout
-from teds_provision.measure.finding.sightings import MOST, TWIN, Sighting, Sightings
+from teds_provision.measure.lookout import AirLookout
+from teds_provision.measure.request import Requirements
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.patience import Patience
-from teds_provision.measure.running.requirements import Requirements
+from teds_provision.measure.sightings import MOST, TWIN, Sighting, Sightings
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
@@ -105,7 +105,7 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Who answers at once was taken again and again, and the node, after its random wait, never."""
-    monkeypatch.setattr("teds_provision.measure.finding.sightings.TWIN", 5.0)
+    monkeypatch.setattr("teds_provision.measure.sightings.TWIN", 5.0)
     sightings = Sightings()
     copy, true = seen(ONE, 7), seen(ONE, 8)
     sightings.saw(copy)
@@ -120,7 +120,7 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     sightings.wrong(seen(ONE, 8))
     alone = time.monotonic()
     sightings.saw(seen(ONE, 7))
-    monkeypatch.setattr("teds_provision.measure.finding.sightings.TWIN", TWIN)
+    monkeypatch.setattr("teds_provision.measure.sightings.TWIN", TWIN)
     assert find(sightings, ONE, seconds=PATIENCE, fresh=alone).address == 7, "nobody else answers: it is tried again"
 
 

@@ -23,11 +23,10 @@ from pathlib import Path
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Command, StationFacts
-from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.buses import Buses
+from teds_provision.measure.request import MeasurementRequest, Requirements
 from teds_provision.measure.runner import Ended, Measurement, Watcher
-from teds_provision.measure.running.requirements import Requirements
 from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
-from teds_provision.measure.wish import Wish
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
@@ -59,13 +58,13 @@ class Job:
         kept: Kept,
         *,
         more: Callable[[CommandTaker | None], Sequence[Sink]] = lambda _take: (),
-        wish: Wish | None = None,
+        request: MeasurementRequest | None = None,
         admits: Callable[[Command], bool] | None = lambda _command: True,
         opened: Callable[[str, CommandTaker | None], Sink] = open_sink,
     ) -> None:
         self.station, self.kept = station, kept
         self._moves = kept.actuators and admits is not None
-        self.wish = replace(wish_of(kept, wish or Wish(patient=True)), actuators=self._moves)
+        self.request = replace(request_of(kept, request or MeasurementRequest(patient=True)), actuators=self._moves)
         self._more, self._admits, self._opened = more, admits, opened
         self._commands: Callable[[Command], None] = lambda _command: None
         self.sinks = self._new_sinks()
@@ -95,7 +94,7 @@ class Job:
             if duration is None and self.kept.ends is not None:
                 duration = max(0.1, self.kept.ends - time.time())
             self.measurement = measurement = Measurement(
-                self.station, buses, uuids, self.wish, self.sinks, self._facts(), watcher or Watcher()
+                self.station, buses, uuids, self.request, self.sinks, self._facts(), watcher or Watcher()
             )
             measurement.began = lambda: self._began(duration)
             self._commands = measurement.command
@@ -163,7 +162,7 @@ class Job:
             instance=self.kept.group or (first and f"n{first}"),
             started=time.time(),
             scalar_rate=self.kept.scalar_rate,
-            test_pattern=self.wish.test_pattern,
+            test_pattern=self.request.test_pattern,
         )
 
     def _new_sinks(self) -> list[Sink]:
@@ -176,7 +175,7 @@ class Job:
             self._commands(command)
 
 
-def wish_of(kept: Kept, more: Wish) -> Wish:
+def request_of(kept: Kept, more: MeasurementRequest) -> MeasurementRequest:
     """What is asked of each node; ``more`` has what is not kept: patience, time-out, lease."""
     return replace(
         more,

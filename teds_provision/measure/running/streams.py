@@ -12,8 +12,8 @@ from itertools import chain
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Block, Invalid
+from teds_provision.measure.buses import Bus
 from teds_provision.measure.clock import ClockMap, HostClock, Monotone
-from teds_provision.measure.finding.buses import Bus
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.trusting import Trusted, ask_clock

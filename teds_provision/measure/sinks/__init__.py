@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import lazy
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
-from teds_provision.measure.sinks.jsonl import JsonLinesSink
 from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.measure.sinks.ros.sourced import ros2_sink
-from teds_provision.measure.sinks.text import TextSink
+from teds_provision.measure.sinks.text import JsonLinesSink, TextSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
 

@@ -39,9 +39,17 @@ from teds_provision.measure.blocks import (
 )
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import facts_as_json
-from teds_provision.measure.sinks.meaning import VARIANCE_NOTE, Meaning, meaning_of, variance_of
 from teds_provision.measure.sinks.names import Topics, slug
-from teds_provision.measure.sinks.vectors import Compound, FieldValue, compounds_of, is_range
+from teds_provision.measure.sinks.vectors import (
+    VARIANCE_NOTE,
+    Compound,
+    FieldValue,
+    Meaning,
+    compounds_of,
+    is_range,
+    meaning_of,
+    variance_of,
+)
 
 NODE = "teds_provision"
 BUDGET = 5000  # messages a second that one process bears (docs/ros.md)

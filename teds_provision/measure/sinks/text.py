@@ -20,7 +20,7 @@ from typing import Any
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, why_invalid
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FileSink
-from teds_provision.measure.sinks.lines import facts_as_json, iso
+from teds_provision.measure.sinks.lines import as_line, data_lines, facts_as_json, iso, status_line
 from teds_provision.sanitize import printable
 
 FORMULA = ("=", "+", "-", "@")  # a cell that begins so would be computed by a spreadsheet
@@ -152,3 +152,46 @@ def _heads(known: Sequence[ChannelFacts]) -> list[str]:
     names = [f"{one.node or one.uuid}/{one.label}" for one in known]
     values = [f"{name} [{one.unit}]" if one.unit else name for name, one in zip(names, known, strict=True)]
     return ["time", "uuid", "index", "clock_error", "note", *values, *(f"{name} raw" for name in names)]
+
+
+# JSON lines: the first says who measures what, then the events of ``measure --json``, one line each.
+
+
+class JsonLinesSink(FileSink):
+    """Recorder of JSON lines; see the module."""
+
+    def _begin(self) -> None:
+        station = self.station
+        head = {
+            "event": "recording",
+            "format": "teds-provision/measurement-1",
+            "station": station.name,
+            "group": station.group,
+            "started": iso(station.started),
+            "clock": station.clock,
+            "test_pattern": station.test_pattern,
+        }
+        self._add(as_line(head))
+        self._channels(tuple(self.facts.values()))
+
+    def _channels(self, item: Item) -> None:
+        if isinstance(item, tuple):
+            for one in item:
+                self.facts[one.key] = one
+                self._add(as_line({"event": "channel", **facts_as_json(one)}))
+
+    def _take(self, item: Item) -> None:
+        if isinstance(item, Block):
+            self._count(written=item.value.size, messages=len(item.channels))
+            self._add(b"".join(as_line(line) for line in data_lines(item, self.facts)), item.value.size)
+        elif isinstance(item, NodeReport):
+            self._add(as_line(status_line(item)))
+        else:
+            self._channels(item)
+
+    def _note(self, at: float, text: str) -> None:
+        self._add(as_line({"event": "note", "time": at, "why": text}))
+
+    def _add(self, lines: bytes, values: int = 0) -> None:
+        self._count(octets=len(lines))
+        self.part.add(lines, values)

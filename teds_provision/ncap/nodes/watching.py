@@ -20,10 +20,10 @@ from teds_provision.links import Contact, Notice, Port, Trace
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.opening import open_place
-from teds_provision.measure.finding.buses import Buses
-from teds_provision.measure.finding.lookout import POLL
-from teds_provision.measure.finding.sightings import Sighting
-from teds_provision.measure.finding.sources import sole_user
+from teds_provision.measure.buses import Buses
+from teds_provision.measure.lookout import POLL
+from teds_provision.measure.sightings import Sighting
+from teds_provision.measure.sources import sole_user
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look, read_anew

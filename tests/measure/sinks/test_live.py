@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, Status, TopicSink
-from teds_provision.measure.sinks.meaning import Meaning, meaning_of, variance_of
 from teds_provision.measure.sinks.names import Topics, slug
-from teds_provision.measure.sinks.vectors import FieldValue, compounds_of, is_range
+from teds_provision.measure.sinks.vectors import FieldValue, Meaning, compounds_of, is_range, meaning_of, variance_of
 from teds_provision.teds.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, fill
 

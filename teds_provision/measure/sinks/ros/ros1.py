@@ -11,7 +11,7 @@ from pathlib import Path
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
-from teds_provision.measure.sinks.ros import interpreters, ros1_child
+from teds_provision.measure.sinks.ros import child, ros1_child
 from teds_provision.measure.sinks.ros.child import ChildSink
 
 PYTHON = "/usr/bin/python3"
@@ -27,7 +27,7 @@ class Ros1Sink(ChildSink):
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         super()._prepare(facts, station)
-        if not interpreters.imports(PYTHON, NEEDS, self._environment()):
+        if not child.imports(PYTHON, NEEDS, self._environment()):
             raise TedsProvisionError(
                 f"{PYTHON} has no rospy.",
                 hint="Install it: apt install python3-rospy python3-sensor-msgs python3-diagnostic-msgs",
@@ -35,7 +35,7 @@ class Ros1Sink(ChildSink):
 
     def _environment(self) -> dict[str, str]:
         """Without the virtual environment's paths; a ROS that the user sourced keeps its own."""
-        kept = interpreters.environment(sourced="/opt/ros/" in os.environ.get("PYTHONPATH", ""))
+        kept = child.environment(sourced="/opt/ros/" in os.environ.get("PYTHONPATH", ""))
         if self._master:
             kept["ROS_MASTER_URI"] = self._master
         return kept

@@ -20,8 +20,7 @@ from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
-from teds_provision.measure.sinks.meaning import Meaning
-from teds_provision.measure.sinks.vectors import FieldValue
+from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 
 if TYPE_CHECKING:
     from teds_provision.measure.blocks import ChannelFacts

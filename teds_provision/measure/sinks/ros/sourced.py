@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 
 from teds_provision.measure.sinks.base import CommandTaker, Sink
-from teds_provision.measure.sinks.ros import interpreters, rclpy_child
+from teds_provision.measure.sinks.ros import child, rclpy_child
 from teds_provision.measure.sinks.ros.child import ChildSink
 from teds_provision.measure.sinks.ros.ros2 import Ros2Sink, domain_of
 
@@ -32,10 +32,10 @@ def ros2_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
 @functools.cache
 def _python(_sourced: str, _paths: str) -> str | None:
     """The Python that imports rclpy in this environment, None where none does; found out once in a process."""
-    around = interpreters.environment(sourced=True)
+    around = child.environment(sourced=True)
     conda = os.environ.get("CONDA_PREFIX", "")
     found = [f"{conda}/bin/python3" if conda else "", SYSTEM, shutil.which("python3") or ""]
-    return next((one for one in dict.fromkeys(found) if one and interpreters.imports(one, NEEDS, around)), None)
+    return next((one for one in dict.fromkeys(found) if one and child.imports(one, NEEDS, around)), None)
 
 
 class RclpySink(ChildSink):
@@ -46,7 +46,7 @@ class RclpySink(ChildSink):
         self._python, self._domain = python, domain
 
     def _environment(self) -> dict[str, str]:
-        return interpreters.environment(sourced=True) | {"ROS_DOMAIN_ID": str(self._domain)}
+        return child.environment(sourced=True) | {"ROS_DOMAIN_ID": str(self._domain)}
 
     def _program(self) -> list[str]:
         return [self._python, "-s", str(Path(rclpy_child.__file__))]

@@ -11,13 +11,12 @@ from types import TracebackType
 
 from teds_provision.errors import LinkFailure
 from teds_provision.links.ble.port import BlePort
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.finding.air import AirHearing, AirLookout, air_time
-from teds_provision.measure.finding.lookout import Lookout
-from teds_provision.measure.finding.sightings import Sighting, Sightings
 from teds_provision.measure.hearing import CanHearing, Hearing
+from teds_provision.measure.lookout import AirHearing, AirLookout, Lookout, air_time
 from teds_provision.measure.planning import BusShare, BusTime
+from teds_provision.measure.sightings import Sighting, Sightings
 from teds_provision.protocol.messages.ble import LEAST_MTU
 from teds_provision.protocol.operation.can_frames import Assembly, DriveAddress, cut
 

@@ -10,17 +10,102 @@ says who it is.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import deque
+from dataclasses import replace
+from typing import ClassVar
 
-from teds_provision.errors import AddressConflict, LinkFailure
+from teds_provision.errors import AddressConflict, LinkFailure, NoNode
+from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.finding import LONGEST_SECONDS, SILENCE_SECONDS, Found, ask_all, settle, twice_text
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.finding.asking import LEAST, Asking, Pace
-from teds_provision.measure.finding.sightings import Sighting, Sightings
+from teds_provision.links.ports import Notice
+from teds_provision.measure.hearing import SLICE, HeardStream, Hearing
+from teds_provision.measure.planning import BusTime
+from teds_provision.measure.sightings import Sighting, Sightings
 from teds_provision.protocol.announce import LAST_ADDRESS, Announce, is_announce
 from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.operation.can_frames import read_ble_frame
+
+# What the look-outs on a bus and in the air have in common: a thread that asks everybody, and when it asks again.
+
+LEAST, MOST = 1.0, 30.0  # seconds between questions while somebody is missing
+
+
+class Pace:
+    """When everybody is asked again: ``asked`` is when they were last.
+
+    While somebody is missing that is after ``first`` seconds, then after LEAST, doubling to MOST. ``first`` is short on
+    a bus, where a question, or its answer, may have been lost.
+    """
+
+    def __init__(self, asked: float, *, first: float = LEAST) -> None:
+        self.asked = asked
+        self._first = self._pause = first
+
+    def is_due(self, *, wanted: bool, missing: bool, poll: float | None) -> bool:
+        """Whether to ask now: somebody wants it, is missing, or polls."""
+        since = time.monotonic() - self.asked
+        if wanted or not missing:
+            self._pause = self._first
+        if wanted:
+            return True
+        if (missing and since >= self._pause) or (poll and since >= poll):
+            self._pause = min(max(LEAST, 2 * self._pause), MOST)
+            return True
+        return False
+
+
+class Asking:
+    """A thread until :meth:`close`. ``failure`` is why the link could not be asked last, None where it could."""
+
+    LONGEST: ClassVar[float]  # seconds that one round of questions may take
+
+    def __init__(self, place: str, sightings: Sightings, poll: float | None) -> None:
+        self._sightings, self._poll = sightings, poll
+        self._stop, self._asked = threading.Event(), threading.Event()
+        self._begun = self._finished = 0  # rounds of questions
+        self._turn = threading.Condition()
+        self.failure: LinkFailure | None = None
+        self._thread = threading.Thread(target=self._run, name=f"look-out {place}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._stop.set()
+        self._asked.set()
+        self._thread.join(self.LONGEST)
+
+    def poll(self, seconds: float | None) -> None:
+        """Ask everybody every so many seconds from now on; None: only while somebody is missing."""
+        self._poll = seconds
+
+    def discover(self, seconds: float | None = None) -> None:
+        """Ask everybody now, and wait until that is done; raises LinkFailure where the link has failed."""
+        with self._turn:
+            wanted = self._begun + 1  # a round that is under way may be past the node that has just come
+            self._asked.set()
+            longest = self.LONGEST if seconds is None else seconds
+            self._turn.wait_for(lambda: self._finished >= wanted or self._stop.is_set(), longest)
+        if self.failure is not None:
+            raise self.failure
+
+    def _run(self) -> None:
+        """The thread; it calls :meth:`_begin` and :meth:`_done` around each round."""
+        raise NotImplementedError
+
+    def _begin(self) -> None:
+        with self._turn:
+            self._asked.clear()
+            self._begun += 1
+
+    def _done(self) -> None:
+        with self._turn:
+            self._finished = self._begun
+            self._turn.notify_all()
+
 
 POLL = 30.0  # seconds between questions to everybody, where that was asked for (operation.md section 7)
 EACH, ALL = 10.0, 0.2  # seconds between questions to one address that announces itself, and to any of them
@@ -142,3 +227,84 @@ class Lookout(Asking):
 
     def _saw(self, address: int, identity: Identity) -> None:
         self._sightings.saw(Sighting(identity, address, self.port, time.monotonic()))
+
+
+# Nodes in the air: their data messages, and the look-out that connects to each and asks who it is (operation.md 6).
+
+ROUND = 20.0  # seconds in which somebody must advertise, else the look-out begins anew
+
+
+class AirHearing(Hearing):
+    """The listening thread of one Bluetooth adapter; nodes are told apart by the number of their connection."""
+
+    def __init__(self, port: BlePort) -> None:
+        self._air = port
+        super().__init__(port.place)
+
+    def register(self, node: int, stream: int, heard: HeardStream) -> None:
+        """Hear a stream; its connection is kept."""
+        super().register(node, stream, heard)
+        self._air.keep(node, streaming=True)
+
+    def forget(self, node: int, stream: int) -> HeardStream | None:
+        """Hear it no more."""
+        heard = super().forget(node, stream)
+        self._air.keep(node, streaming=any(number == node for number, _ in self._streams))
+        return heard
+
+    def _hear(self) -> None:
+        with self._air.listen() as ear:
+            looked = time.monotonic()
+            while not self._stop.is_set():
+                came = ear(SLICE)
+                read = read_ble_frame(came.octets) if came is not None else None
+                if came is not None and read is not None:
+                    heard = self._streams.get((came.connection, read[0]))
+                    if heard is not None:
+                        heard.whole(read[1], came.at)
+                looked = self._flush(looked, self._air.lost)
+
+
+class AirLookout(Asking):
+    """The look-out of one adapter, a thread until :meth:`close`: it looks only while somebody is missing, or on asking.
+
+    Every node that advertises is connected to and asked, one after the other; those that are in use are left alone.
+    """
+
+    LONGEST = ROUND
+
+    def __init__(self, port: BlePort, sightings: Sightings, *, poll: float | None = None) -> None:
+        self.port = port
+        super().__init__(port.place, sightings, poll)
+
+    def _run(self) -> None:
+        pace = Pace(0.0)
+        while not self._stop.is_set():
+            wanted = self._asked.is_set()
+            if not pace.is_due(wanted=wanted, missing=self._sightings.missing(), poll=self._poll):
+                self._asked.wait(LOOK)
+                continue
+            self._look()
+            pace.asked = time.monotonic()
+
+    def _look(self) -> None:
+        self._begin()
+        self.failure = None
+        try:
+            for contact in self.port.everyone(seconds=2 * LEAST, notice=_nothing):
+                number = contact.connection or 0
+                self._sightings.saw(Sighting(contact.identity, number, self.port, time.monotonic()))
+        except NoNode:
+            pass
+        except LinkFailure as failure:
+            self.failure = failure
+        self._done()
+
+
+def air_time(time_: BusTime, mtu: int) -> BusTime:
+    """The adapter's time as a node behind a connection of this MTU has it."""
+    return replace(time_, mtu=mtu)
+
+
+def _nothing(_notice: Notice) -> None:
+    """What the look-out sees is told as sightings."""

@@ -1,19 +1,24 @@
-"""Whether the datasheets that were verified in the sessions suffice for the task (`measure --require`).
-
-A requirement may be met by any node of the group, so each node waits until the others have shown their datasheets
-(:data:`WAITING` at most), before anything is claimed. A node that comes back with another datasheet is judged anew.
-"""
+"""What is wished for: what is to be measured of each node, and where news of it goes."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from teds_provision.errors import PolicyRefused
+from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+from teds_provision.measure.trusting import DEAD_MAN, LEASE
+from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.teds.fits import Fit, Requirement, judge, met
 from teds_provision.teds.sheet import Sheet
+
+# Whether the datasheets that were verified in the sessions suffice for the task (`measure --require`).
+#
+# A requirement may be met by any node of the group, so each node waits until the others have shown their datasheets
+# (:data:`WAITING` at most), before anything is claimed. A node that comes back with another datasheet is judged anew.
 
 WAITING = 10.0  # seconds from the first datasheet on
 
@@ -67,3 +72,31 @@ class Requirements:
             if not met(requirement, found):
                 unmet.append(requirement.subject)
         return unmet
+
+
+@dataclass(frozen=True)
+class MeasurementRequest:
+    """What is to be measured of each node; ``channels`` empty: every sensor. ``rate`` in Hz, None: the datasheet's."""
+
+    channels: tuple[int, ...] = ()
+    rate: float | None = None
+    kind: Kind | None = None
+    trigger: bool = False
+    test_pattern: bool = False
+    lease: int = LEASE
+    timeout: float = 60.0
+    actuators: bool = False  # whether set points may come for actuators of nodes on the whitelist
+    dead_man: int = DEAD_MAN
+    patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
+    unsigned: bool = False  # whether raw values of a node are wanted whose datasheet nobody has signed
+    require: Requirements | None = None
+    by: str = "measure"  # the command that a reading of the datasheet is put down to
+
+
+@dataclass
+class Events:
+    """Where a node's news goes; each may be called from any thread and returns at once."""
+
+    block: Callable[[Block], None]
+    facts: Callable[[Sequence[ChannelFacts]], None]
+    report: Callable[[NodeReport], None]
