@@ -246,7 +246,7 @@ int teds_confirm(teds_node *node, const teds_command *command, teds_origin *orig
     const teds_pending *pending = &node->pending;
     teds_state state;
     int failed;
-    if (!pending->used || teds_now(node) - pending->at >= PENDING_NS || pending->link != origin->link ||
+    if (!pending->used || teds_now(node) >= pending->at + PENDING_NS || pending->link != origin->link ||
         pending->session != origin->session) {
         return -TEDS_WRONG_STATE;
     }

@@ -150,7 +150,7 @@ static void request(teds_node *node, teds_line *line, const uint8_t *body, size_
     }
     place = teds_reply_place(node, line->source);
     teds_sha256_parts(node, &whole, 1, digest);
-    if (!place->stored || memcmp(digest, place->digest, 32) != 0 || now - place->at >= KEEP_NS ||
+    if (!place->stored || memcmp(digest, place->digest, 32) != 0 || now >= place->at + KEEP_NS ||
         always_anew(body + 1, length - 1)) {
         place->stored = false;
         place->length = (uint16_t)(1 + teds_node_handle(node, line->source, &arrival, body + 1, length - 1,

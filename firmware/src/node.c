@@ -51,7 +51,7 @@ static int hold_strangers_back(teds_node *node)
     if (!teds_streams_running(node)) {
         return 0;
     }
-    if (node->stranger_seen && now - node->stranger_at < STRANGER_NS) {
+    if (node->stranger_seen && now < node->stranger_at + STRANGER_NS) {
         return -TEDS_BUSY;
     }
     node->stranger_seen = true;
@@ -195,7 +195,7 @@ static int set_can_address(teds_node *node, const teds_command *command, const t
         return -TEDS_BAD_FORM;
     }
     if (command->payload[0] != state.address) {
-        if (node->address_written && now - node->address_written_at < ADDRESS_NS) {
+        if (node->address_written && now < node->address_written_at + ADDRESS_NS) {
             return -TEDS_BUSY;
         }
         state.address = command->payload[0];

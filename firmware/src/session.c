@@ -72,14 +72,14 @@ void teds_end_everything(teds_node *node)
 void teds_sessions_expire(teds_node *node, uint64_t now)
 {
     for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (node->sessions[i].used && now - node->sessions[i].good_at >= IDLE_NS) {
+        if (node->sessions[i].used && now >= node->sessions[i].good_at + IDLE_NS) {
             teds_session_end(node, i);
         }
-        if (node->half_open[i].used && now - node->half_open[i].at >= HALF_OPEN_NS) {
+        if (node->half_open[i].used && now >= node->half_open[i].at + HALF_OPEN_NS) {
             teds_wipe(&node->half_open[i], sizeof node->half_open[i]);
         }
     }
-    if (node->pending.used && now - node->pending.at >= HALF_OPEN_NS) {
+    if (node->pending.used && now >= node->pending.at + HALF_OPEN_NS) {
         teds_pending_forget(node);
     }
 }

@@ -634,7 +634,7 @@ int teds_write(teds_node *node, const teds_command *command, teds_origin *origin
     if (offset > staged) {
         return -TEDS_BAD_FORM;
     }
-    if (other >= 0 && now - node->sessions[other].staged_at < STAGED_NS) {
+    if (other >= 0 && now < node->sessions[other].staged_at + STAGED_NS) {
         return -TEDS_BUSY;
     }
     if (!can_list(node, (uint16_t)id, other < 0) || (other >= 0 && 4 + command->length - 5 > TEDS_STAGING)) {

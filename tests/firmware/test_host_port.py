@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import socket
 
 import pytest
 
@@ -12,6 +13,7 @@ from tests.e2e.desk import ANGLE, Desk, Station, results
 from tests.firmware import builds
 from tests.firmware.conftest import CNode
 from tests.handover.desk import Pair
+from tests.links.can.hub import Hub
 from tests.pace import until
 
 pytestmark = pytest.mark.system
@@ -41,6 +43,35 @@ def test_it_is_provisioned_verified_rotated_and_reset(desk: Desk, station: Stati
     assert station.ask("verify", node.uuid, *links)["verdict"] == "authentic"
     assert station.ask("reset", node.uuid, "--yes", *links)["uuid"] == node.uuid
     assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
+
+
+def test_it_is_provisioned_over_socketcand_though_frames_are_lost_and_doubled(
+    desk: Desk, station: Station, node: CNode
+) -> None:
+    """Of some 500 frames every 150th is lost, every 30th comes twice: the station repeats, the node runs nothing twice."""
+    count = 0
+
+    def lose(identifier: int, data: bytes) -> bool:
+        nonlocal count
+        count += 1
+        return count % 150 == 0
+
+    hub = Hub(lose)
+    given = hub.send
+
+    def twice(identifier: int, data: bytes, sender: socket.socket | None = None) -> None:
+        given(identifier, data, sender)
+        if count % 30 == 0:
+            given(identifier, data, sender)
+
+    hub.send = twice  # type: ignore[method-assign]
+    try:
+        node.start(can=hub.spec)
+        done = station.ask("provision", "--profile", ANGLE, "--yes", "--via", "can", "--can", hub.spec)
+        assert done["verdict"] == "authentic"
+        assert count > 300
+    finally:
+        hub.close()
 
 
 def test_what_it_holds_outlives_its_power(desk: Desk, station: Station, node: CNode) -> None:

@@ -187,6 +187,36 @@ static void frames_may_come_twice(void)
     memory_free(board);
 }
 
+/* A clock that goes on while a command runs: what is later than "now" is not old. */
+static uint64_t running;
+
+static uint64_t runs_on(void *user)
+{
+    (void)user;
+    return running += 1000;
+}
+
+static void a_repetition_while_the_reply_is_under_way_gets_it_again(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64], first[64];
+    running = now;
+    board->port.now = runs_on;
+    in(board, TO_NODE, "\x07\x05\x00\x00\x80\x03\x00\x00", 8, false); /* Open: 2 in factory state, one frame */
+    CHECK(out(board, &identifier, first) == 8 && memcmp(first, "\x05\x05\x00\x00\x01\x02", 6) == 0, "refused");
+    for (int i = 0; i < TEDS_REPLIES; i++) {
+        if (board->node.replies[i].stored) {
+            board->node.replies[i].octets[4] = 0x63; /* so that it shows whether it was run again */
+            board->node.can.lines[0].out_state = TEDS_OUT_FIRST; /* as if it were still leaving */
+            board->node.can.lines[0].out_reply = (int8_t)i;
+        }
+    }
+    in(board, TO_NODE, "\x07\x05\x00\x00\x80\x03\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[5] == 0x63, "the stored reply, not a new one");
+    memory_free(board);
+}
+
 static void everyone_is_answered_after_a_wait(void)
 {
     memory_board *board = fresh();
@@ -243,6 +273,7 @@ int main(void)
     a_broken_question_is_dropped();
     what_cannot_be_taken_is_refused_by_one_frame();
     frames_may_come_twice();
+    a_repetition_while_the_reply_is_under_way_gets_it_again();
     everyone_is_answered_after_a_wait();
     nodes_that_meet_sort_themselves_out();
     return ENDED("isotp");
