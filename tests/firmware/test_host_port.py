@@ -49,7 +49,7 @@ def test_it_is_provisioned_verified_rotated_and_reset(desk: Desk, station: Stati
 def test_it_is_provisioned_over_socketcand_though_frames_are_lost_and_doubled(
     desk: Desk, station: Station, node: CNode
 ) -> None:
-    """Of some 500 frames every 150th is lost, every 30th comes twice: the station repeats, the node runs nothing twice."""
+    """Every 150th frame is lost, every 30th comes twice: the station repeats, the node runs nothing twice."""
     hub = Hub()
     given, told = hub.send, itertools.count(1)
 
