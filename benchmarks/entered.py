@@ -21,8 +21,7 @@ from benchmarks.provisioning import PROFILE, next_node, nodes
 from teds_provision.links import LinkSettings, Notice, open_port
 from teds_provision.links.ports import free_port
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.build_order import prepare
+from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent

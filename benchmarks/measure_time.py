@@ -37,7 +37,7 @@ from teds_provision.node.pulse import Pulse
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
 from teds_provision.store import Measurement
 from teds_provision.talk.conversation import Conversation

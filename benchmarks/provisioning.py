@@ -32,8 +32,7 @@ from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, op
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.build_order import prepare
+from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
 from teds_provision.store.database import Database
 from teds_provision.talk.conversation import Conversation

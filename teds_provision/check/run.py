@@ -15,9 +15,8 @@ from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import NodeKey, Station
-from teds_provision.steps.agree import open_session
+from teds_provision.steps.agree import open_session, reset_node
 from teds_provision.steps.identify import examine
-from teds_provision.steps.reset import reset_node
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter

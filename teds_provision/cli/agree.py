@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
+from teds_provision import steps
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.announce import LAST_ADDRESS
-from teds_provision.steps import visits
 
 
 @command(
@@ -33,7 +33,7 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
     def confirm(question: str) -> None:
         app.confirm(question, yes=yes and rotate, named="--rotate")
 
-    done = visits.at_node.agree_at(
+    done = steps.commands.agree_at(
         app.station(), links, uuid, reporter_for(app), rotate=rotate, dry_run=dry_run, confirm=confirm
     )
     node, agreed = done.uuid.hex(), done.agreed
@@ -65,7 +65,7 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
         app.emit({"uuid": octets.hex(), "plan": "reset"}, f"Plan: reset {octets.hex()} to factory state.")
         return
     app.confirm(f"Reset node {octets.hex()}? Its key is erased, and its datasheet becomes unsigned.", yes=yes)
-    receipt = visits.at_node.reset_at(station, links, octets, reporter_for(app))
+    receipt = steps.commands.reset_at(station, links, octets, reporter_for(app))
     app.emit(
         {
             "uuid": octets.hex(),
@@ -99,7 +99,7 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
 def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Permanently change a node's CAN address, 1 to 239: by tap, or in a session if its key is held."""
     del yes  # the old address can be given back the same way
-    done = visits.at_node.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
+    done = steps.commands.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
     node = done.uuid.hex()
     if done.changed is None:
         plan = f"Plan: change the CAN address of node {node} to 0x{address:02x}."

@@ -28,7 +28,6 @@ from teds_provision.cli.rendering import local_time, reporter_for
 from teds_provision.errors import UsageFailure
 from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.links import LinkSettings
-from teds_provision.steps import visits
 
 if TYPE_CHECKING:
     from teds_provision.steps.write import Written
@@ -43,7 +42,7 @@ def order_options(function: Function) -> Function:
     @wraps(function)
     def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
         accepted, retype = rest.pop("accept_calibration"), rest.pop("retype")
-        order = steps.build_order.BuildOrder(profile, calibration, name, no_calibration, accepted, retype)
+        order = steps.build.BuildOrder(profile, calibration, name, no_calibration, accepted, retype)
         return function(*args, order=order, **rest)
 
     options = [
@@ -163,7 +162,7 @@ def sign(
     """
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
-    done = visits.sign_command.sign_at(
+    done = steps.commands.sign_at(
         station,
         links,
         what,
@@ -236,7 +235,7 @@ def write(
         _bring_back(app, uuid, sequence, links, dry_run=dry_run)
         return
     confirm = partial(app.confirm, yes=yes)
-    done = visits.at_node.write_at(
+    done = steps.commands.write_at(
         app.station(),
         links,
         uuid,
@@ -258,7 +257,7 @@ def write(
 
 
 def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
-    done = visits.history.bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
+    done = steps.commands.bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
     node, changes = done.uuid.hex(), [change.text for change in done.changes]
     lines = "".join(f"\n  {text}" for text in changes) or "\n  no changes"
     if done.written is None:
@@ -301,7 +300,7 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     If a key is held but no session can be opened, nothing is proven: the data received is shown, no file is written,
     and the exit code is 5.
     """
-    done = visits.at_node.read_at(app.station(), links, uuid, reporter_for(app))
+    done = steps.commands.read_at(app.station(), links, uuid, reporter_for(app))
     text = done.image.to_json()
     if done.error is not None:
         app.conclude({**json.loads(text), "verdict": "unproven"}, text.rstrip("\n"), done.error)
@@ -342,7 +341,7 @@ def list_(app: App) -> None:
 def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Drop a node's draft; the datasheet on the node is not affected."""
     del yes  # what was built can be built again
-    done = visits.history.drop_draft(app.station(), uuid, dry_run=dry_run)
+    done = steps.commands.drop_draft(app.station(), uuid, dry_run=dry_run)
     node = done.uuid.hex()
     if done.draft is None:
         app.emit({"uuid": node, "dropped": False}, f"Node {node} has no draft.")
@@ -360,7 +359,7 @@ draft.add_command(drop, "drop")
 @pass_app
 def history(app: App, uuid: str) -> None:
     """List a node's earlier datasheets, newest first; write UUID --from SEQUENCE restores one, signed again."""
-    node, records = visits.history.history_of(app.station(), uuid)
+    node, records = steps.commands.history_of(app.station(), uuid)
     told = [
         {
             "sequence": record.sequence,

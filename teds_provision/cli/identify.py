@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import talk
+from teds_provision import steps, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.links import LinkSettings
-from teds_provision.steps import visits
 
 if TYPE_CHECKING:
-    from teds_provision.steps.visits.identify_at import Found
+    from teds_provision.steps.commands import Found
 
 
 @command(
@@ -36,7 +35,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
         signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     several = len(links.places) > 1
     found: list[dict[str, Any]] = []
-    for came in visits.identify_at.identify_at(
+    for came in steps.commands.identify_at(
         app.station(), links, reporter_for(app, several=several), add=add, watch=watch, stop=stop
     ):
         if came.error is not None:

@@ -16,7 +16,7 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from teds_provision.handover.life import TakeOver
     from teds_provision.station.station import Station
-    from teds_provision.steps.reset import ResetReceipt
+    from teds_provision.steps.agree import ResetReceipt
 
 
 @command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")
@@ -127,7 +127,7 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
     """Reset the node; None where it cannot be had and that is to be recorded as unconfirmed."""
     try:
         with talk.meeting.meet(station, links, uuid, reporter_for(app)) as node:
-            return steps.reset.reset_node(station, node, steps.identify.identify(station, node))
+            return steps.agree.reset_node(station, node, steps.identify.identify(station, node))
     except (LinkFailure, PolicyRefused) as error:
         if not force and not app.interactive:
             error.hint = "Bring the node within reach, or add --force to record it as unconfirmed."

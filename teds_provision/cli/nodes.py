@@ -262,7 +262,7 @@ def show_fits(app: App, station: Station, expression: str, uuids: list[bytes]) -
         requirement = teds.fits.parse_fits(expression)
     except BadData as error:
         raise UsageFailure(f"--fits: {error.message}", hint=error.hint) from error
-    found = [fit.to_json() for fit in steps.many.fits.fits_of(station, [requirement], uuids, datetime.now(UTC))]
+    found = [fit.to_json() for fit in steps.inventory.fits_of(station, [requirement], uuids, datetime.now(UTC))]
     app.emit({"fits": found}, lambda console: _fits_table(console, found))
 
 

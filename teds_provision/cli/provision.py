@@ -22,18 +22,16 @@ from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import NotWhitelisted, TedsProvisionError
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import sanitize
-from teds_provision.steps import many
 from teds_provision.talk.progress import Reporter, StepResult
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.links import Notice
+    from teds_provision.steps.batch import Boards, Plan, Questions
+    from teds_provision.steps.batch_sheet import Board, Row
     from teds_provision.steps.build import NotNamed
     from teds_provision.steps.identify import Identified
-    from teds_provision.steps.many.board import Board
-    from teds_provision.steps.many.boards import Boards, Plan, Questions
-    from teds_provision.steps.many.sheet import Row
     from teds_provision.steps.provision import Provisioned
     from teds_provision.teds.diff import Change
 
@@ -84,10 +82,10 @@ def provision(
     --yes accepts the node on the reader. A finished node keeps its datasheet: only what you name (--profile,
     --calibration, --name) changes, or what you confirm after seeing the changes.
     """
-    request = many.boards.Request(uuid, order, watch, everything, batch, report)
+    request = steps_room.batch.Request(uuid, order, watch, everything, batch, report)
     several = everything or len(links.places) > 1
     reporter = Watched(reporter_for(app, several=several))
-    boards = many.boards.Boards(app.station(), links, request, reporter)
+    boards = steps_room.batch.Boards(app.station(), links, request, reporter)
     for warning in boards.warnings:
         app.warn(warning)
     if dry_run:
@@ -152,7 +150,9 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
                 f"Node {who.uuid.hex()}, key {who.fingerprint[:32]}\nTrust this board and add it to the whitelist?",
                 who.fingerprint,
             ):
-                raise many.board.Declined(f"Cancelled. Node {who.uuid.hex()} was not whitelisted; nothing was changed.")
+                raise steps_room.batch_sheet.Declined(
+                    f"Cancelled. Node {who.uuid.hex()} was not whitelisted; nothing was changed."
+                )
         accepted.add((who.uuid, who.fingerprint))
 
     def confirm(uuid: bytes, changes: tuple[Change, ...]) -> None:
@@ -165,7 +165,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
             if len(changes) > _CHANGES_SHOWN:
                 app.note(f"  and {len(changes) - _CHANGES_SHOWN} more")
             if not app.ask("Write it?"):
-                raise many.board.Declined(f"Cancelled. Node {uuid.hex()} keeps its datasheet.")
+                raise steps_room.batch_sheet.Declined(f"Cancelled. Node {uuid.hex()} keeps its datasheet.")
 
     def low(question: str) -> None:
         with turn:
@@ -174,11 +174,11 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
     def take_over(question: str) -> None:
         with turn:
             if not app.ask(question):
-                raise many.board.Declined("Cancelled. The node keeps its key; nothing was changed.")
+                raise steps_room.batch_sheet.Declined("Cancelled. The node keeps its key; nothing was changed.")
 
     asked = app.interactive
     retype = app.asks_retype(yes=yes or several)
-    return many.boards.Questions(accept, confirm if asked else None, low, take_over if asked else None, retype)
+    return steps_room.batch.Questions(accept, confirm if asked else None, low, take_over if asked else None, retype)
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def _tell_not_named(app: App, error: NotNamed) -> None:
 
 
 def _failure(done: Provisioned) -> TedsProvisionError | None:
-    return many.board.Board(done.who.uuid, 0.0, done).failure
+    return steps_room.batch_sheet.Board(done.who.uuid, 0.0, done).failure
 
 
 def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = None, **more: object) -> None:

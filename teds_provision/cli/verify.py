@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING
 
 import click
 
+from teds_provision import steps
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import printable
-from teds_provision.steps import many, visits
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.steps.many.verify_files import FileVerdict
     from teds_provision.steps.verify import Verified
+    from teds_provision.steps.verify_files import FileVerdict
 
 
 @command(
@@ -49,7 +49,7 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
             raise UsageFailure("--accept-calibration applies to a single image.", hint="Verify that image by itself.")
         verify_many(app, what)
         return
-    done = visits.at_node.verify_at(
+    done = steps.commands.verify_at(
         app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration, node=node
     )
     verified = done.verified
@@ -88,9 +88,9 @@ def are_files(what: Sequence[str]) -> bool:
 
 def verify_many(app: App, what: Sequence[str]) -> None:
     """Judge every file by itself; one that fails stops no other."""
-    files = many.verify_files.image_files([Path(word) for word in what])
-    totals = many.verify_files.Totals()
-    for lines, counted in many.verify_files.verify_files(app.station(), files, _json if app.json else _line):
+    files = steps.verify_files.image_files([Path(word) for word in what])
+    totals = steps.verify_files.Totals()
+    for lines, counted in steps.verify_files.verify_files(app.station(), files, _json if app.json else _line):
         totals.join(counted)
         app.lines(lines)
     if app.json:

@@ -59,8 +59,8 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
         if fingerprint is not None and not same_key(fingerprint, scanned[1]):
             raise click.BadParameter("the label carries a different key.", param_hint="--fingerprint")
         fingerprint = scanned[1]
-    steps.whitelist_files.require_name(name)
-    wanted = steps.whitelist_files.Listed(0, octets, fingerprint, name)
+    steps.whitelist.require_name(name)
+    wanted = steps.whitelist.Listed(0, octets, fingerprint, name)
     plan = steps.whitelist.plan_addition(station, [wanted])
     if dry_run or not plan.write:
         _emit_plan(app, station, plan, dry_run=dry_run)
@@ -145,7 +145,7 @@ def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     fingerprint and name are imported; this station sets the date and the assurance.
     """
     station = app.station()
-    listed = steps.whitelist_files.read_whitelist(file, form)
+    listed = steps.whitelist.read_whitelist(file, form)
     if dry_run:
         _emit_plan(app, station, steps.whitelist.plan_addition(station, listed), dry_run=True)
         return

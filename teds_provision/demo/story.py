@@ -35,7 +35,7 @@ from teds_provision.links.ports import free_port
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.steps.read import read_image

@@ -19,7 +19,7 @@ from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import BlockId, Image
 
 if TYPE_CHECKING:
-    from teds_provision.steps.reset import ResetReceipt
+    from teds_provision.steps.agree import ResetReceipt
 
 DECOMMISSIONED = "decommissioned"
 REPLACED = "replaced by"

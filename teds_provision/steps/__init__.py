@@ -1,4 +1,4 @@
-"""Each step of provisioning: identify, whitelist, agree, build, sign, write, verify, provision, reset, address."""
+"""Each step of provisioning in a module of its own, and what the commands make of the steps."""
 
 from typing import TYPE_CHECKING
 
@@ -6,25 +6,23 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.steps import (
-        address,
         agree,
+        batch,
+        batch_sheet,
         board_type,
         build,
-        build_order,
+        commands,
+        document,
         identify,
         inventory,
-        judging,
-        many,
         provision,
         read,
         reading,
-        reset,
         sign,
         verify,
+        verify_files,
         verify_node,
-        visits,
         whitelist,
-        whitelist_files,
         write,
     )
 else:

@@ -5,14 +5,15 @@ What a lost message left half done is found and finished here.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from teds_provision.errors import BadData, Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
 from teds_provision.protocol.agreement import AgreedKey, OtherTranscript, StationAgreement, fit_to_agree
 from teds_provision.protocol.datasheet import signature_good, station_signature_good
-from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, reset_message, verify
+from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.identify import Identified
@@ -410,3 +411,52 @@ def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: by
     with station.reading():
         epoch = station.pins.epoch_to_exceed(node.uuid, entry.fingerprint)
     return agreement.accept(reply, teds, pinned=entry.fingerprint, epoch=epoch)
+
+
+# -- reset: back to factory state, signed by the node (profile.md, "Reset") --------------------------------------------
+
+
+@dataclass(frozen=True)
+class ResetReceipt:
+    """SIG(node, "TEDS1 reset" ‖ 00 ‖ UUID ‖ epoch ‖ challenge): the node says that it is in factory state."""
+
+    epoch: int
+    challenge: bytes
+    proof: bytes
+
+
+def reset_node(station: Station, node: Conversation, who: Identified) -> ResetReceipt:
+    """Reset in a session; a node that is in factory state already gives the same proof plainly.
+
+    The keys held for it are deleted only after the proof was verified. Raises PolicyRefused without a key,
+    NotAuthentic where the proof is wrong.
+    """
+    if who.state != NodeState.FACTORY:
+        require_session(station, node)
+    receipt = proof_of_reset(node, who.point)
+    with station.durable("reset"):
+        station.keys.remove(who.uuid)
+        station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), retired=None)
+        station.nodes.forget_reading(who.uuid)
+        told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
+        station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)
+    return receipt
+
+
+def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
+    """Send Reset: in a session it resets, in factory state it changes nothing; either way the node signs its state.
+
+    A node that has a key refuses it plainly (NodeRefused). Raises NotAuthentic where the signature is wrong.
+    """
+    epoch = read_identity(node).epoch
+    challenge = os.urandom(CHALLENGE_OCTETS)
+    command = security_command(Function.RESET, challenge)
+    try:
+        proof = node.send(command, "the reset")
+    except SessionLost:  # its reply was lost and the session with it: in factory state it gives the proof again
+        node.forget()
+        proof = node.plain(command, "the proof of its reset")
+    node.forget()
+    if not verify(point, reset_message(node.uuid, epoch, challenge), proof):
+        raise NotAuthentic("The node's receipt of the reset does not verify; its keys are kept here.")
+    return ResetReceipt(epoch, challenge, proof)

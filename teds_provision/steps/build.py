@@ -7,15 +7,20 @@ asked about; the store never silently wins over the node.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused
+from teds_provision import teds
+from teds_provision.errors import BadData, CalibrationMisfit, NotFound, PolicyRefused, UsageFailure
+from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
+from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse
-from teds_provision.steps.build_order import BuildOrder, Prepared, compose, guard, merged, named_for, own_name, prepare
 from teds_provision.steps.read import Survey
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.steps.verify import Known, Verified, verify_image
@@ -24,9 +29,394 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.teds.profile.load import default_folders, is_profile_name, load_profile, passed_over
+from teds_provision.teds.profile.reader import NAME_OCTETS
+from teds_provision.teds.sheet import Sheet, described
 
 if TYPE_CHECKING:
     from teds_provision.teds.calibration import Calibration
+
+if TYPE_CHECKING:
+    from teds_provision.teds import calibration
+    from teds_provision.teds import guard as guarding
+    from teds_provision.teds.calibration import Calibration
+    from teds_provision.teds.guard import GuardFinding
+    from teds_provision.teds.image import BlockId
+    from teds_provision.teds.profile import BuiltDatasheet, Profile
+else:  # numpy: not for a datasheet without calibration
+    calibration, guarding = late("teds_provision.teds.calibration"), late("teds_provision.teds.guard")
+
+
+# -- the order: profile, calibration, name; read, fitted and guarded before any node is waited for ---------------------
+
+_UUID, _COUNT = "{uuid}", "{n}"
+_NOBODY: Final = bytes(10)
+
+
+@dataclass(frozen=True)
+class BuildOrder:
+    """What the user asks for: profile (None: the one that the node had), calibration file, name, and overrides.
+
+    ``name`` may hold ``{uuid}`` (20 hex digits) or ``{n}`` (the first free number from 1). ``accept_calibration`` is
+    the reason given for a calibration that the guard would refuse.
+    """
+
+    profile: str | None = None
+    calibration: Path | None = None
+    name: str | None = None
+    drop_calibration: bool = False
+    accept_calibration: str | None = None
+    retype: bool = False  # whether the board may become one of another type than it says it is
+
+    @property
+    def names_nothing(self) -> bool:
+        """Whether no value of the datasheet is named."""
+        return self.profile is None and self.calibration is None and self.name is None and not self.drop_calibration
+
+    @property
+    def has_pattern(self) -> bool:
+        """Whether each node gets a name of its own."""
+        return self.name is not None and (_UUID in self.name or _COUNT in self.name)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """An order that was read and found good: its profile, and the calibrations of its file, fitted; None where unnamed.
+
+    ``warnings`` are those of the guard, and what a person should know of the order.
+    """
+
+    order: BuildOrder
+    profile: Profile | None = None
+    calibrations: Mapping[int, Calibration] | None = None
+    warnings: tuple[str, ...] = ()
+    passed: tuple[str, ...] = ()
+    """What a person should know of where the profile was found."""
+
+
+@dataclass(frozen=True)
+class Composed:
+    """The TEDS that profile, calibration and name give; ``wanted`` is the profile as it was asked for."""
+
+    profile: Profile
+    wanted: str
+    name: str | None
+    calibrations: Mapping[int, Calibration]
+    blocks: Mapping[BlockId, bytes]
+    warnings: tuple[str, ...]
+    digest: str = ""
+    changed: bool = False
+    """Whether the profile that the node had says something else than when its datasheet was made."""
+
+
+def for_several(order: BuildOrder) -> BuildOrder:
+    """The order, if it can be meant for more than one node; raises UsageFailure where all would be made equal."""
+    if order.name is not None and not order.has_pattern:
+        raise UsageFailure(
+            f"Every node would get the name {order.name!r}.",
+            hint="Put {uuid} or {n} into --name, or say which board gets which in a sheet: --batch FILE.",
+        )
+    if order.calibration is not None:
+        raise UsageFailure(
+            f"Every node would get the calibration {order.calibration}: it belongs to one sensor.",
+            hint="Say which board gets which in a sheet: --batch FILE.",
+        )
+    return order
+
+
+def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> Prepared:
+    """Read, fit and guard what an order names; ``uuid`` is the node that is meant, None where any may come.
+
+    Changes nothing. Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (the guard).
+    """
+    check_name(order.name)
+    wanted = _whole(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
+    if order.calibration is not None and not order.calibration.is_file():
+        raise NotFound(f"There is no calibration file {order.calibration}.")
+    if wanted is None:
+        if uuid is not None and not order.names_nothing:
+            raise no_profile(uuid)
+        return Prepared(order)
+    profile, passed = _load(station, wanted), _passed_over(station, wanted)
+    calibrations = _from_file(order, profile)
+    if calibrations is None:
+        return Prepared(order, profile, passed=passed)
+    made = _made(profile, _NOBODY, calibrations, order.name, 2007)
+    trial = Image(_NOBODY, dict(made.blocks))
+    warnings = guard(station, trial, None, order.accept_calibration, calibrations, profile, record=False)
+    return Prepared(order, profile, calibrations, merged(warnings), passed)
+
+
+def named_for(station: Station, uuid: bytes, prepared: Prepared, *, keep: bool = False) -> Prepared:
+    """The order with the name that this node gets; raises PolicyRefused where another node has it.
+
+    ``keep``: a numbered name is kept for this node at once, as others may ask for theirs at the same time.
+    """
+    if prepared.order.name is None or _COUNT not in prepared.order.name or not keep:
+        return _named_for(station, uuid, prepared)
+    with station.durable("name"):
+        named = _named_for(station, uuid, prepared)
+        station.nodes.remember(uuid, name=named.order.name)
+    return named
+
+
+def _named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
+    name = prepared.order.name
+    if name is None:
+        return prepared
+    name = name.replace(_UUID, uuid.hex())
+    if _COUNT in name:
+        name = _numbered(station, uuid, name)
+    others = [other for other in station.nodes.all_named(name) if other != uuid]
+    if others:
+        raise PolicyRefused(
+            f"Node {others[0].hex()} has the name {name!r} already.",
+            hint="Give this one another name; {uuid} or {n} in --name makes each its own.",
+        )
+    check_name(name)
+    return replace(prepared, order=replace(prepared.order, name=name))
+
+
+def _numbered(station: Station, uuid: bytes, pattern: str) -> str:
+    """The pattern with the first number that no other node has; a node that has one keeps it."""
+    record = station.nodes.get(uuid)
+    mine = record.name if record is not None else None
+    number = 1
+    while True:
+        name = pattern.replace(_COUNT, str(number))
+        owners = station.nodes.all_named(name)
+        if name == mine or not owners or owners == [uuid]:
+            break
+        number += 1
+    if mine is not None and mine != name:
+        before, _, after = pattern.partition(_COUNT)
+        digits = mine.removeprefix(before).removesuffix(after)
+        if digits.isdecimal() and mine == pattern.replace(_COUNT, digits):
+            return mine
+    return name
+
+
+def compose(
+    station: Station,
+    uuid: bytes,
+    prepared: Prepared,
+    has: Image | None,
+    *,
+    name: str | None = None,
+    as_known: bool = True,
+    edition: int = 2007,
+) -> Composed:
+    """Compose a node's TEDS; ``has`` is where calibrations come from that the order does not bring or drop.
+
+    ``name`` is the one to keep where the order names none; ``as_known``: else the one that this station knows.
+    Raises UsageFailure (no profile known), BadData.
+    """
+    order = prepared.order
+    wanted = _whole(order.profile) or _known_profile(station, uuid)
+    if wanted is None:
+        raise no_profile(uuid)
+    profile = prepared.profile or _load(station, wanted)
+    passed = prepared.passed if prepared.profile is not None else _passed_over(station, wanted)
+    calibrations = prepared.calibrations if prepared.calibrations is not None else _from_file(order, profile)
+    warnings: tuple[str, ...] = ()
+    if calibrations is None:
+        calibrations, warnings = _kept_calibrations(order, has, profile)
+    kept = order.name or name or (_known_name(station, uuid) if as_known else None)
+    made = _made(profile, uuid, calibrations, kept, edition)
+    digest, record = digest_of(profile), station.nodes.get(uuid)
+    before = record.profile_digest if record is not None and record.profile == wanted else None
+    changed = order.profile is None and before is not None and before != digest
+    if changed:
+        warnings += (f"The profile {wanted} is not what it was when this node's datasheet was made.",)
+    told = merged((*passed, *warnings, *made.warnings))
+    return Composed(profile, wanted, kept, calibrations, made.blocks, told, digest, changed)
+
+
+def digest_of(profile: Profile) -> str:
+    """SHA-256 (hex) of what a profile says, with all that it extends: of the TEDS that it gives, and its demands."""
+    blocks = _made(profile, _NOBODY, {}, None, 2007).blocks
+    said = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]
+    demands = [repr(one.calibration) for one in profile.channels]
+    return hashlib.sha256(json.dumps([said, demands]).encode()).hexdigest()
+
+
+def _whole(profile: str | None) -> str | None:
+    """A name as it is, a path from the root on: the next command may stand in another folder."""
+    return profile if profile is None or is_profile_name(profile) else str(Path(profile).absolute())
+
+
+def _known_name(station: Station, uuid: bytes) -> str | None:
+    record = station.nodes.get(uuid)
+    return record.name if record is not None else None
+
+
+def _kept_calibrations(
+    order: BuildOrder, has: Image | None, profile: Profile
+) -> tuple[dict[int, Calibration], tuple[str, ...]]:
+    """The calibrations that the node has and the order does not drop, and a warning where there are any.
+
+    Raises CalibrationMisfit where one was made for another channel than the profile's.
+    """
+    if order.drop_calibration or has is None:
+        return {}, ()
+    kept = teds_calibrations(has)
+    if not kept:
+        return {}, ()
+    require_fit(kept, has, Image(_NOBODY, dict(_made(profile, _NOBODY, {}, None, 2007).blocks)), profile)
+    numbers = ", ".join(map(str, kept))
+    return kept, (f"The calibration that was given before is kept (channel {numbers}).",)
+
+
+def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile: Profile | None = None) -> None:
+    """Raise CalibrationMisfit where a calibration of ``has`` was made for another channel than ``new`` describes."""
+    for number, one in kept.items():
+        had, now = described(number, has.blocks), described(number, new.blocks)
+        own = profile.channel(number) if profile is not None else None
+        why = guarding.misfit(one, had, now, own)
+        if why:
+            raise CalibrationMisfit(
+                f"The calibration of channel {number} that the node has does not fit: {why}.",
+                hint="Give this channel's own: --calibration FILE; or leave it without one: --no-calibration.",
+            )
+
+
+def teds_calibrations(image: Image) -> dict[int, Calibration]:
+    """The calibrations that an image holds, by channel."""
+    if not _is_calibrated(image):
+        return {}
+    return dict(Sheet.of(image).calibrations)
+
+
+def own_name(station: Station, image: Image, before: str | None) -> str | None:
+    """The name that a node's datasheet gives it, None where it is the one that its profile ``before`` gives to all."""
+    octets = image.blocks.get((0, AccessCode.NAME))
+    found = teds.decode(octets).get("TCName") if octets is not None else None
+    if not isinstance(found, str) or not found:
+        return None
+    try:
+        common = _load(station, before).tim_name if before is not None else None
+    except (BadData, NotFound):
+        common = None
+    return None if found == common else printable(found)
+
+
+def guard(
+    station: Station,
+    image: Image,
+    has: Image | None,
+    accepted: str | None,
+    calibrations: Mapping[int, Calibration] | None = None,
+    profile: Profile | None = None,
+    *,
+    record: bool = True,
+) -> tuple[str, ...]:
+    """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings.
+
+    That reason goes into the audit log, unless ``record`` is False (dry run).
+    """
+    if not _is_calibrated(image, has):
+        return ()
+    old = has.unsigned_blocks() if has is not None else None
+    findings = guarding.check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
+    errors = [_said(finding) for finding in findings if finding.severity == "error"]
+    if errors and accepted is None:
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise PolicyRefused(
+            f"The calibration is refused: {errors[0]}{more}.",
+            hint='Mend it; or, if it is right, say why: --accept-calibration "why".',
+        )
+    if errors and record:
+        station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
+    return merged(tuple(map(_said, findings)))
+
+
+def _is_calibrated(*images: Image | None) -> bool:
+    return any(code == AccessCode.CALIBRATION for image in images for _, code in image or ())
+
+
+def merged(warnings: Sequence[str]) -> tuple[str, ...]:
+    """Warnings, those that say the same of several channels in one line: ``Channels 1 to 12: …``."""
+    order: list[tuple[str, str]] = []
+    channels: dict[tuple[str, str], list[int]] = {}
+    for text in warnings:
+        head, number, rest = _of_channel(text)
+        if (head, rest) not in channels:
+            order.append((head, rest))
+        channels.setdefault((head, rest), [])
+        if number is not None and number not in channels[head, rest]:
+            channels[head, rest].append(number)
+    return tuple(_joined(head, channels[head, rest], rest) for head, rest in order)
+
+
+def _of_channel(text: str) -> tuple[str, int | None, str]:
+    """``Channel 3 (force): x`` → ("Channel", 3, ": x"); the name of the channel counts for nothing."""
+    head, _, rest = text.partition(" ")
+    digits = len(rest) - len(rest.lstrip("0123456789"))
+    if head.lower() != "channel" or not digits:
+        return text, None, ""
+    number, rest = int(rest[:digits]), rest[digits:]
+    if rest.startswith(" (") and ")" in rest:
+        rest = rest[rest.index(")") + 1 :]
+    return head, number, rest
+
+
+def _joined(head: str, numbers: list[int], rest: str) -> str:
+    if not numbers:
+        return head
+    if len(numbers) == 1:
+        return f"{head} {numbers[0]}{rest}"
+    whole = numbers == list(range(numbers[0], numbers[-1] + 1))
+    told = f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
+    return f"{head}s {told}{rest}"
+
+
+def _said(finding: GuardFinding) -> str:
+    return f"channel {finding.channel}: {finding.message}"
+
+
+def check_name(name: str | None) -> None:
+    """Raise UsageFailure for a name that fits into no TEDS or is not shown whole, BadData for one that is no text."""
+    if name is None:
+        return
+    try:
+        octets = len(name.encode())
+    except UnicodeEncodeError as error:  # an argument in another encoding than the terminal's
+        raise BadData("The name of the node is not valid text.", hint="Give it in the terminal's encoding.") from error
+    if not 1 <= octets <= NAME_OCTETS:
+        raise UsageFailure(f"A name has 1 to {NAME_OCTETS} octets of UTF-8, this one {octets}.")
+    if not name.isprintable():
+        raise UsageFailure(f"A name is one line of printable characters, not {name!r}.")
+
+
+def _known_profile(station: Station, uuid: bytes) -> str | None:
+    record = station.nodes.get(uuid)
+    return record.profile if record is not None else None
+
+
+def no_profile(uuid: bytes) -> UsageFailure:
+    """The error for a node of which nobody said what it is."""
+    return UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
+
+
+def _load(station: Station, wanted: str) -> Profile:
+    return load_profile(wanted, default_folders(station.home))
+
+
+def _passed_over(station: Station, wanted: str) -> tuple[str, ...]:
+    return passed_over(wanted, default_folders(station.home))
+
+
+def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration] | None:
+    if order.calibration is None:
+        return None
+    return calibration.load_calibrations(order.calibration, profile)
+
+
+def _made(
+    profile: Profile, uuid: bytes, calibrations: Mapping[int, Calibration], name: str | None, edition: int
+) -> BuiltDatasheet:
+    return profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
+
 
 __all__ = ["BuildOrder", "Built", "NotNamed", "Proposal", "build", "propose"]
 

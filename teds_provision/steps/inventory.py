@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from teds_provision.errors import NotFound
+from teds_provision import teds
+from teds_provision.errors import NotFound, PolicyRefused
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -17,6 +20,7 @@ from teds_provision.store import Known, Search
 if TYPE_CHECKING:
     from teds_provision.steps import reading
     from teds_provision.steps.reading import Judged
+    from teds_provision.teds.fits import Fit, Requirement
 else:  # cryptography: a list of nodes that nobody verified yet needs none
     reading = late("teds_provision.steps.reading")
 
@@ -107,3 +111,57 @@ def _state(node: dict[str, Any]) -> str | None:
         return NodeState(node["state"]).name.lower()
     except ValueError:
         return f"unknown ({node['state']})"
+
+
+# -- do the known datasheets suffice for a task? (--fits, --require) ---------------------------------------------------
+
+
+@dataclass(frozen=True)
+class NodeFit:
+    """How one channel of one node (None: the node as a whole) stands to one requirement."""
+
+    uuid: bytes
+    requirement: Requirement
+    fit: Fit
+
+    def to_json(self) -> dict[str, object]:
+        """One entry of ``fits``."""
+        return {
+            "uuid": self.uuid.hex(),
+            "channel": self.fit.channel,
+            "name": self.fit.name,
+            "result": self.fit.result,
+            "why": self.fit.why,
+        }
+
+
+def fits_of(
+    station: Station, requirements: Iterable[Requirement], uuids: Iterable[bytes], now: datetime
+) -> Iterator[NodeFit]:
+    """Judge the datasheet that each node has, as far as this station knows it; ``skipped`` where it knows none."""
+    asked = tuple(requirements)
+    for uuid in uuids:
+        image = station.nodes.datasheet(uuid)
+        sheet = teds.sheet.Sheet.of(image) if image is not None else None
+        for requirement in asked:
+            if sheet is None or not sheet.channels:
+                unknown = teds.fits.Fit(None, "", "skipped", "its datasheet is not known here.")
+                yield NodeFit(uuid, requirement, unknown)
+            else:
+                yield from (NodeFit(uuid, requirement, fit) for fit in teds.fits.judge(requirement, sheet, now))
+
+
+def require(fits: Iterable[NodeFit]) -> None:
+    """Raise PolicyRefused (exit 6) unless a group meets every requirement that it was judged by."""
+    by_requirement: dict[Requirement, list[Fit]] = {}
+    for found in fits:
+        by_requirement.setdefault(found.requirement, []).append(found.fit)
+    for requirement, found_fits in by_requirement.items():
+        if not teds.fits.met(requirement, found_fits):
+            reasons = " ".join(dict.fromkeys(fit.why for fit in found_fits if fit.result != "passed"))
+            raise PolicyRefused(
+                f"No channel suffices for {requirement.subject}: {reasons}"
+                if not requirement.channel
+                else f"{requirement.subject[0].upper()}{requirement.subject[1:]} does not suffice: {reasons}",
+                hint="See what each channel has with: teds-provision nodes --fits EXPRESSION",
+            )

@@ -26,8 +26,18 @@ from teds_provision.steps.board_type import (
     refuse,
     shown_by,
 )
-from teds_provision.steps.build import BuildOrder, Confirm, Proposal, nobody, propose
-from teds_provision.steps.build_order import Prepared, merged, named_for, no_profile, prepare
+from teds_provision.steps.build import (
+    BuildOrder,
+    Confirm,
+    Prepared,
+    Proposal,
+    merged,
+    named_for,
+    no_profile,
+    nobody,
+    prepare,
+    propose,
+)
 from teds_provision.steps.identify import Identified, identify
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign

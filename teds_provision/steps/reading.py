@@ -16,15 +16,16 @@ from typing import Any, Literal
 
 from teds_provision.errors import StoreChanged
 from teds_provision.station.station import Station
-from teds_provision.steps.judging import Judging, remember_page
 from teds_provision.steps.verify import (
     ABOUT_THE_REST,
     MERELY_UNSIGNED,
     Check,
+    Judging,
     Known,
     Signers,
     Verified,
     judge,
+    remember_page,
     session,
     what_octets_say,
 )

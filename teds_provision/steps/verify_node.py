@@ -9,11 +9,10 @@ from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps import reading
-from teds_provision.steps.agree import agreed_elsewhere, session_if_keyed
+from teds_provision.steps.agree import agreed_elsewhere, proof_of_reset, session_if_keyed
 from teds_provision.steps.identify import Identified, prove
 from teds_provision.steps.read import read_block, read_identity, read_image
 from teds_provision.steps.reading import Judged
-from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import HEARD, Conversation

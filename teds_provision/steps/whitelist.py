@@ -2,6 +2,10 @@
 
 A pinned key is never replaced by a command that adds; the entry has to be removed first (profile.md,
 "Keys and trust").
+
+Whitelist files that other tools write are XML in the style of the NCAP, CSV or JSON, and are taken whole or not at all.
+XML is read with defusedxml, without a DTD: neither entity bombs nor external entities. It is read liberally: an element
+is an entry where it has an attribute ``uuid``, a child ``uuid`` beside its other fields, or a UUID as its text.
 """
 
 from __future__ import annotations
@@ -9,18 +13,383 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from teds_provision.errors import OtherKey, PolicyRefused, UsageFailure
-from teds_provision.protocol.fingerprints import same_key
+from teds_provision.errors import BadData, OtherKey, PolicyRefused, UsageFailure
+from teds_provision.files import read_text
+from teds_provision.limits import check_count, load_json
+from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.station.station import Station
-from teds_provision.steps.whitelist_files import FIELDS, FORMATS, Listed
 from teds_provision.store import WhitelistEntry, pages
+from teds_provision.store.records import UUID_OCTETS
+
+MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
+MAX_ENTRIES: Final = 250_000
+FORMATS: Final = ("xml", "csv", "json")
+FIELDS: Final = ("uuid", "fingerprint", "added", "assurance", "name")
 
 _SHOWN = 5
+_SHOWN_MISTAKES = 10
+_MAX_NAME = 200
+_MAX_DEPTH = 16
+_MAX_TAG = 65_536
+_MOST_TAGS = 12 * MAX_ENTRIES  # an entry of five elements with their ends, and what stands around it
+_MOST_LINES = 4 * MAX_ENTRIES
+_UUID_DIGITS = 2 * UUID_OCTETS
+_NAME_RULE = f"a name is printable and has at most {_MAX_NAME} characters"
+_ENTRY_ELEMENTS = frozenset({"transducer", "tim", "node", "entry", "item", "device", "uuid"})
+_ALIASES = {"id": "uuid", "uid": "uuid"}
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One entry of a file: the UUID, and the key and name that it gives where it gives them."""
+
+    line: int
+    uuid: bytes
+    fingerprint: str | None = None
+    name: str | None = None
+
+
+@dataclass
+class _Reading:
+    """What has been read so far, and every mistake with its line and field."""
+
+    file: str
+    entries: dict[bytes, Listed] = field(default_factory=dict)
+    mistakes: list[str] = field(default_factory=list)
+    count: int = 0
+
+    def wrong(self, line: int, what: str, why: str) -> None:
+        self.mistakes.append(f"{self.file}:{line}: {what}: {why}")
+
+    def add(self, line: int, values: dict[str, str]) -> None:
+        """Take one entry in, or note what is wrong with it."""
+        self.count += 1
+        if self.count > MAX_ENTRIES:
+            raise BadData(f"{self.file}:{line}: there are more than {MAX_ENTRIES} entries.")
+        before = len(self.mistakes)
+        uuid = self._digits(line, "uuid", values.get("uuid", ""), _UUID_DIGITS)
+        print_text = values.get("fingerprint", "").strip()
+        pin = self._fingerprint(line, print_text) if print_text else None
+        name = values.get("name", "").strip() or None
+        if not _is_name(name):
+            self.wrong(line, "name", _NAME_RULE)
+        if len(self.mistakes) == before and uuid is not None:
+            self._join(Listed(line, bytes.fromhex(uuid), pin, name))
+
+    def _digits(self, line: int, what: str, text: str, length: int) -> str | None:
+        digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
+        if len(digits) == length and re.fullmatch("[0-9a-f]+", digits):
+            return digits
+        shown = ascii(text[:48]) if text else "nothing"
+        self.wrong(line, what, f"{length} hex digits are needed, here is {shown}")
+        return None
+
+    def _fingerprint(self, line: int, text: str) -> str | None:
+        digits = read_fingerprint(text)
+        if digits is None:
+            self.wrong(line, "fingerprint", f"32 to 64 hex digits are needed, here is {text[:80]!a}")
+        return digits
+
+    def _join(self, entry: Listed) -> None:
+        known = self.entries.get(entry.uuid)
+        pins = [one.fingerprint for one in (known, entry) if one is not None and one.fingerprint]
+        if known is not None and len(pins) == 2 and not same_key(*pins):
+            self.wrong(entry.line, "fingerprint", f"the same UUID has another key in line {known.line}")
+            return
+        if known is not None:
+            entry = Listed(known.line, known.uuid, max(pins, key=len, default=None), known.name or entry.name)
+        self.entries[entry.uuid] = entry
+
+
+def read_whitelist(path: Path, form: str | None = None) -> list[Listed]:
+    """Read a whitelist file; the format is ``form``, else the file's extension, else what its content looks like.
+
+    Raises NotFound, or BadData that names file, line and field of every mistake (the first ten in full).
+    """
+    text = read_text(path, MAX_FILE_OCTETS, "whitelist")
+    if not text.strip():
+        raise BadData(f"{path} is empty: it lists no node.", hint="Give XML, CSV (a line of column names) or JSON.")
+    form = form or _form_of(path, text)
+    reading = _Reading(str(path))
+    readers: dict[str, Callable[[str, _Reading], None]] = {"xml": _read_xml, "csv": _read_csv, "json": _read_json}
+    readers[form](text, reading)
+    if reading.mistakes:
+        shown = "; ".join(reading.mistakes[:_SHOWN_MISTAKES])
+        more = len(reading.mistakes) - _SHOWN_MISTAKES
+        raise BadData(
+            f"{shown}{f'; and {more} more' if more > 0 else ''}.",
+            hint="Mend these lines and import again; nothing was imported.",
+        )
+    return list(reading.entries.values())
+
+
+def require_name(name: str | None) -> None:
+    """Raise BadData for what cannot be a node's name."""
+    if not _is_name(name):
+        raise BadData(f"{_NAME_RULE[0].upper()}{_NAME_RULE[1:]}.")
+
+
+def _is_name(name: str | None) -> bool:
+    return name is None or (len(name) <= _MAX_NAME and name.isprintable())
+
+
+def _form_of(path: Path, text: str) -> str:
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix in FORMATS:
+        return suffix
+    first = text.lstrip()[:1]
+    return "xml" if first == "<" else "json" if first in ("{", "[") else "csv"
+
+
+# -- XML ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Element:
+    """An element that is still open: its own fields, and the UUIDs that stand in it as children."""
+
+    tag: str
+    line: int
+    fields: dict[str, str]
+    text: list[str] = field(default_factory=list)
+    uuids: list[tuple[int, str]] = field(default_factory=list)
+    entries: int = 0
+
+    @property
+    def own(self) -> dict[str, str]:
+        """Those of its fields that a whitelist has."""
+        return {key: value for key, value in self.fields.items() if key in FIELDS}
+
+    def take_field(self, line: int, tag: str, text: str) -> None:
+        """A child that is one field of this element."""
+        if tag == "uuid":
+            self.uuids.append((line, text))
+        else:
+            self.fields[tag] = text
+
+
+def _read_xml(text: str, reading: _Reading) -> None:
+    from xml.sax import SAXException, SAXParseException
+    from xml.sax.handler import ContentHandler
+
+    from defusedxml.common import DefusedXmlException
+    from defusedxml.expatreader import DefusedExpatParser
+
+    class Handler(ContentHandler):
+        """Feeds elements into the reading as they close."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.open: list[_Element] = []
+
+        def startElement(self, name: str, attrs: Any) -> None:
+            if len(self.open) >= _MAX_DEPTH:
+                raise BadData(f"{reading.file}:{parser.getLineNumber()}: elements are nested too deeply.")
+            fields = {_field_name(key): value for key, value in attrs.items()}
+            self.open.append(_Element(_field_name(name), parser.getLineNumber(), fields))
+
+        def characters(self, content: str) -> None:
+            self.open[-1].text.append(content)
+
+        def endElement(self, name: str) -> None:
+            element = self.open.pop()
+            _close_element(element, self.open[-1] if self.open else None, reading)
+
+    check_count(text.count("<"), _MOST_TAGS, f"tags in {reading.file}")
+    _refuse_long(text, "<", reading.file, "a tag or text")  # a million attributes would all be held in memory at once
+    parser = DefusedExpatParser(forbid_dtd=True)
+    handler = Handler()
+    parser.setContentHandler(handler)
+    try:
+        parser.parse(io.StringIO(text))
+    except DefusedXmlException as error:
+        raise BadData(
+            f"{reading.file}: the XML has a DTD or entities, which are not read.", hint="Remove the DOCTYPE."
+        ) from error
+    except SAXParseException as error:
+        raise BadData(f"{reading.file}:{error.getLineNumber()}: this is not XML: {error.getMessage()}.") from error
+    except SAXException as error:
+        raise BadData(f"{reading.file}: this is not XML: {error.getMessage()}.") from error
+
+
+def _refuse_long(text: str, separator: str, file: str, what: str) -> None:
+    """Raise BadData where two separators are too far apart; linear in the text, which no regex of a count is."""
+    at = 0
+    while at < len(text):
+        end = text.find(separator, at, at + _MAX_TAG)
+        if end < 0 and at + _MAX_TAG <= len(text):
+            line = text.count("\n", 0, at) + 1
+            raise BadData(f"{file}:{line}: {what} of more than {_MAX_TAG} characters.")
+        at = end + 1 if end >= 0 else len(text)
+
+
+def _local(name: str) -> str:
+    return name.rpartition(":")[2].lower()
+
+
+def _field_name(name: str) -> str:
+    local = _local(name)
+    return _ALIASES.get(local, local)
+
+
+def _close_element(element: _Element, parent: _Element | None, reading: _Reading) -> None:
+    text = "".join(element.text).strip()
+    leaf = not element.uuids and not element.entries
+    if parent is not None and leaf and _is_field(element, text):
+        parent.take_field(element.line, element.tag, text)
+        return
+    entries = element.entries + _entry_of(element, text, leaf, parent is None, reading)
+    if parent is not None:
+        parent.entries += entries
+    elif entries == 0 and element.tag != "whitelist" and not reading.mistakes:
+        reading.wrong(element.line, element.tag, "there is no UUID in this document")
+
+
+def _is_field(element: _Element, text: str) -> bool:
+    """``<fingerprint>…</fingerprint>``: a text under a field's name, which belongs to the element around it."""
+    return bool(text) and not element.fields and element.tag in FIELDS
+
+
+def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _Reading) -> int:
+    """Take in what the element holds by itself; returns how many entries that were."""
+    own = element.own
+    if "uuid" in own:
+        reading.add(element.line, own)
+        return 1
+    if len(element.uuids) == 1 and (own or not root):
+        line, uuid = element.uuids[0]
+        reading.add(line, {**own, "uuid": uuid})
+        return 1
+    if element.uuids:
+        return _add_several(element, own, reading)
+    if not leaf or not _is_entry_text(element, text, root):
+        return 0
+    for part in _parts(text):
+        reading.add(element.line, {**own, "uuid": part})
+    return 1
+
+
+def _add_several(element: _Element, own: dict[str, str], reading: _Reading) -> int:
+    if len(element.uuids) > 1 and "fingerprint" in own:
+        reading.wrong(element.line, "fingerprint", "it stands beside several UUIDs and belongs to none")
+    for line, uuid in element.uuids:
+        reading.add(line, {"uuid": uuid})
+    return len(element.uuids)
+
+
+def _is_entry_text(element: _Element, text: str, root: bool) -> bool:
+    """Whether the text of an element is a UUID by where it stands, or by how it looks."""
+    if element.tag in _ENTRY_ELEMENTS:
+        return True
+    return bool(text) and (root or text[:2].lower() == "0x")
+
+
+def _parts(text: str) -> list[str]:
+    """Several whole UUIDs in one text, or the one text as it is."""
+    words = re.split(r"[\s,;]+", text.strip())
+    whole = all(len(word.lower().removeprefix("0x")) == _UUID_DIGITS for word in words)
+    return words if whole else [text]
+
+
+# -- CSV ---------------------------------------------------------------------------------------------------------------
+
+
+def _read_csv(text: str, reading: _Reading) -> None:
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text, reading.file), strict=True)
+    columns: list[str] | None = None
+    try:
+        for row in rows:
+            cells = [cell.strip() for cell in row]
+            if not any(cells) or cells[0].startswith("#"):
+                continue
+            if columns is None:
+                columns, is_header = _columns_of(cells)
+                if is_header:
+                    continue
+            if any(cells[len(columns) :]):
+                reading.wrong(rows.line_num, "row", f"{len(cells)} cells for {len(columns)} columns")
+                continue
+            reading.add(rows.line_num, dict(zip(columns, cells, strict=False)))
+    except csv.Error as error:
+        raise BadData(f"{reading.file}:{rows.line_num}: this is not CSV: {error}.") from error
+
+
+def _delimiter(text: str, file: str) -> str:
+    check_count(text.count("\n"), _MOST_LINES, f"lines in {file}")
+    _refuse_long(text, "\n", file, "a line")
+    first = next((line for line in text[:_MAX_TAG].splitlines() if line.strip() and not line.startswith("#")), "")
+    return max(",;\t", key=first.count)
+
+
+def _columns_of(cells: list[str]) -> tuple[list[str], bool]:
+    """The columns of a file whose first row this is, and whether the row names them (else it is data already)."""
+    named = [_field_name(cell) for cell in cells]
+    return (named, True) if "uuid" in named else (["uuid", "fingerprint", "name"], False)
+
+
+# -- JSON --------------------------------------------------------------------------------------------------------------
+
+
+def _read_json(text: str, reading: _Reading) -> None:
+    value = load_json(text, "the whitelist", octets=MAX_FILE_OCTETS, file=reading.file)
+    listed = value.get("whitelist") if isinstance(value, dict) else value
+    if not isinstance(listed, list):
+        raise BadData(f'{reading.file}:1: whitelist: a list is needed, or an object with "whitelist": […].')
+    for line, item in _with_lines(text, inside=isinstance(value, dict)):
+        if isinstance(item, str):
+            reading.add(line, {"uuid": item})
+        elif not isinstance(item, dict):
+            reading.wrong(line, "entry", "an object or a UUID as a string is needed")
+        else:
+            _add_object(line, item, reading)
+
+
+def _add_object(line: int, item: dict[str, Any], reading: _Reading) -> None:
+    values: dict[str, str] = {}
+    for key, value in item.items():
+        name = _field_name(key)
+        if name in FIELDS and not isinstance(value, str | None):
+            reading.wrong(line, name, "a string is needed")
+            return
+        if name in FIELDS and value is not None:
+            values[name] = value
+    reading.add(line, values)
+
+
+def _with_lines(text: str, *, inside: bool) -> Iterator[tuple[int, Any]]:
+    """Give the elements of the list again, each with the line it begins in; the text is known to be JSON."""
+    decoder, blank = json.JSONDecoder(), re.compile(r"[\s,:]*")
+
+    def skip(at: int) -> int:
+        found = blank.match(text, at)
+        return found.end() if found else at
+
+    at = skip(0)
+    if inside:
+        at, start = skip(at + 1), None
+        while text[at] != "}":
+            key, at = decoder.raw_decode(text, at)
+            at = skip(at)
+            start = at if key == "whitelist" else start  # of two, json takes the last
+            _, at = decoder.raw_decode(text, at)
+            at = skip(at)
+        assert start is not None
+        at = start
+    line, counted, at = 1, 0, skip(at + 1)
+    while text[at] != "]":
+        line, counted = line + text.count("\n", counted, at), at
+        item, at = decoder.raw_decode(text, at)
+        yield line, item
+        at = skip(at)
+
+
+# -- adding, removing, writing out -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from teds_provision.errors import Garbled, NodeSilent, PolicyRefused, TooLongFor
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import reset_node
 from teds_provision.steps.identify import identify
-from teds_provision.steps.reset import reset_node
 
 from ..bench import Board, make_station, talk
 from . import faulty, nodes

@@ -16,9 +16,9 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from teds_provision.errors import TedsProvisionError
+from teds_provision.steps.batch_sheet import Declined
 from teds_provision.steps.board_type import WrongBoard
 from teds_provision.steps.build import NotNamed
-from teds_provision.steps.many.board import Declined
 from teds_provision.store import Store
 from tests.terminal import on_terminal
 

@@ -10,9 +10,8 @@ from rich.console import Console
 
 from teds_provision.cli.provision import OperatorScreen, Watched
 from teds_provision.errors import NodeSilent, TedsProvisionError
-from teds_provision.steps.build_order import BuildOrder, Prepared
-from teds_provision.steps.many.board import Board, Declined
-from teds_provision.steps.many.sheet import Row
+from teds_provision.steps.batch_sheet import Board, Declined, Row
+from teds_provision.steps.build import BuildOrder, Prepared
 from teds_provision.talk.progress import Silent
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")

@@ -17,9 +17,9 @@ from teds_provision.links import Notice
 from teds_provision.links.nfc.message import Record
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, build
+from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import provision
-from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 from teds_provision.store import StoreLock, WhitelistEntry
 from teds_provision.talk.progress import Silent
 

@@ -16,9 +16,9 @@ from teds_provision.errors import LinkFailure
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import port
 from teds_provision.station.station import Station as BaseStation
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.batch import Boards, Questions, Request
+from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.inventory import inventory
-from teds_provision.steps.many.boards import Boards, Questions, Request
 from teds_provision.talk.progress import Silent
 from tests.bench import PASSPHRASE
 from tests.links.nfc.field import Field

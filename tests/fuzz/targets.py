@@ -413,12 +413,12 @@ def backup_seeds() -> Iterable[bytes]:
 
 def check_whitelist(data: bytes) -> None:
     """Whitelists that other people write: XML, CSV, JSON by the first octet."""
-    from teds_provision.steps import whitelist_files
+    from teds_provision.steps import whitelist
 
     if not data:
         return
-    readers = (whitelist_files._read_xml, whitelist_files._read_csv, whitelist_files._read_json)
-    reads(lambda: readers[data[0] % 3](as_text(data[1:]), whitelist_files._Reading("list")))
+    readers = (whitelist._read_xml, whitelist._read_csv, whitelist._read_json)
+    reads(lambda: readers[data[0] % 3](as_text(data[1:]), whitelist._Reading("list")))
 
 
 def whitelist_seeds() -> Iterable[bytes]:

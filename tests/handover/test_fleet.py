@@ -26,10 +26,10 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder, build
+from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.verify import Verified, verify_image
 from teds_provision.steps.verify_node import look_at_node
-from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.codec import security

@@ -13,9 +13,8 @@ from teds_provision.handover.life import is_finished, plan_takeover, retire, rev
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import agree
+from teds_provision.steps.agree import ResetReceipt, agree, reset_node
 from teds_provision.steps.identify import identify
-from teds_provision.steps.reset import ResetReceipt, reset_node
 from teds_provision.steps.verify import verify_image
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.image import Image

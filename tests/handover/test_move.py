@@ -12,8 +12,8 @@ from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, UsageFai
 from teds_provision.handover.incoming import ImportPlan, plan_import, prove_node, proven_of
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import content_digest
-from teds_provision.steps.address import set_address
 from teds_provision.steps.agree import agree, open_session
+from teds_provision.steps.commands import set_address
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
 from teds_provision.steps.verify_node import verify_node

@@ -15,7 +15,7 @@ from teds_provision.node.described import create
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import provision
 from teds_provision.store import WhitelistEntry, utc_now

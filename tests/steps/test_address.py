@@ -7,7 +7,7 @@ import pytest
 from teds_provision.errors import NodeRefused, NodeSilent
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
-from teds_provision.steps.address import set_address
+from teds_provision.steps.commands import set_address
 from tests.bench import Board, MemoryLink, talk
 
 from .test_provision import run

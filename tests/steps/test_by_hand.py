@@ -12,9 +12,9 @@ from teds_provision.protocol.messages.frames import Reason, refusal
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder, build
+from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import Survey
-from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.meeting import the_one

@@ -12,10 +12,9 @@ from teds_provision.errors import CalibrationMisfit
 from teds_provision.handover.life import plan_takeover, take_over
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoard
-from teds_provision.steps.build import build
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.build import BuildOrder, build
+from teds_provision.steps.document import plan_sheet, write_sheet
 from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.steps.visits.sheet_file import plan_sheet, write_sheet
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.calibration import Calibration, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm

@@ -16,7 +16,7 @@ from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.frames import Function, Reason, refusal
 from teds_provision.station.station import Station
-from teds_provision.steps.visits.identify_at import identify_at
+from teds_provision.steps.commands import identify_at
 from teds_provision.talk.progress import Silent
 from tests.pace import PATIENCE
 from tests.places import free_bus

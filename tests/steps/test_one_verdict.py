@@ -21,7 +21,7 @@ from teds_provision.measure.trusting import open_trusted
 from teds_provision.station.station import Station
 from teds_provision.steps import reading
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
 from teds_provision.steps.read import read_image
@@ -243,7 +243,7 @@ def test_trust_that_ends_is_in_the_verdict_of_what_was_read_before(tmp_path: Pat
 
 
 def test_a_reset_forgets_the_reading(station: Station, board: Board) -> None:
-    from teds_provision.steps.reset import reset_node
+    from teds_provision.steps.agree import reset_node
 
     with talk(board) as node:
         reset_node(station, node, identify(station, node))

@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-from teds_provision.steps.build import NotNamed, build, nobody
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.agree import reset_node
+from teds_provision.steps.build import BuildOrder, NotNamed, build, nobody
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.steps.reset import reset_node
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.profile.load import shipped_profiles
 from tests.bench import Board, talk

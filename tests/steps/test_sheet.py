@@ -8,11 +8,8 @@ import pytest
 
 from teds_provision.errors import BadData, NodeBusy, NodeSilent, NoNode
 from teds_provision.station.station import Station
-from teds_provision.steps.build_order import BuildOrder
-from teds_provision.steps.many.board import Board, Declined
-from teds_provision.steps.many.progress import Progress
-from teds_provision.steps.many.report import write_report
-from teds_provision.steps.many.sheet import Sheet, read_sheet
+from teds_provision.steps.batch_sheet import Board, Declined, Progress, Sheet, read_sheet, write_report
+from teds_provision.steps.build import BuildOrder
 
 
 def read(station: Station, folder: Path, text: str | bytes) -> Sheet:

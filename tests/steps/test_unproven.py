@@ -18,13 +18,11 @@ from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import COMMON, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import require_session
+from teds_provision.steps.agree import proof_of_reset, require_session
+from teds_provision.steps.commands import ReadDone, Visit, read_at, verify_at
 from teds_provision.steps.identify import identify
-from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Verified, require_authentic
 from teds_provision.steps.verify_node import look_at_node
-from teds_provision.steps.visits.at_node import ReadDone, read_at, verify_at
-from teds_provision.steps.visits.visit import Visit
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, refused
 from teds_provision.talk.meeting import refuse_twins, without_twins
@@ -191,7 +189,7 @@ def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
         raise refused(Reason.BUSY, "to prove its key")
         yield
 
-    monkeypatch.setattr("teds_provision.steps.visits.at_node.at_node", contextmanager(refuses))
+    monkeypatch.setattr("teds_provision.steps.commands.at_node", contextmanager(refuses))
     done = verify_at(station, LinkSettings(), board.uuid.hex(), Silent())
     assert (done.verified.verdict, type(done.error)) == ("unproven", Unproven)
 
@@ -211,7 +209,7 @@ def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
             with node:
                 yield Visit(station, node, identify(station, node))
 
-        monkeypatch.setattr("teds_provision.steps.visits.at_node.at_node", at)
+        monkeypatch.setattr("teds_provision.steps.commands.at_node", at)
 
     def read() -> ReadDone:
         return read_at(station, LinkSettings(), board.uuid.hex(), Silent())

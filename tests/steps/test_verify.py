@@ -14,12 +14,12 @@ from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import build
+from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
 from teds_provision.steps.sign import known_node_keys, sign
 from teds_provision.steps.verify import Known, Verified, known_of, verify_image
 from teds_provision.steps.verify_node import verify_node
-from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 from teds_provision.steps.write import write
 from teds_provision.store import TrustRecord
 from teds_provision.teds.codec import security

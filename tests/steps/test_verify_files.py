@@ -13,8 +13,8 @@ import pytest
 from teds_provision.errors import NotFound
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, station_key_message, to_pem
-from teds_provision.steps.many import verify_files as many
-from teds_provision.steps.many.verify_files import FileVerdict, Totals, image_files
+from teds_provision.steps import verify_files as many
+from teds_provision.steps.verify_files import FileVerdict, Totals, image_files
 from teds_provision.teds.calibration import Calibration, CalibrationInput
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotFound, OtherKey, PolicyRefused
 from teds_provision.station.station import Station
-from teds_provision.steps.whitelist import add, plan_addition, remove, render
-from teds_provision.steps.whitelist_files import FORMATS, Listed, read_whitelist
+from teds_provision.steps.whitelist import FORMATS, Listed, add, plan_addition, read_whitelist, remove, render
 from teds_provision.store import Revocation, WhitelistEntry
 from tests.pace import costs_at_most
 

@@ -8,8 +8,7 @@ from teds_provision.errors import OtherKey
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.steps.identify import identify
-from teds_provision.steps.whitelist import add, plan_addition, remove
-from teds_provision.steps.whitelist_files import Listed
+from teds_provision.steps.whitelist import Listed, add, plan_addition, remove
 from tests.bench import Board, MemoryLink, talk
 
 

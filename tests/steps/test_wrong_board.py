@@ -16,15 +16,13 @@ from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import OPERATION, ChannelState, Operation
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import require_session
+from teds_provision.steps.agree import require_session, reset_node
+from teds_provision.steps.batch import Boards, Questions, Request
 from teds_provision.steps.board_type import WrongBoard, bears, differences, operate
-from teds_provision.steps.build import build
-from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
-from teds_provision.steps.many.boards import Boards, Questions, Request
 from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.steps.read import read_image
-from teds_provision.steps.reset import reset_node
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.image import Image
@@ -199,7 +197,7 @@ def test_a_row_of_a_sheet_waits_for_its_own_board(station: Station, angle: Virtu
     sheet.write_text("uuid,name,profile\n,cell,load-cell\n")
     boards = Boards(station, LinkSettings("nfc"), Request(None, BuildOrder(), sheet=sheet), Silent())
     asked = Questions(lambda _who: None, None)
-    from teds_provision.steps.many.board import Board as Ended
+    from teds_provision.steps.batch_sheet import Board as Ended
 
     def tap(contact: Contact) -> Ended:
         with Conversation(contact, notice=lambda _notice: None) as node:

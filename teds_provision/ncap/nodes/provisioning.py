@@ -26,11 +26,11 @@ from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
-from teds_provision.steps.build_order import BuildOrder, prepare
+from teds_provision.steps.build import BuildOrder, prepare
+from teds_provision.steps.document import write_sheet
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, newcomer, provision
 from teds_provision.steps.verify import Verified, require_authentic
-from teds_provision.steps.visits.sheet_file import write_sheet
 from teds_provision.store.audit import ACTOR
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.progress import Silent, StepResult

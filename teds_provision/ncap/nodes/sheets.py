@@ -13,12 +13,12 @@ from teds_provision.ncap.nodes.desk import Desk
 from teds_provision.ncap.nodes.looking import read_anew
 from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.station.station import Station
-from teds_provision.steps.build_order import guard
+from teds_provision.steps.build import guard
+from teds_provision.steps.document import SheetPlan, plan_sheet, write_sheet
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
 from teds_provision.steps.reading import Judged, is_keyed, verdict_of
 from teds_provision.steps.verify import Verified, known_of, session, verify_image
-from teds_provision.steps.visits.sheet_file import SheetPlan, plan_sheet, write_sheet
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent

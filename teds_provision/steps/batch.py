@@ -15,14 +15,30 @@ from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import TakeOver
+from teds_provision.steps.batch_sheet import (
+    Board,
+    Progress,
+    Row,
+    Totals,
+    check_report,
+    mean_steps,
+    read_sheet,
+    worse,
+    write_report,
+)
 from teds_provision.steps.board_type import Retype, WrongBoard, differences
-from teds_provision.steps.build import Confirm, nobody, propose
-from teds_provision.steps.build_order import BuildOrder, Prepared, for_several, merged, named_for, prepare
+from teds_provision.steps.build import (
+    BuildOrder,
+    Confirm,
+    Prepared,
+    for_several,
+    merged,
+    named_for,
+    nobody,
+    prepare,
+    propose,
+)
 from teds_provision.steps.identify import Identified, examine
-from teds_provision.steps.many.board import Board, Totals, worse
-from teds_provision.steps.many.progress import Progress, mean_steps
-from teds_provision.steps.many.report import check_report, write_report
-from teds_provision.steps.many.sheet import Row, read_sheet
 from teds_provision.steps.provision import Accept, Provisioned, provision
 from teds_provision.steps.read import survey
 from teds_provision.steps.reading import verdict_of

@@ -17,8 +17,7 @@ from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisio
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
-from teds_provision.steps.judging import Judging, remember
-from teds_provision.steps.verify import Check, Verified, require_authentic, verify_images
+from teds_provision.steps.verify import Check, Judging, Verified, remember, require_authentic, verify_images
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image

@@ -14,7 +14,7 @@ from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.board_type import differences, refuse
-from teds_provision.steps.build_order import guard, own_name, require_fit, teds_calibrations
+from teds_provision.steps.build import guard, own_name, require_fit, teds_calibrations
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import known_node_keys, sign
 from teds_provision.steps.verify import Verified, require_authentic

@@ -1,0 +1,628 @@
+"""The sheet of a batch (``--batch FILE``): its rows, how each board ended, how far the sheet is, and the report.
+
+CSV with a header: ``uuid`` (or empty: the rows are taken in the order of the taps), ``name``, ``profile``,
+``calibration`` (a file; a relative path starts at the sheet) and ``fingerprint`` (32 to 64 hex digits, for example from
+a scanned label: it pins the board's key before the tap). Everything is checked before the first tap. Progress is kept
+per sheet in the station's home, so the same command carries on after an interruption.
+"""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import hashlib
+import html
+import io
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from teds_provision.errors import (
+    BadData,
+    NodeBusy,
+    NoNode,
+    NotAuthentic,
+    NotFound,
+    PolicyRefused,
+    TedsProvisionError,
+    UsageFailure,
+)
+from teds_provision.files import SHARED, private_folder, read_limited, write_whole
+from teds_provision.station.label import read_label
+from teds_provision.station.station import Station
+from teds_provision.steps.build import BuildOrder, Prepared, prepare
+from teds_provision.steps.provision import Provisioned
+from teds_provision.steps.verify import require_authentic
+from teds_provision.store import utc_now
+
+Result = Literal["passed", "failed", "skipped"]
+
+
+class Declined(PolicyRefused):
+    """A person said no: nothing was changed."""
+
+    code = "declined"
+
+
+@dataclass(frozen=True)
+class Board:
+    """The end of one board: what was done, or the error that ended it. ``row`` is that of a sheet, from 1."""
+
+    uuid: bytes
+    seconds: float
+    done: Provisioned | None = None
+    error: TedsProvisionError | None = None
+    row: int | None = None
+    place: str = ""
+    time: str = field(default_factory=utc_now)
+
+    @property
+    def failure(self) -> TedsProvisionError | None:
+        """The error that ended it, or the verdict that is not ``authentic``; None for a board that passed."""
+        if self.error is not None or self.done is None:
+            return self.error
+        try:
+            require_authentic(self.done.verified)
+        except TedsProvisionError as error:
+            return error
+        return None
+
+    @property
+    def result(self) -> Result:
+        """``passed``: provisioned and authentic; ``skipped``: somebody said no."""
+        if isinstance(self.error, Declined):
+            return "skipped"
+        return "failed" if self.failure is not None else "passed"
+
+
+@dataclass(frozen=True)
+class Totals:
+    """What a batch came to: boards by result, seconds, and the share that passed at their first try (None: no try).
+
+    ``steps`` are the mean seconds of each step over the boards that passed.
+    """
+
+    passed: int
+    failed: int
+    skipped: int
+    seconds: float
+    first_pass: float | None
+    steps: dict[str, float]
+    worst: TedsProvisionError | None = None
+
+    @property
+    def error(self) -> TedsProvisionError | None:
+        """What the command ends with: nothing if all passed, else the worst that happened."""
+        if not self.failed and not self.skipped:
+            return None
+        told = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."
+        if isinstance(self.worst, NoNode):  # told nowhere else: no board came whose error it would be
+            told = f"{told} {self.worst.message}"
+        kind = type(self.worst) if self.worst is not None else PolicyRefused
+        known = kind if kind.__init__ is TedsProvisionError.__init__ else PolicyRefused
+        return known(told, hint="Run the same command again: it carries on with what is left.")
+
+
+def worse(one: TedsProvisionError | None, other: TedsProvisionError | None) -> TedsProvisionError | None:
+    """Whichever a person should hear of first: not authentic, then refused, then the rest."""
+    if one is None or other is None:
+        return one or other
+    return max(one, other, key=_weight)
+
+
+def _weight(error: TedsProvisionError) -> int:
+    if isinstance(error, NotAuthentic):
+        return 3
+    return 2 if isinstance(error, PolicyRefused) and not isinstance(error, Declined) else 1
+
+
+# -- reading the sheet -------------------------------------------------------------------------------------------------
+
+MAX_SHEET_OCTETS: Final = 4 << 20
+MAX_ROWS: Final = 10_000
+COLUMNS: Final = ("uuid", "name", "profile", "calibration", "fingerprint")
+_SHOWN: Final = 20
+_DELIMITERS: Final = ",;\t"  # of equals the first
+_UUID = re.compile("[0-9a-f]{20}")
+_FINGERPRINT = re.compile("[0-9a-f]{32,64}")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One board of the sheet: ``number`` counts from 1, ``line`` is that of the file."""
+
+    number: int
+    line: int
+    uuid: bytes | None
+    fingerprint: str | None
+    prepared: Prepared
+    digest: str
+
+    @property
+    def by_order(self) -> bool:
+        """Whether the next board that nobody else is meant by takes this row."""
+        return self.uuid is None and self.fingerprint is None
+
+    @property
+    def lacks_calibration(self) -> bool:
+        """Whether the type asks for a calibration and the row brings none; its board may have one from before."""
+        profile = self.prepared.profile
+        if profile is None or self.prepared.calibrations is not None:
+            return False
+        return any(channel.calibration.required for channel in profile.channels)
+
+    def means(self, uuid: bytes, fingerprint: str) -> bool:
+        """Whether this row names that board; a UUID with another key is for the pin to refuse."""
+        if self.uuid is not None:
+            return self.uuid == uuid
+        return self.fingerprint is not None and fingerprint.startswith(self.fingerprint)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """All rows of one file, each found good."""
+
+    path: Path
+    rows: tuple[Row, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know before the first board, once for all rows of which it is true."""
+        found: dict[str, list[int]] = {}
+        for row in self.rows:
+            for warning in row.prepared.warnings:
+                found.setdefault(warning, []).append(row.number)
+            if row.lacks_calibration:
+                found.setdefault("the type asks for a calibration, and none is named.", []).append(row.number)
+        return tuple(f"Row{'s' if len(rows) > 1 else ''} {_numbers(rows)}: {why}" for why, rows in found.items())
+
+
+def read_sheet(station: Station, path: Path, order: BuildOrder) -> Sheet:
+    """Read a sheet, and read, fit and guard all that it names; ``order`` is what rows get that leave it out.
+
+    Raises NotFound (no such file), BadData with every line that is wrong.
+    """
+    reading = _Reading(station, path, order)
+    reading.read(read_limited(path, MAX_SHEET_OCTETS, "sheet of boards"))
+    if reading.mistakes:
+        mistakes = [f"{path.name}:{_numbers(lines)}: {why}" for why, lines in reading.mistakes.items()]
+        shown = "; ".join(mistakes[:_SHOWN])
+        more = f"; and {len(mistakes) - _SHOWN} more" if len(mistakes) > _SHOWN else ""
+        raise BadData(f"{shown}{more}.", hint="Nothing was provisioned. Mend the sheet and run the same command again.")
+    if not reading.rows:
+        raise BadData(f"{path} has no row.", hint=f"A header ({', '.join(COLUMNS)}) and a line per board.")
+    return Sheet(path, tuple(reading.rows))
+
+
+def _numbers(numbers: Sequence[int]) -> str:
+    """``2, 9, 16``; of many the first few, and how many more."""
+    more = f" and {len(numbers) - _SHOWN} more" if len(numbers) > _SHOWN else ""
+    return f"{', '.join(map(str, numbers[:_SHOWN]))}{more}"
+
+
+class _Reading:
+    def __init__(self, station: Station, path: Path, order: BuildOrder) -> None:
+        self.station, self.path, self.order = station, path, order
+        self.rows: list[Row] = []
+        self.mistakes: dict[str, list[int]] = {}
+        self.count = 0
+        self._seen: dict[tuple[str, str], int] = {}
+        self._prepared: dict[BuildOrder, Prepared | str] = {}
+
+    def wrong(self, line: int, why: str) -> None:
+        self.mistakes.setdefault(why, []).append(line)
+        self.count += 1
+
+    def read(self, octets: bytes) -> None:
+        try:
+            text = octets.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            self.wrong(1 + octets[: error.start].count(b"\n"), "it is not UTF-8 (a spreadsheet calls it: CSV UTF-8)")
+            return
+        first = text.partition("\n")[0]
+        delimiter = max(_DELIMITERS, key=first.count)
+        table = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+        try:
+            header = [cell.strip().lower() for cell in next(table, [])]
+            if not self._header_is_good(header):
+                return
+            for row in table:
+                cells = [cell.strip() for cell in row]
+                if any(cells):
+                    self._row(table.line_num, header, cells)
+                if len(self.rows) > MAX_ROWS:
+                    self.wrong(table.line_num, f"there are more than {MAX_ROWS} rows")
+                    return
+        except csv.Error as error:
+            self.wrong(table.line_num, f"this is no CSV: {error}")
+
+    def _header_is_good(self, header: Sequence[str]) -> bool:
+        for name in header:
+            if name not in COLUMNS:
+                self.wrong(1, f"there is no column {name!r}; columns are {', '.join(COLUMNS)}")
+            elif header.count(name) > 1:
+                self.wrong(1, f"the column {name!r} is there twice")
+        return not self.mistakes
+
+    def _row(self, line: int, header: Sequence[str], cells: Sequence[str]) -> None:
+        before = self.count
+        if len(cells) > len(header):
+            self.wrong(line, f"{len(cells)} cells under {len(header)} columns")
+        values = dict(zip(header, cells, strict=False))
+        self._take_label(line, values)
+        uuid = self._digits(line, "uuid", values.get("uuid", ""), _UUID, "20 hex digits")
+        pin = self._digits(line, "fingerprint", values.get("fingerprint", ""), _FINGERPRINT, "32 to 64 hex digits")
+        prepared = self._order(line, values)
+        for what, value in (("uuid", uuid), ("fingerprint", pin), ("name", values.get("name", ""))):
+            self._once(line, what, value or "")
+        if uuid is not None and prepared is not None and prepared.order.name is not None:
+            self._name_is_free(line, bytes.fromhex(uuid), prepared.order.name)
+        if self.count == before and prepared is not None:
+            digest = hashlib.sha256("\0".join(cells).encode()).hexdigest()
+            number = len(self.rows) + 1
+            self.rows.append(Row(number, line, bytes.fromhex(uuid) if uuid else None, pin, prepared, digest))
+
+    def _take_label(self, line: int, values: dict[str, str]) -> None:
+        """A label that was scanned into the cell of UUID or fingerprint says both; another cell may not contradict."""
+        for name in ("uuid", "fingerprint"):
+            label = read_label(values.get(name, ""))
+            if label is None:
+                continue
+            said = {"uuid": label[0].hex(), "fingerprint": label[1]}
+            other = "uuid" if name == "fingerprint" else "fingerprint"
+            digits = re.sub(r"[\s:-]", "", values.get(other, "")).lower().removeprefix("0x")
+            if digits and read_label(values[other]) is None and not said[other].startswith(digits):
+                self.wrong(line, f"{other}: {values[other][:48]!a}, and the label in {name} says {said[other]}")
+            values.update(said)
+
+    def _digits(self, line: int, what: str, text: str, form: re.Pattern[str], rule: str) -> str | None:
+        if not text:
+            return None
+        digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
+        if form.fullmatch(digits):
+            return digits
+        self.wrong(line, f"{what}: {rule} are needed, here is {text[:48]!a}")
+        return None
+
+    def _once(self, line: int, what: str, value: str) -> None:
+        if not value:
+            return
+        other = self._seen.setdefault((what, value), line)
+        if other != line and not (what == "name" and ("{uuid}" in value or "{n}" in value)):
+            self.wrong(line, f"the {what} {value} stands in line {other} too")
+
+    def _name_is_free(self, line: int, uuid: bytes, name: str) -> None:
+        others = [other for other in self.station.nodes.all_named(name) if other != uuid]
+        if others:
+            self.wrong(line, f"node {others[0].hex()} has the name {name!r} already")
+
+    def _order(self, line: int, values: dict[str, str]) -> Prepared | None:
+        file = values.get("calibration") or None
+        order = replace(
+            self.order,
+            profile=values.get("profile") or self.order.profile,
+            name=values.get("name") or self.order.name,
+            calibration=self.path.parent / file if file else None,
+        )
+        shared = replace(order, name=None)  # one fit for all that name the same file
+        if shared not in self._prepared:
+            try:
+                self._prepared[shared] = prepare(self.station, shared)
+            except TedsProvisionError as error:
+                self._prepared[shared] = error.message.rstrip(".")
+        try:
+            prepare(self.station, BuildOrder(name=order.name))
+        except TedsProvisionError as error:
+            self.wrong(line, error.message.rstrip("."))
+        found = self._prepared[shared]
+        if isinstance(found, str):
+            self.wrong(line, found)
+            return None
+        return replace(found, order=order)
+
+
+# -- progress ----------------------------------------------------------------------------------------------------------
+
+FOLDER: Final = "batches"
+_MAX_OCTETS: Final = 64 << 20
+
+
+@dataclass
+class Attempted:
+    """What became of one row: the board that took it, its last result, and whether the first try passed.
+
+    ``digest`` is of the row's cells: another content is another board, and begins anew.
+    """
+
+    digest: str
+    uuid: str | None = None
+    result: str = ""
+    tries: int = 0
+    first: bool = False
+    seconds: float = 0.0
+    time: str = ""
+    message: str = ""
+    steps: dict[str, float] = field(default_factory=dict)
+
+
+class Progress:
+    """The rows of one sheet with what became of them; durable after each board."""
+
+    def __init__(self, home: Path, sheet: Sheet) -> None:
+        self.sheet = sheet
+        name = hashlib.sha256(str(sheet.path.resolve()).encode()).hexdigest()[:32]
+        self._path = home / FOLDER / f"{name}.json"
+        self._there = kept = self._kept()
+        self.rows = {row.number: self._of(row, kept.get(str(row.number))) for row in sheet.rows}
+        self.worst: TedsProvisionError | None = None
+        self._tried: frozenset[int] = frozenset()
+        self._turned_away: dict[int, str] = {}
+
+    def _kept(self) -> dict[str, Any]:
+        try:
+            told = json.loads(read_limited(self._path, _MAX_OCTETS, "progress of a sheet", follow=False))
+        except (NotFound, ValueError):
+            return {}
+        rows = told.get("rows") if isinstance(told, dict) else None
+        return rows if isinstance(rows, dict) else {}
+
+    @staticmethod
+    def _of(row: Row, kept: Any) -> Attempted:
+        if not isinstance(kept, dict) or kept.get("digest") != row.digest:
+            return Attempted(row.digest)
+        try:
+            return Attempted(**kept)
+        except TypeError:  # of another version of this tool
+            return Attempted(row.digest)
+
+    def save(self, *changed: Row) -> None:
+        """Put these rows (all, where none is named) onto the disk, beside what another run of this sheet put there.
+
+        Raises StoreFailure.
+        """
+        with self._alone():
+            self._read_again(but={row.number for row in changed or self.sheet.rows})
+            self._write()
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """What is written is made from what lies there: two runs of one sheet (two desks) lose each other no board."""
+        private_folder(self._path.parent)
+        place = self._path.with_suffix(".lock")
+        descriptor = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # held for one small file
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _read_again(self, but: Collection[int] = ()) -> None:
+        """Take in the rows that another run has changed since this one looked."""
+        before, self._there = self._there, self._kept()
+        self.rows |= {
+            row.number: self._of(row, self._there[key])
+            for row in self.sheet.rows
+            if row.number not in but and (key := str(row.number)) in self._there and self._there[key] != before.get(key)
+        }
+
+    def _write(self) -> None:
+        self._there = {str(number): asdict(row) for number, row in self.rows.items()}
+        told = {"sheet": str(self.sheet.path.resolve()), "rows": self._there}
+        write_whole(self._path, json.dumps(told, indent=1).encode())
+
+    @property
+    def open(self) -> list[Row]:
+        """The rows whose board has not passed."""
+        return [row for row in self.sheet.rows if self.rows[row.number].result != "passed"]
+
+    @property
+    def untried(self) -> list[Row]:
+        """The open rows that nobody tried in this run."""
+        return [row for row in self.open if row.number not in self._tried]
+
+    @property
+    def next_row(self) -> Row | None:
+        """The row that the next board may be of."""
+        rows = self.untried or self.open
+        return rows[0] if rows else None
+
+    def row_for(self, uuid: bytes, fingerprint: str, *, busy: Collection[int] = ()) -> Row | None:
+        """The row of a board: that which names it or had it before, else the next in the order of the taps.
+
+        One that had no board goes before one whose board did not pass: that is for a spare, once nothing else is left.
+        ``busy`` are the numbers of the rows on which another reader is at work.
+        """
+        for row in self.sheet.rows:
+            if row.means(uuid, fingerprint) or (row.by_order and self.board_of(row) == uuid.hex()):
+                return row
+        rows = [row for row in self.open if row.by_order and row.number not in busy]
+        return min(rows, key=self._lateness, default=None)
+
+    def _lateness(self, row: Row) -> tuple[bool, bool]:
+        return self.rows[row.number].uuid is not None, row.number in self._tried
+
+    def board_of(self, row: Row) -> str | None:
+        """The board that has the row, or was turned away from it in this run; None where there was none."""
+        return self.rows[row.number].uuid or self._turned_away.get(row.number)
+
+    def take(self, row: Row, uuid: bytes) -> None:
+        """Note that this board is the row's, before anything is done with it.
+
+        Raises NodeBusy where another run of this sheet has given the row to another board meanwhile.
+        """
+        before = self.rows[row.number].uuid
+        if before == uuid.hex():
+            return
+        with self._alone():
+            self._read_again()
+            attempted = self.rows[row.number]
+            if row.by_order and attempted.uuid not in (before, uuid.hex()):
+                raise NodeBusy(
+                    f"Row {row.number} was given to board {attempted.uuid} by another run of this sheet.",
+                    hint="Tap this board again: it gets the next row.",
+                )
+            attempted.uuid = uuid.hex()
+            self._write()
+
+    def turn_away(self, row: Row, uuid: bytes) -> None:
+        """Note that this board was not given what the row says; the row stays free, and is tried again with it."""
+        self._turned_away[row.number] = uuid.hex()
+
+    def not_this_board(self, row: Row, board: Board) -> None:
+        """Note that another type of board was tapped for this row: nothing was written, the row waits for its own."""
+        attempted = self.rows[row.number]
+        attempted.uuid, attempted.time = None, board.time
+        attempted.message = board.failure.message if board.failure is not None else ""
+        self.worst = worse(self.worst, board.failure)
+        self.save(row)
+
+    def note(self, row: Row, board: Board) -> None:
+        """Note how a board ended."""
+        attempted = self.rows[row.number]
+        attempted.tries += board.result != "skipped"  # a "no" says nothing of the board
+        attempted.result = board.result
+        attempted.first = attempted.first or (attempted.tries == 1 and board.result == "passed")
+        attempted.seconds, attempted.time = round(board.seconds, 3), board.time
+        attempted.message = board.failure.message if board.failure is not None else ""
+        if board.done is not None:
+            attempted.message = attempted.message or " ".join(board.done.warnings)
+            attempted.steps = {step.name: step.seconds for step in board.done.steps}
+        self._tried = self._tried | {row.number}
+        self.worst = worse(self.worst, board.failure)
+        self.save(row)
+
+    def ran_out(self, seconds: float) -> None:
+        """Note that no board came in time for the rows that nobody tried, if there are any."""
+        if self.untried:
+            missed = ", ".join(str(row.number) for row in self.untried[:10])
+            self.worst = worse(self.worst, NoNode(f"No board came within {seconds:.0f} s for row {missed}."))
+
+    def totals(self) -> Totals:
+        """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""
+        rows = list(self.rows.values())
+        results = Counter(row.result for row in rows)
+        passed, failed = results["passed"], results["failed"]
+        firsts = [row.first for row in rows if row.tries and row.result != "skipped"]
+        return Totals(
+            passed,
+            failed,
+            len(rows) - passed - failed,
+            round(sum(row.seconds for row in rows), 3),
+            round(sum(firsts) / len(firsts), 4) if firsts else None,
+            mean_steps([row.steps for row in rows if row.result == "passed"]),
+            self.worst,
+        )
+
+
+def mean_steps(all_steps: list[dict[str, float]]) -> dict[str, float]:
+    """Mean seconds of each step."""
+    names = list(dict.fromkeys(name for steps in all_steps for name in steps))
+    return {name: round(sum(steps.get(name, 0.0) for steps in all_steps) / len(all_steps), 4) for name in names}
+
+
+# -- the report: CSV or HTML, by suffix --------------------------------------------------------------------------------
+
+_HEAD: Final = ("row", "uuid", "name", "profile", "result", "tries", "first_pass", "seconds", "time", "message")
+_RESULT: Final = _HEAD.index("result")
+_STYLE: Final = (
+    "body{font:16px sans-serif;margin:2em}table{border-collapse:collapse}td,th{border:1px solid #999;padding:.3em .6em;"
+    "text-align:left;white-space:nowrap}td:last-child{white-space:normal}.passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
+)
+
+
+def check_report(path: Path | None) -> None:
+    """Raise UsageFailure for a report of an unknown form, NotFound without a folder to lie in, before the first tap."""
+    if path is None:
+        return
+    if path.suffix.lower() not in (".csv", ".html", ".htm"):
+        raise UsageFailure(f"{path.name} is neither CSV nor HTML.", hint="Name it FILE.csv or FILE.html.")
+    if not path.parent.is_dir():
+        raise NotFound(f"There is no folder {path.parent} for the report.", hint="Make it, or name another place.")
+
+
+def write_report(path: Path, progress: Progress) -> None:
+    """Write the report whole; raises what ``write_whole`` raises."""
+    rows, totals = _rows(progress), progress.totals()
+    text = _csv(rows, totals) if path.suffix.lower() == ".csv" else _html(progress.sheet.path.name, rows, totals)
+    write_whole(path, text.encode(), mode=SHARED)
+
+
+def _rows(progress: Progress) -> list[tuple[str, ...]]:
+    told = []
+    for row in progress.sheet.rows:
+        kept, order = progress.rows[row.number], row.prepared.order
+        uuid = kept.uuid or (row.uuid.hex() if row.uuid is not None else "")
+        values = (row.number, uuid, order.name or "", order.profile or "", kept.result or "not reached", kept.tries)
+        told.append((*map(str, values), str(kept.first).lower(), str(kept.seconds), kept.time, kept.message))
+    return told
+
+
+def _totals(totals: Totals) -> list[tuple[str, str]]:
+    share = "" if totals.first_pass is None else f"{totals.first_pass:.4f}"
+    told = [
+        ("passed", str(totals.passed)),
+        ("failed", str(totals.failed)),
+        ("skipped", str(totals.skipped)),
+        ("seconds", f"{totals.seconds:.3f}"),
+        ("first_pass", share),
+    ]
+    return told + [(f"seconds of {name}", f"{seconds:.4f}") for name, seconds in totals.steps.items()]
+
+
+def _csv(rows: Sequence[Sequence[str]], totals: Totals) -> str:
+    out = io.StringIO(newline="")
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_HEAD)
+    writer.writerows([[_tame(cell) for cell in row] for row in rows])
+    writer.writerow([])
+    writer.writerows(_totals(totals))
+    return out.getvalue()
+
+
+def _tame(cell: str) -> str:
+    """A cell that no spreadsheet takes for a formula: names and messages come from outside."""
+    return f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell
+
+
+def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals) -> str:
+    head = "".join(f"<th>{html.escape(cell.replace('_', ' '))}</th>" for cell in _HEAD)
+    body = "".join(
+        f'<tr class="{html.escape(row[_RESULT])}">'
+        + "".join(f"<td>{html.escape(cell)}</td>" for cell in _for_people(row))
+        + "</tr>\n"
+        for row in rows
+    )
+    sums = "".join(
+        f"<tr><th>{html.escape(what)}</th><td>{html.escape(value)}</td></tr>\n" for what, value in _sums(totals)
+    )
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)}</title>'
+        f"<style>{_STYLE}</style></head><body><h1>{html.escape(name)}</h1>\n<table>{sums}</table><p></p>"
+        f"<table><tr>{head}</tr>\n{body}</table></body></html>\n"
+    )
+
+
+def _sums(totals: Totals) -> list[tuple[str, str]]:
+    share = "none was tried" if totals.first_pass is None else f"{totals.first_pass:.1%}"
+    counts = [("passed", totals.passed), ("failed", totals.failed), ("skipped or not reached", totals.skipped)]
+    told = [(what, str(count)) for what, count in counts]
+    told += [("first-pass yield", share), ("seconds in all", f"{totals.seconds:.1f}")]
+    return told + [(f"seconds of {name}, mean", f"{seconds:.2f}") for name, seconds in totals.steps.items()]
+
+
+def _for_people(row: Sequence[str]) -> list[str]:
+    """The cells of a row with the time of day here; nothing where the board was not reached."""
+    cells = dict(zip(_HEAD, row, strict=True))
+    tried = bool(cells["time"])
+    cells["first_pass"] = ("yes" if cells["first_pass"] == "true" else "no") if tried else ""
+    cells["seconds"] = f"{float(cells['seconds']):.1f}" if tried else ""
+    if tried:
+        cells["time"] = datetime.fromisoformat(cells["time"]).astimezone().isoformat(sep=" ", timespec="seconds")
+    return list(cells.values())

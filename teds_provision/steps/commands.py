@@ -1,0 +1,723 @@
+"""What each command does at a node, as one call: unlock, wait for the node, take its turn, identify, then the steps.
+
+Whoever calls one of these (the command line, the API) brings words alone: no session, lock or link is its own.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from teds_provision.errors import (
+    BadData,
+    Garbled,
+    NodeRefused,
+    NodeSilent,
+    NotFound,
+    PolicyRefused,
+    TedsProvisionError,
+    Unproven,
+    UsageFailure,
+)
+from teds_provision.files import read_limited
+from teds_provision.links import LINKS, LinkSettings, Notice
+from teds_provision.links.ports import OnABus
+from teds_provision.protocol.datasheet import SEQUENCE_WINDOW, NodeKeys
+from teds_provision.protocol.messages.frames import Function, security_command
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import Agreed, ResetReceipt, agree, open_session, require_session, reset_node
+from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse, shown_by
+from teds_provision.steps.build import guard, own_name
+from teds_provision.steps.identify import Identified, describe, identify
+from teds_provision.steps.provision import add_to_whitelist
+from teds_provision.steps.read import read_identity, read_image, survey
+from teds_provision.steps.reading import keep
+from teds_provision.steps.sign import Signed, known_image, known_node_keys, sign
+from teds_provision.steps.verify import Verified, known_of, require_authentic, session, unproven, verify_image
+from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
+from teds_provision.steps.write import Low, Written, wait_for_charge, write
+from teds_provision.store import DatasheetRecord, Draft
+from teds_provision.talk.conversation import HEARD, Conversation, SessionLost
+from teds_provision.talk.meeting import meet, meet_everyone
+from teds_provision.talk.progress import Reporter
+from teds_provision.talk.watching import Came, watch_nodes
+from teds_provision.teds.codec import security
+from teds_provision.teds.diff import Change, diff_blocks
+from teds_provision.teds.image import SECURITY, BlockId, Image
+
+MAX_IMAGE_OCTETS: Final = 16 << 20
+Unlock = Literal["always", "if held", "never"]
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A node that was met and proved its identity key, for as long as the meeting lasts."""
+
+    station: Station
+    node: Conversation
+    who: Identified
+
+    def session(self) -> None:
+        """Open a session under the key that is held; raises PolicyRefused where there is none."""
+        require_session(self.station, self.node)
+
+
+@contextmanager
+def at_node(
+    station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter, *, unlock: Unlock = "if held"
+) -> Iterator[Visit]:
+    """Meet node ``uuid`` on the chosen link and have it prove its key.
+
+    The vault is opened before anyone is waited for: always, where a key of this node is held, or never. Another
+    command of this station that works on the same node is waited for. Raises NoReader, NoNode after ``links.timeout``
+    seconds, OtherKey, NotAuthentic, LinkFailure.
+    """
+
+    def before() -> None:
+        if unlock != "never":
+            station.unlock(None if unlock == "always" else uuid)
+
+    with meet(station, links, uuid, reporter, before=before) as node, station.turn(uuid):
+        yield Visit(station, node, identify(station, node))
+
+
+def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
+    """The image of a file, or the UUID that ``text`` names; raises NotFound which says what of the two it is not.
+
+    Of both the file, but with ``node`` the node.
+    """
+    path = Path(text)
+    if node:
+        with suppress(NotFound):
+            return station.nodes.resolve(text)
+    if path.is_file():
+        return read_image_file(path)
+    try:
+        return station.nodes.resolve(text)
+    except NotFound:
+        if path.is_dir():
+            raise NotFound(f"{text} is a folder, and no node is known by that name.") from None
+        if path.exists():
+            raise NotFound(f"{text} is no regular file, and no node is known by that name.") from None
+        if path.suffix or len(path.parts) > 1:
+            raise NotFound(f"There is no file {text}, and no node is known by that name.") from None
+        raise
+
+
+def read_image_file(path: Path) -> Image:
+    """Read an image file; raises NotFound, BadData (of KeyAgreement 1 too, by name)."""
+    try:
+        image = Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
+    except BadData as error:
+        raise BadData(
+            f"{path} is no TEDS image: {error.message}", hint=error.hint or "Images come from build, sign and read."
+        ) from error
+    return security.require_our_wire(image)
+
+
+# -- identify: who lies on the reader or hangs on the bus, once or as they come ----------------------------------------
+
+
+@dataclass(frozen=True)
+class Found:
+    """A node that proved its key; ``identity`` is its plain Identify, a hint."""
+
+    who: Identified
+    identity: Identity
+    whitelisted: bool
+    channels: int
+    name: str | None
+    charging: dict[str, object] | None = None
+    ble: str | None = None
+
+
+def identify_at(
+    station: Station,
+    links: LinkSettings,
+    reporter: Reporter,
+    *,
+    add: bool = False,
+    watch: bool = False,
+    stop: threading.Event | None = None,
+) -> Iterator[Came[Found]]:
+    """Identify who is there, or (``watch``) whoever comes until ``stop``; ``add`` whitelists what proves its key.
+
+    With ``watch`` an error ends one node only. Without it that is so where another node was identified, and it is told
+    as a notice; else the first error is raised.
+    """
+    if add:
+        station.unlock()  # before a node lies there: a pin is sealed by the vault
+    if watch:
+        yield from watch_nodes(links, lambda node: _one(station, node, add), reporter, stop or threading.Event())
+        return
+    first: TedsProvisionError | None = None
+    identified = False
+    with meet_everyone(links, reporter) as nodes:
+        for node, found in _side_by_side(nodes, lambda node: _one(station, node, add)):
+            if isinstance(found, Found):
+                identified = True
+                yield Came(node.uuid, links.places[0], 0.0, found)
+                continue
+            first = first or found
+            if len(nodes) > 1:
+                text = f"Node {node.uuid.hex()} was not identified: {found.message}"
+                reporter.notice(Notice("unfinished", text, uuid=node.uuid))
+    if first is not None and not identified:
+        raise first
+
+
+def _side_by_side(
+    nodes: list[Conversation], work: Callable[[Conversation], Found]
+) -> Iterator[tuple[Conversation, Found | TedsProvisionError]]:
+    """What became of each node, in their order: as many at a time as the link bears, as a mute one takes 40 s."""
+
+    def one(node: Conversation) -> Found | TedsProvisionError:
+        try:
+            return work(node)
+        except TedsProvisionError as error:
+            return error
+
+    at_once = min(len(nodes), *(node.contact.link.capabilities.at_once for node in nodes))
+    if at_once < 2:
+        yield from ((node, one(node)) for node in nodes)
+        return
+    pool = ThreadPoolExecutor(at_once, thread_name_prefix="node")
+    try:
+        yield from zip(nodes, pool.map(one, nodes), strict=True)
+    finally:  # after a Ctrl-C nobody is waited for: the bus is closed next
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _one(station: Station, node: Conversation, add: bool) -> Found:
+    who = identify(station, node)
+    described = describe(node)
+    entry = who.whitelisted
+    if entry is None and add:
+        entry = add_to_whitelist(station, node, who)
+    known = station.nodes.get(who.uuid)
+    name = (known.name if known else None) or described.name
+    facts: dict[str, object] = {}
+    read = station.nodes.reading(who.uuid)
+    if read is None or not read.is_datasheet:  # nothing is verified here: it stands for what is not known better
+        facts["channels"] = described.channels
+        if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
+            facts["name"] = name
+    with station.durable("identify"):
+        station.nodes.remember(who.uuid, **facts)
+        station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
+    return _found(node, who, listed=entry is not None, channels=described.channels, name=name)
+
+
+def _found(node: Conversation, who: Identified, *, listed: bool, channels: int, name: str | None) -> Found:
+    charging = node.contact.charging.to_json() if node.contact.charging else None
+    ble = node.contact.ble.text if node.contact.ble else None
+    return Found(who, node.identity, listed, channels, name, charging, ble)
+
+
+# -- agree, address ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class AgreeDone:
+    """What ``agree`` did; for a dry run ``agreed`` is None, and ``plan`` says what it would do."""
+
+    uuid: bytes
+    agreed: Agreed | None
+    plan: str = ""
+    held: tuple[str, ...] = ()
+
+
+def agree_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    reporter: Reporter,
+    *,
+    rotate: bool = False,
+    dry_run: bool = False,
+    confirm: Callable[[str], object] | None = None,
+) -> AgreeDone:
+    """Agree on a key with the node that ``node`` names (UUID, prefix, name), or rotate it; see :func:`agree`.
+
+    ``confirm`` is asked where the key came back from a backup and nobody taps the node, and before a node is taken
+    over from another station; it raises for a no.
+    """
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    if dry_run:
+        held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.of(uuid))
+        return AgreeDone(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
+    if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
+        confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
+    with at_node(station, links, uuid, reporter, unlock="always") as visit:
+        return AgreeDone(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=confirm))
+
+
+@dataclass(frozen=True)
+class AddressDone:
+    """A node's CAN address; ``changed`` None for a dry run."""
+
+    uuid: bytes
+    changed: bool | None
+
+
+def set_address_at(
+    station: Station, links: LinkSettings, node: str, address: int, reporter: Reporter, *, dry_run: bool = False
+) -> AddressDone:
+    """Give the node that ``node`` names another CAN address; see :func:`set_address`."""
+    uuid = station.nodes.resolve(node)
+    if dry_run:
+        return AddressDone(uuid, None)
+    with at_node(station, links, uuid, reporter) as visit:
+        return AddressDone(uuid, set_address(station, visit.node, address))
+
+
+def set_address(station: Station, node: Conversation, address: int) -> bool:
+    """Give the node another CAN address, 1 to 239, durably; False where it has it already.
+
+    Its reply still leaves from the old address; the node is met at the new one from then on. A board that moves at once
+    loses that reply: where none comes over the bus, who is at the new address is asked before wiring is spoken of.
+    Raises NodeRefused (3: neither tapped nor in a session; 17: written less than 10 s ago), OtherKey, LinkFailure.
+    """
+    if node.identity.can_address == address:
+        return False
+    open_session(station, node)
+    try:
+        node.send(security_command(Function.SET_CAN_ADDRESS, bytes([address])), "the new CAN address")
+    except SessionLost as lost:
+        raise lost.cause from lost
+    except (NodeSilent, Garbled):
+        if not _is_at(node, address):
+            raise
+    if node.contact.address is not None:
+        node.forget()  # a link is one pair of addresses: this session ended with the old one
+    elif node.sealed and _address_of(node) != address:
+        raise Garbled("The node took the new CAN address and still shows the old one.")
+    with station.durable("address"):
+        station.nodes.remember(node.uuid, can_address=address)
+        station.audit("address", node.uuid, "done", address=address)
+    return True
+
+
+def _is_at(node: Conversation, address: int) -> bool:
+    """Whether this node answers at the new address; what it says there is a hint, as every address is."""
+    link = node.contact.link
+    there = link.there(address) if isinstance(link, OnABus) else None
+    return there is not None and there.uuid == node.uuid
+
+
+def _address_of(node: Conversation) -> int:
+    return read_identity(node).can_address
+
+
+# -- read, reset, verify, write ----------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class ReadDone:
+    """Every TEDS of a node; ``error`` is Unproven where a key is held here and nothing shows who said it."""
+
+    image: Image
+    error: Unproven | None
+
+
+def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadDone:
+    """Read every TEDS of the node that ``node`` names, in a session where this station holds its key."""
+    uuid = station.nodes.resolve(node)
+    with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
+        why = open_or_say_why(station, visit.node)
+        c = visit.node.c
+        image = read_image(visit.node)
+        check = vouched(visit.node, visit.who.point, why)
+        if visit.node.sealed:
+            known = known_of(station, uuid, visit.node.proven or read_identity(visit.node))
+            with station.durable("read"):
+                keep(station, visit.node, image, by="read", known=known, c=c)
+        return ReadDone(image, unproven(uuid, check.why) if check.result == "failed" else None)
+
+
+def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter) -> ResetReceipt:
+    """Reset a node; see :func:`reset_node`."""
+    with at_node(station, links, uuid, reporter) as visit:
+        return reset_node(station, visit.node, visit.who)
+
+
+@dataclass(frozen=True)
+class VerifyDone:
+    """All checks of a node or an image, warnings, and the error that the verification ends with, None for none."""
+
+    verified: Verified
+    warnings: tuple[str, ...]
+    error: TedsProvisionError | None
+
+
+def verify_at(
+    station: Station,
+    links: LinkSettings,
+    what: str,
+    reporter: Reporter,
+    *,
+    accept_calibration: str | None = None,
+    node: bool = False,
+) -> VerifyDone:
+    """Check the image file, or the node, that ``what`` names; with ``node`` a node's name goes first.
+
+    ``error``: NotAuthentic (4), Unproven (5), or PolicyRefused (6) for a calibration that would hurt.
+    """
+    found = node_or_image(station, what, node=node)
+    if isinstance(found, Image):
+        image, verified = found, Verified(found.uuid, tuple(verify_image(station, found)), scope="image")
+    else:
+        in_session = False
+        try:
+            with at_node(station, links.after_agreeing(), found, reporter) as visit:
+                try:
+                    looked = look_at_node(station, visit.node, visit.who)
+                finally:
+                    in_session = visit.node.sealed
+            image, verified = looked.image, looked.verified
+        except NodeRefused as refusal:  # outside a session anyone may have sent it: it decides nothing
+            if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
+                raise
+            station.audit("verify", found, "unproven", why=refusal.message)
+            why = refusal.message.removeprefix(HEARD).rstrip(".")
+            image, verified = Image(found, {}), Verified(found, (session("", why),))
+    try:
+        require_authentic(verified)
+        return VerifyDone(verified, guard(station, image, None, accept_calibration), None)
+    except TedsProvisionError as error:
+        return VerifyDone(verified, (), error)
+
+
+@dataclass(frozen=True)
+class WriteDone:
+    """What ``write`` did; for a dry run ``written`` is None and ``image`` what would be written."""
+
+    image: Image
+    written: Written | None
+
+
+def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, dict[str, object]]:
+    """The signed image to write to a node, and what is remembered of the node once it is written."""
+    draft = station.nodes.draft(uuid)
+    profile = draft.profile if draft is not None else None
+    facts: dict[str, object] = {}
+    if file is not None:
+        wanted: Image | None = read_image_file(file)
+    elif draft is not None:
+        wanted = draft.image
+        facts = {"profile": profile} if profile is not None else {}
+    else:
+        wanted = known_image(station, uuid)
+    if wanted is None:
+        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint="build and sign it first, or give --image.")
+    name = own_name(station, wanted, profile)
+    if name is not None:
+        facts["name"] = name
+    if wanted.uuid != uuid:
+        raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
+    if wanted.security is None:
+        raise BadData("The image holds no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
+    return wanted, facts
+
+
+def write_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    reporter: Reporter,
+    *,
+    file: Path | None,
+    dry_run: bool = False,
+    jump: Callable[[str], object] | None = None,
+    low: Low = wait_for_charge,
+    retype: Retype | None = None,
+    retyped: bool = False,
+) -> WriteDone:
+    """Write a signed image to the node that ``node`` names: of a file, else the draft, else what it was read to have.
+
+    ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
+    ``low`` before a node with a low battery is written; ``retype`` before a board becomes one of another type than it
+    says it is (None: that is refused), unless it was ``retyped`` by a word.
+    Raises NotFound (nothing built), BadData (not signed), PolicyRefused (another node's image), as ``write`` does.
+    """
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    wanted, facts = _wanted(station, uuid, file)
+    if dry_run:
+        return WriteDone(wanted, None)
+    if jump is not None:
+        jump("The sequence of this node is then used up that far, for good. Write it?")
+    with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
+        visit.session()
+        if not retyped:
+            channels = {channel for channel, _ in wanted}
+            told = differences(shown_by(visit.node, channels), wanted)
+            profile = facts.get("profile")
+            known = isinstance(profile, str) and is_remembered(station, uuid, profile, factory=False)
+            if told and not known:
+                (retype or refuse)(uuid, told)
+        far = jump is not None
+        written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=far, low=low)
+        return WriteDone(wanted, written)
+
+
+# -- sign: which image, against what the node has; guarded, with the changes in physical terms -------------------------
+
+
+@dataclass(frozen=True)
+class SignOrder:
+    """What to sign: ``image`` (None: the draft of ``uuid``); ``accept_calibration`` as at build; or only the plan."""
+
+    uuid: bytes
+    image: Image | None = None
+    accept_calibration: str | None = None
+    dry_run: bool = False
+
+
+@dataclass(frozen=True)
+class SignDone:
+    """The signed image (for a dry run: of the plan, unsigned), and what changes, a sentence each."""
+
+    signed: Signed
+    changes: tuple[str, ...]
+
+
+def sign_at(
+    station: Station,
+    links: LinkSettings,
+    what: str,
+    reporter: Reporter,
+    *,
+    read_node: bool = False,
+    accept_calibration: str | None = None,
+    dry_run: bool = False,
+    output: Path | None = None,
+) -> SignDone:
+    """Sign the draft of the node that ``what`` names, or an image file; ``read_node``: against the node itself.
+
+    ``output`` is where the caller will write the image: an image file needs one. Raises UsageFailure, and what
+    :func:`sign_image` raises.
+    """
+    found = node_or_image(station, what)
+    image = found if isinstance(found, Image) else None
+    if image is not None and output is None and not dry_run:
+        raise UsageFailure("Signing an image file needs a place for the result.", hint="Add --output IMAGE.")
+    uuid = image.uuid if image is not None else station.nodes.resolve(what)
+    order = SignOrder(uuid, image, accept_calibration, dry_run)
+    if not dry_run:
+        station.policy.require_whitelisted(uuid)
+        station.unlock()
+    if not read_node:
+        return sign_image(station, order, None)
+    with meet(station, links.after_agreeing(), uuid, reporter) as node, station.turn(uuid):
+        return sign_image(station, order, node)
+
+
+def sign_image(station: Station, order: SignOrder, node: Conversation | None) -> SignDone:
+    """Sign the draft or image of one node; with ``node`` against what it has, in a session, else as last known.
+
+    An image file that was built at another station brings the node's epoch and sequence in its Security TEDS, as that
+    station knew them; what this one knows counts where it is newer.
+
+    Where nothing lies ready, what the node was last read to have is signed: nothing to do, if it still holds. Raises
+    NotFound (nothing built, key unknown), BadData, PolicyRefused (guard), NotWhitelisted.
+    """
+    uuid = order.uuid
+    station.policy.require_whitelisted(uuid)
+    draft = station.nodes.draft(uuid)
+    known = known_image(station, uuid)
+    image = order.image or (draft.image if draft is not None else known)
+    if image is None or not image.unsigned_blocks():
+        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
+    present = _last_known(station, uuid, known, order.image) if node is None else _read_now(station, node, order)
+    image, has = present.completing(image), present.image
+    keys = known_node_keys(station, uuid, has or image)
+    guard(station, image, has, order.accept_calibration, record=not order.dry_run)
+    changes = diff_blocks(has.unsigned_blocks() if has else {}, image.unsigned_blocks())
+    told = tuple(change.text for change in changes)
+    if order.dry_run:
+        return SignDone(Signed(image, present.sequence, reused=False), told)
+    signed = sign(
+        station,
+        keys,
+        image,
+        epoch=present.epoch,
+        node_sequence=present.sequence,
+        on_node=present.security_for(image),
+        earlier=_signed_before(image, draft),
+    )
+    _keep(station, order, signed, draft)
+    return SignDone(signed, told)
+
+
+@dataclass(frozen=True)
+class _Present:
+    """What the node has: as last known, or (``read``) as it was read now. ``read_only`` blocks cannot be replaced."""
+
+    image: Image | None
+    epoch: int
+    sequence: int
+    read_only: Collection[BlockId] = ()
+    read: bool = False
+
+    def completing(self, image: Image) -> Image:
+        """The image with the read-only blocks of the node that it leaves out: they stay on the node and are signed."""
+        if self.image is None:
+            return image
+        keep = {block: self.image.blocks[block] for block in self.read_only if block not in image.blocks}
+        return Image(self.image.uuid, {**image.blocks, **keep})
+
+    def security_for(self, image: Image) -> bytes | None:
+        """The node's Security TEDS, where its signature may be used again for ``image``.
+
+        Not where the node was read to hold something else than it was signed for: it takes ``image`` only under a
+        newer sequence.
+        """
+        if self.image is None or (self.read and self.image.unsigned_blocks() != image.unsigned_blocks()):
+            return None
+        return self.image.security
+
+
+def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image | None) -> _Present:
+    """What the store knows of the node, or the image file that came, where it says more.
+
+    A file is hearsay, so it does not use up the sequence of a node that this station knows: more than a node would take
+    at once, it has to be read (``--read-node``).
+    """
+    record = station.nodes.get(uuid)
+    epoch, sequence = station.keys.active_epoch(uuid) or (record.epoch if record else 0), _sequence_of(known)
+    if file is None or SECURITY not in file.blocks:
+        return _Present(known, epoch, sequence)
+    brought = security.decode(file.blocks[SECURITY])
+    epoch = max(epoch, brought.key_epoch)
+    if brought.signed and brought.station_key == station.point:
+        return _Present(known, epoch, sequence)  # this very sequence was given here: the signature may still hold
+    highest = max(sequence, record.sequence if record else 0)
+    if highest and brought.sequence > highest + SEQUENCE_WINDOW:
+        raise PolicyRefused(
+            f"The image says sequence {brought.sequence}; the last one known here is {highest}.",
+            hint="Nobody vouches for that. Meet the node: sign IMAGE --read-node",
+        )
+    return _Present(known, epoch, max(sequence, brought.sequence))
+
+
+def _read_now(station: Station, node: Conversation, order: SignOrder) -> _Present:
+    if not order.dry_run:  # opening a session may settle or rotate keys
+        require_session(station, node)
+    found = survey(node)
+    return _Present(found.image, found.identity.epoch, found.identity.sequence, found.read_only, read=True)
+
+
+def _keep(station: Station, order: SignOrder, signed: Signed, draft: Draft | None) -> None:
+    """Keep what was built here, or signed anew, until it is written; with the profile that it was built from.
+
+    An image file that was not built here stays the caller's.
+    """
+    uuid = order.uuid
+    built_here = draft is not None and draft.image.unsigned_blocks() == signed.image.unsigned_blocks()
+    if not built_here and (order.image is not None or signed.reused):
+        return
+    record = station.nodes.get(uuid)
+    profile = draft.profile if draft is not None else record.profile if record is not None else None
+    with station.durable("sign"):
+        station.nodes.keep_draft(Draft(uuid, signed.image, "signed", profile))
+
+
+def _sequence_of(has: Image | None) -> int:
+    """Sequence of the datasheet that the node was last read to have."""
+    octets = has.blocks.get(SECURITY) if has is not None else None
+    return security.decode(octets).sequence if octets is not None else 0
+
+
+def _signed_before(image: Image, draft: Draft | None) -> list[bytes]:
+    """Security TEDS of the image at hand and of the draft: either may hold the signature that still says the same."""
+    images = [image] if draft is None else [image, draft.image]
+    return [found.blocks[SECURITY] for found in images if SECURITY in found.blocks]
+
+
+# -- drafts and history: what was built and never written, and the datasheets that a node had --------------------------
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A draft that was dropped, or would be; None where there was none."""
+
+    uuid: bytes
+    draft: Draft | None
+
+
+def drop_draft(station: Station, node: str, *, dry_run: bool = False) -> Dropped:
+    """Drop what was built for the node that ``node`` names and never written."""
+    uuid = station.nodes.resolve(node)
+    draft = station.nodes.draft(uuid)
+    if draft is not None and not dry_run:
+        with station.durable("draft"):
+            station.nodes.drop_draft(uuid)
+            station.audit("draft", uuid, "dropped", stage=draft.stage, profile=draft.profile)
+    return Dropped(uuid, draft)
+
+
+def history_of(station: Station, node: str) -> tuple[bytes, list[DatasheetRecord]]:
+    """The datasheets of the node that ``node`` names, newest first."""
+    uuid = station.nodes.resolve(node)
+    return uuid, station.nodes.history(uuid)
+
+
+@dataclass(frozen=True)
+class BroughtBack:
+    """An older datasheet, signed anew and written; for a dry run ``written`` is None."""
+
+    uuid: bytes
+    sequence: int
+    changes: tuple[Change, ...]
+    written: Written | None
+
+
+def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
+    known = station.nodes.history(uuid)
+    for record in known:
+        if record.sequence == sequence:
+            return record
+    listed = ", ".join(str(record.sequence) for record in known) or "none"
+    raise NotFound(f"Node {uuid.hex()} had no datasheet of sequence {sequence}.", hint=f"Known are: {listed}.")
+
+
+def bring_back(
+    station: Station, links: LinkSettings, node: str, sequence: int, reporter: Reporter, *, dry_run: bool = False
+) -> BroughtBack:
+    """Write a datasheet that the node had under ``sequence``, signed anew; its content counts, not its number.
+
+    Raises NotFound (no such datasheet), PolicyRefused, and what ``write`` raises.
+    """
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    record = _record_of(station, uuid, sequence)
+    if dry_run:
+        now = station.nodes.datasheet(uuid)
+        before = now.unsigned_blocks() if now is not None else {}
+        return BroughtBack(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
+    with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always") as visit:
+        visit.session()
+        present = survey(visit.node)
+        keep = {block: present.image.blocks[block] for block in present.read_only}
+        image = Image(uuid, {**record.image.unsigned_blocks(), **keep})
+        guard(station, image, present.image, f"datasheet of sequence {sequence} brought back")
+        changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
+        signed = sign(
+            station,
+            NodeKeys(uuid, visit.who.point, visit.who.key_signature),
+            image,
+            epoch=present.identity.epoch,
+            node_sequence=present.identity.sequence,
+            on_node=present.image.security if not changes else None,
+            keep_draft=True,
+            profile=record.profile,
+        )
+        facts = {"profile": record.profile} if record.profile is not None else {}
+        written = write(station, visit.node, signed.image, present=present, progress=reporter.written, facts=facts)
+        return BroughtBack(uuid, signed.sequence, changes, written)
