@@ -102,7 +102,7 @@ faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
 
 # Does a test notice when the code is broken? Rules of the profile by pattern, and random mutants; prints the survivors.
-# 300 within the hour on two cores: make mutants ROOM=steps COUNT=100, or ROOM=protocol/commit.py
+# 300 within the hour on two cores: make mutants ROOM=steps COUNT=100, or ROOM=protocol/tim/teds_access.py
 COUNT ?= 300
 mutants: $(VENV)/.dev
 	$(BIN)/python -m tests.mutants.run --count $(COUNT) $(if $(ROOM),--room $(ROOM))

@@ -29,7 +29,7 @@ from teds_provision.protocol.keys import (
 )
 from teds_provision.protocol.messages.frames import IDENTIFY, Command, Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.protocol.messages.words import named, told
+from teds_provision.protocol.messages.tables import describe_command, describe_reply
 from teds_provision.protocol.session import OPEN_OCTETS, StationSession
 from teds_provision.teds.image import SECURITY
 
@@ -104,7 +104,7 @@ def try_agreement(probe: Probe, credentials: Credentials, *, sealed: bool = Fals
     reply = probe.sealed(command) if sealed else probe.plain(command)
     if not reply.ok:
         slip = _slip_of_request(probe) if reply.reason == Reason.BAD_SIGNATURE else None
-        raise RuleBroken(f"{named(command)}: success is due, {told(reply)} came.", slip)
+        raise RuleBroken(f"{describe_command(command)}: success is due, {describe_reply(reply)} came.", slip)
     holds(
         len(reply.payload) == REPLY_OCTETS,
         f"Request (128.1): {REPLY_OCTETS} octets are due, {len(reply.payload)} came.",
@@ -267,7 +267,7 @@ def request_answered(probe: Probe) -> str:
     if reply.ok and len(reply.payload) == REPLY_OCTETS:
         return f"{REPLY_OCTETS} octets"
     slip = _slip_of_request(probe) if reply.reason == Reason.BAD_SIGNATURE else None
-    what = f"{named(command)}: success with {REPLY_OCTETS} octets is due, {told(reply)} came."
+    what = f"{describe_command(command)}: success with {REPLY_OCTETS} octets is due, {describe_reply(reply)} came."
     probe.no_agreement = what
     raise RuleBroken(what, slip)
 
@@ -385,7 +385,7 @@ def confirm(probe: Probe, *, sealed: bool) -> None:
     reply = probe.sealed(agreed.confirm) if sealed else probe.plain(agreed.confirm)
     if not reply.ok:
         slip = _slip_of_confirm(probe) if reply.reason == Reason.BAD_TAG and not sealed else None
-        raise RuleBroken(f"{named(agreed.confirm)}: success is due, {told(reply)} came.", slip)
+        raise RuleBroken(f"{describe_command(agreed.confirm)}: success is due, {describe_reply(reply)} came.", slip)
     probe.key, probe.okm = agreed.key, tried.okm
 
 
@@ -558,7 +558,9 @@ def explain(probe: Probe) -> Explained:
     tried = try_agreement(probe, Strangers.make().credentials if factory else probe.station, sealed=sealed)
     ended = (probe.sealed if sealed else probe.plain)(_WRONG_CONFIRM)
     if ended.ok or ended.reason != Reason.BAD_TAG:
-        raise RuleBroken(f"Confirm (128.2) with a wrong tagS, to end the test: refusal 12 is due, {told(ended)} came.")
+        raise RuleBroken(
+            f"Confirm (128.2) with a wrong tagS, to end the test: refusal 12 is due, {describe_reply(ended)} came."
+        )
     probe.close()
     confirmation = tried.okm[16:]
     due = next(tried.agreement.tags(tried.okm + bytes(16), tried.script))[1]

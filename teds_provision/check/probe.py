@@ -27,7 +27,7 @@ from teds_provision.protocol.messages.frames import (
     security_command,
 )
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from teds_provision.protocol.messages.words import answered, named, told
+from teds_provision.protocol.messages.tables import describe_answer, describe_command, describe_reply
 from teds_provision.protocol.session import StationSession
 from teds_provision.talk.conversation import BUSY_PAUSE, BUSY_SECONDS
 from teds_provision.teds.codec import security
@@ -164,7 +164,7 @@ class Probe:
             if len(raw) > self.max_message:
                 raise RuleBroken(f"{what}: {len(raw)} octets came; maxMessage is {self.max_message}.")
             if inside is None or not reply.ok:  # what is sealed is told when it is opened
-                self.contact.note("in", raw, f"reply to {what}: {told(reply)}")
+                self.contact.note("in", raw, f"reply to {what}: {describe_reply(reply)}")
             if reply.reason != Reason.BUSY:
                 return reply
             if self.now() >= until:
@@ -214,18 +214,18 @@ class Probe:
 
     def plain(self, command: Command) -> Reply:
         """Send a plain command."""
-        return self.octets(command.encode(), named(command))
+        return self.octets(command.encode(), describe_command(command))
 
     def good(self, command: Command) -> bytes:
         """Send a plain command that must succeed; its payload."""
         reply = self.plain(command)
         if not reply.ok:
-            raise RuleBroken(f"{named(command)}: success is due, {told(reply)} came.")
+            raise RuleBroken(f"{describe_command(command)}: success is due, {describe_reply(reply)} came.")
         return reply.payload
 
     def refused(self, command: Command, reason: int, why: str = "") -> str:
         """Send a plain command that must be refused for this reason; what was seen."""
-        return demand(self.plain(command), reason, named(command) + (f", {why}" if why else ""))
+        return demand(self.plain(command), reason, describe_command(command) + (f", {why}" if why else ""))
 
     # -- sessions --------------------------------------------------------------------------------------------------
 
@@ -264,7 +264,8 @@ class Probe:
             reply = self.plain(command)
         if not reply.ok:
             raise RuleBroken(
-                f"{named(command)}: success is due, {told(reply)} came.", self._slip_of_open(reply, one_time)
+                f"{describe_command(command)}: success is due, {describe_reply(reply)} came.",
+                self._slip_of_open(reply, one_time),
             )
         try:
             session.accept(reply.payload)
@@ -304,19 +305,21 @@ class Probe:
 
     def _sealed(self, session: StationSession, command: Command) -> Reply:
         sealed = session.seal(command)
-        outer = self.octets(sealed.encode(), named(command), inside=command)
+        outer = self.octets(sealed.encode(), describe_command(command), inside=command)
         if not outer.ok:
             self.session = None
             slip = self._slip_of_sealed(session) if outer.reason == Reason.BAD_TAG else None
-            raise RuleBroken(f"{named(command)}, sealed: a sealed reply is due, {told(outer)} came.", slip)
+            raise RuleBroken(
+                f"{describe_command(command)}, sealed: a sealed reply is due, {describe_reply(outer)} came.", slip
+            )
         try:
             inner = session.unseal(outer.payload)
         except (Garbled, NotAuthentic) as error:
-            self.contact.note("in", outer.encode(), answered(command, outer), sealed=True)
+            self.contact.note("in", outer.encode(), describe_answer(command, outer), sealed=True)
             self.session = None
             slip = slips.of_sealed_reply(session.keys, outer.payload, int.from_bytes(sealed.payload[:4], "big"))
-            raise RuleBroken(f"{named(command)}, sealed: {error.message}", slip) from None
-        self.contact.note("in", outer.encode(), answered(command, inner), sealed=True, opened=inner.encode())
+            raise RuleBroken(f"{describe_command(command)}, sealed: {error.message}", slip) from None
+        self.contact.note("in", outer.encode(), describe_answer(command, inner), sealed=True, opened=inner.encode())
         return inner
 
     def _slip_of_sealed(self, session: StationSession) -> Slip | None:
@@ -331,12 +334,14 @@ class Probe:
         """A sealed command that must succeed; the inner payload."""
         reply = self.sealed(command)
         if not reply.ok:
-            raise RuleBroken(f"{named(command)}, sealed: success is due, {told(reply)} came.")
+            raise RuleBroken(f"{describe_command(command)}, sealed: success is due, {describe_reply(reply)} came.")
         return reply.payload
 
     def sealed_refused(self, command: Command, reason: int, why: str = "") -> str:
         """A sealed command that must be refused inside."""
-        return demand(self.sealed(command), reason, f"{named(command)}, sealed" + (f", {why}" if why else ""))
+        return demand(
+            self.sealed(command), reason, f"{describe_command(command)}, sealed" + (f", {why}" if why else "")
+        )
 
     def close(self) -> None:
         """Leave the session, whatever the node says."""
@@ -417,8 +422,8 @@ class Probe:
 def demand(reply: Reply, reason: int, what: str) -> str:
     """Hold a reply against the refusal that is due; raises RuleBroken."""
     if reply.ok or reply.payload != bytes([reason]):
-        raise RuleBroken(f"{what}: refusal {reason} is due, {told(reply)} came.")
-    return f"{what}: {told(reply)}"
+        raise RuleBroken(f"{what}: refusal {reason} is due, {describe_reply(reply)} came.")
+    return f"{what}: {describe_reply(reply)}"
 
 
 def holds(what: bool, text: str) -> None:

@@ -28,7 +28,7 @@ from teds_provision.protocol.messages.frames import (
     security_command,
     write_teds,
 )
-from teds_provision.protocol.messages.words import named, told
+from teds_provision.protocol.messages.tables import describe_command, describe_reply
 from teds_provision.protocol.session import BLOCK_OCTETS, LAST_COUNTER, OPEN_OCTETS, StationSession, open_mac
 from teds_provision.teds.image import SECURITY as SECURITY_TEDS
 
@@ -48,7 +48,7 @@ def open_beside(probe: Probe) -> str:
     probe.sealed_good(IDENTIFY)
     new = probe.open()
     good = probe.plain(old.seal(IDENTIFY))
-    holds(good.ok, f"Sealed (128.4) in a session beside a half-open Open: success is due, {told(good)} came.")
+    holds(good.ok, f"Sealed (128.4) in a session beside a half-open Open: success is due, {describe_reply(good)} came.")
     old.unseal(good.payload)
     probe.session = new
     probe.sealed_good(IDENTIFY)
@@ -246,7 +246,10 @@ def stranger_ends_nothing(probe: Probe) -> str:
         for station in (probe, other):
             assert station.session is not None
             came = station.plain(station.session.seal(IDENTIFY))
-            text = f"{named(command)}, plain, from a third station: after it a sealed reply is due, {told(came)} came."
+            text = (
+                f"{describe_command(command)}, plain, from a third station: after it a sealed reply is due, "
+                f"{describe_reply(came)} came."
+            )
             holds(came.ok, text)
             station.session.unseal(came.payload)
     other.close()
@@ -265,7 +268,7 @@ class _Repeated:
             raise NotApplicable("This link cannot send a request again.")
         self._probe, self._line = probe, probe.line
         self._frame = probe.open().seal(IDENTIFY).encode()
-        self._words = f"{named(IDENTIFY)}, for repeating"
+        self._words = f"{describe_command(IDENTIFY)}, for repeating"
         self.first = self._noted(probe.line.exchange, "")
 
     def _noted(self, send: Callable[[bytes], bytes], more: str) -> bytes:
@@ -278,7 +281,7 @@ class _Repeated:
     def again(self, after: str = "") -> None:
         """Raise RuleBroken unless the stored reply comes."""
         second = self._noted(self._line.again, ", again")
-        came = told(decode_reply(second))
+        came = describe_reply(decode_reply(second))
         text = f"Sealed (128.4) repeated{after}: the stored reply is due, {came} came."
         holds(second == self.first, text)
 
@@ -386,7 +389,7 @@ def _moved(probe: Probe, home: int, target: int) -> StationSession:
         )
         text = f"Set CAN address (128.10) {target}: the node is there now, and its reply never came from {home}."
         raise RuleBroken(text, slip) from None
-    holds(reply.ok, f"Set CAN address (128.10) {target}, sealed: success is due, {told(reply)} came.")
+    holds(reply.ok, f"Set CAN address (128.10) {target}, sealed: success is due, {describe_reply(reply)} came.")
     probe.move(target)
     return session
 

@@ -35,7 +35,7 @@ from teds_provision.protocol.messages.frames import (
     write_teds,
 )
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.protocol.messages.words import named, told
+from teds_provision.protocol.messages.tables import describe_command, describe_reply
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.codec.security import OUR_VALUES, SecurityTeds
@@ -406,7 +406,10 @@ def commit(probe: Probe) -> str:
         reply = probe.sealed(update_teds(*SECURITY))
         if not reply.ok:
             slip = _slip_of_commit(probe, reply.reason, blocks)
-            raise RuleBroken(f"{named(update_teds(*SECURITY))}, sealed: success is due, {told(reply)} came.", slip)
+            raise RuleBroken(
+                f"{describe_command(update_teds(*SECURITY))}, sealed: success is due, {describe_reply(reply)} came.",
+                slip,
+            )
         holds(probe.teds(SECURITY) == octets, "After the commit Read gives another Security TEDS.")
         holds(_stored(probe) == blocks, "After the commit the node holds other TEDS than were signed.")
     after = probe.require(NodeState.PROVISIONED)

@@ -13,7 +13,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, yes_option
 from teds_provision.errors import TedsProvisionError, UsageFailure
 from teds_provision.files import read_limited, require_new, write_new
-from teds_provision.vault.agent import asking
+from teds_provision.vault import agent
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -81,7 +81,7 @@ def init(
 
 
 def _open_for(app: App) -> str:
-    left = asking.seconds_left(app.home)
+    left = agent.seconds_left(app.home)
     return "" if left is None else f", unlocked for {left // 60 + 1} more min (to lock it: teds-provision lock)"
 
 

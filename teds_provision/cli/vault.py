@@ -11,7 +11,7 @@ from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, yes_option
 from teds_provision.cli.rendering import duration, local_time
 from teds_provision.errors import UsageFailure
-from teds_provision.vault.agent import asking
+from teds_provision.vault import agent
 
 
 @click.group(
@@ -56,7 +56,7 @@ def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
     set_it = opened.new_passphrase(ask)  # nobody else waits for the store while a person types
     with station.lock("vault passphrase", app.note):
         opened.refresh()
-        asking.lock(app.home)  # what is held open is of the old one
+        agent.lock(app.home)  # what is held open is of the old one
         set_it()
         station.audit("vault", None, "new passphrase")
     app.emit(
@@ -90,7 +90,7 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
         return
     station.unlock()
     with station.lock("vault rewrap", app.note):
-        done = station_room.rewrap.rewrap(station)
+        done = station_room.station.rewrap(station)
     if done.damaged:
         app.warn(
             f"{done.damaged} keys in the store cannot be decrypted with any master key; run teds-provision doctor."
@@ -113,11 +113,11 @@ def unlock(app: App, span: str) -> None:
     passphrase and exporting the CA key still ask. A keyring does not need this: it is open while you are logged in.
     """
     seconds = duration(span)
-    if not 1 <= seconds <= asking.MOST_SECONDS:
-        raise UsageFailure(f"The vault can stay unlocked for 1 s to {asking.MOST_SECONDS // 3600} h, not {span}.")
+    if not 1 <= seconds <= agent.MOST_SECONDS:
+        raise UsageFailure(f"The vault can stay unlocked for 1 s to {agent.MOST_SECONDS // 3600} h, not {span}.")
     station = app.station()
     kind = station.identity.keystore.partition(":")[0]
-    if kind not in asking.KINDS:
+    if kind not in agent.KINDS:
         text = f"Nothing to do: this station's keys are in the {kind}, which handles unlocking itself."
         app.emit({"unlocked": False, "until": None, "keystore": kind}, text)
         return
@@ -136,7 +136,7 @@ def unlock(app: App, span: str) -> None:
         raise UsageFailure("The token has its own PIN pad, so there is nothing to keep in memory.")
     with station.lock("unlock", app.note):
         opened.refresh()  # an old passphrase is not held, and an old PIN costs no try
-        asking.start(app.home, kind, opener, int(seconds))
+        agent.start(app.home, kind, opener, int(seconds))
         station.audit("vault", None, "unlocked", seconds=int(seconds))
     until = (datetime.now(UTC) + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%SZ")
     text = f"The vault is unlocked until {local_time(until)}, for this user only. To lock it: teds-provision lock"
@@ -147,7 +147,7 @@ def unlock(app: App, span: str) -> None:
 @pass_app
 def lock(app: App) -> None:
     """Close the vault that "unlock" holds open: the secret is wiped, and the next command asks again."""
-    was = asking.lock(app.home)
+    was = agent.lock(app.home)
     if was:
         app.station().audit("vault", None, "locked")
     app.emit({"locked": True, "was_open": was}, "The vault is closed." if was else "Nothing to do: it was not open.")

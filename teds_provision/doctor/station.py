@@ -18,7 +18,7 @@ from teds_provision.files import open_to_read
 from teds_provision.store import Choice, Store
 from teds_provision.store.database import has_store
 from teds_provision.store.lock import holder_of
-from teds_provision.vault.agent import asking
+from teds_provision.vault import agent
 
 _MIN_FREE: Final = 64 * 1024 * 1024
 _BACKUP_DAYS: Final = 90
@@ -172,7 +172,7 @@ def vault(place: Place) -> Iterator[Finding]:
 @check("unlock", "store")
 def unlocked(place: Place) -> Iterator[Finding]:
     """Does a process hold the vault open."""
-    left = asking.seconds_left(place.home)
+    left = agent.seconds_left(place.home)
     if left is None:
         yield Finding("unlock", "ok", "No process holds the vault open.")
     else:

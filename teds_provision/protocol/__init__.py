@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from teds_provision.protocol import (
         agreement,
         announce,
-        commit,
         datasheet,
         fingerprints,
         flash,

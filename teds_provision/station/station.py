@@ -22,14 +22,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from teds_provision import vault as vaults
-from teds_provision.errors import NotFound, UnknownMaster
+from teds_provision.errors import NotFound, UnknownMaster, VaultFailure
 from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
-from teds_provision.station.handovers import Handovers
 from teds_provision.station.identity import DEFAULT_NAME, Identity
 from teds_provision.station.measurements import Measurements
 from teds_provision.station.node_keys import NodeKey, NodeKeys
@@ -37,15 +37,54 @@ from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
 from teds_provision.station.policy import Policy
 from teds_provision.station.seals import Seals
-from teds_provision.store import AuditLog, NodeTurn, Store, StoreLock
+from teds_provision.store import AuditLog, Batch, Handover, KeyRecord, NodeTurn, Store, StoreLock
 from teds_provision.store.database import has_store
 from teds_provision.store.dump import dump
+from teds_provision.store.records import Direction
+from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys
     from teds_provision.vault import Ask, Vault
 else:  # cryptography: not for commands that only list
     keys = late("teds_provision.protocol.keys")
+
+
+class Handovers:
+    """Bundles that left and came, and the many rows that one of them brings at once."""
+
+    def __init__(self, store: Store, keys: NodeKeys, seals: Seals) -> None:
+        self._store = store
+        self._keys = keys
+        self._seals = seals
+
+    def all(self) -> list[Handover]:
+        """Every bundle that left or came, oldest first."""
+        return self._store.handovers()
+
+    def get(self, handover_id: str, direction: Direction) -> Handover | None:
+        """One bundle, None if it is not known."""
+        return self._store.handover(handover_id, direction)
+
+    def put(self, handover: Handover) -> None:
+        """Add or replace a bundle."""
+        self._store.put_handover(handover)
+
+    def remove(self, handover_id: str, direction: Direction) -> bool:
+        """Forget a bundle; False if there is none."""
+        return self._store.remove_handover(handover_id, direction)
+
+    def take_in(self, batch: Batch) -> None:
+        """Add or replace many rows, all or none; the caller has held them against what is there."""
+        with self._store.transaction():
+            seals = self._seals
+            self._store.put_batch(
+                batch,
+                seal_node=lambda node: seals.point(node.uuid, node.point) if node.point else None,
+                seal_entry=seals.of_entry,
+            )
+            self._keys.mark(batch.marks)
+
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
 
@@ -138,7 +177,7 @@ class Station:
             with self._opening:  # of several threads one asks for the passphrase
                 if self._vault is None:
                     keystore = self.identity.keystore
-                    self.adopt(vaults.open_vault(self.home, self.id, keystore, self._ask, agent=self.use_agent))
+                    self.adopt(vaults.open_vault(self.home, self.id, keystore, self._ask, use_agent=self.use_agent))
         assert self._vault is not None
         return self._vault
 
@@ -309,3 +348,51 @@ def initialise(
             return why
 
     return station, vaults.asked_first(ask, make)
+
+
+# A new master key: every link key in the store is wrapped anew, and the old master key is forgotten.
+#
+# Each part is durable before the next begins, so a run that was cut is carried on by the next one: the new master key,
+# a note in the store that says which one it is, the keys (one transaction), the old master keys, the end of the note.
+# At no moment is there a key in the store that the vault does not open: another process that opened the vault before
+# sees by the note that it has to open it again (:class:`.node_keys.NodeKeys`).
+
+
+@dataclass(frozen=True)
+class Rewrapped:
+    """How many keys are wrapped under the new master key, and how many no master key opened (they stay as they are)."""
+
+    keys: int
+    damaged: int
+
+
+def rewrap(station: Station) -> Rewrapped:
+    """Wrap every link key under a new master key; the caller holds the StoreLock and has unlocked the vault.
+
+    Raises VaultFailure and its leaves, StoreFailure; the same command carries on.
+    """
+    vault, identity = station.vault, station.identity
+    vault.refresh()
+    if identity.rewrapping != vault.masters()[-1]:
+        if vault.masters()[-1] <= identity.master:  # else a run was cut before it noted the one that it had made
+            vault.add_master()
+        identity.begin_rewrapping(vault.masters()[-1])
+    damaged = 0
+
+    def anew(record: KeyRecord) -> bytes:
+        nonlocal damaged
+        context = node_key_context(station.id, record.uuid, record.epoch, record.slot)
+        try:
+            key = vault.unwrap(record.wrapped, context=context)
+        except VaultFailure:  # lost before this run: no reason to keep an old master key for the others
+            damaged += 1
+            return record.wrapped
+        return vault.wrap(key, context=context)
+
+    count = station.keys.wrap_anew(anew)
+    station.seals.rewrap(vault)
+    vault.retire_masters()
+    with station.transaction():
+        identity.end_rewrapping()
+        station.audit("vault", None, "rewrapped", keys=count - damaged, damaged=damaged)
+    return Rewrapped(count - damaged, damaged)

@@ -21,7 +21,7 @@ from teds_provision.protocol.messages.frames import (
     security_command,
 )
 from teds_provision.protocol.messages.identity import Identity
-from teds_provision.protocol.messages.words import answered, asked
+from teds_provision.protocol.messages.tables import describe_answer, describe_request
 from teds_provision.protocol.session import StationSession
 
 _log = logging.getLogger(__name__)
@@ -239,7 +239,7 @@ class Conversation:
         try:
             inner = session.unseal(outer.payload)
         except TedsProvisionError as error:
-            self.contact.note("in", outer.encode(), lambda: answered(command, outer), sealed=True)
+            self.contact.note("in", outer.encode(), lambda: describe_answer(command, outer), sealed=True)
             raise SessionLost(error) from error
         self._trace_opened(command, outer, inner)
         if not inner.ok:
@@ -311,7 +311,7 @@ class Conversation:
             _log.debug("%d.%d: %d octets out, %d back", command.command_class, command.function, len(frame), len(raw))
             reply = decode_reply(raw)
             if inside is None or not reply.ok:  # what is sealed is told when it is opened
-                self.contact.note("in", raw, partial(answered, command, reply))
+                self.contact.note("in", raw, partial(describe_answer, command, reply))
             if reply.ok or reply.reason != Reason.BUSY or time.monotonic() >= until:
                 return reply
             self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))
@@ -322,11 +322,13 @@ class Conversation:
     def _trace_sent(self, frame: bytes, command: Command, inside: Command | None) -> None:
         if self.contact.trace is not None:
             opened = None if inside is None else inside.encode()
-            self.contact.note("out", frame, asked(inside or command), sealed=inside is not None, opened=opened)
+            self.contact.note(
+                "out", frame, describe_request(inside or command), sealed=inside is not None, opened=opened
+            )
 
     def _trace_opened(self, command: Command, outer: Reply, inner: Reply) -> None:
         if self.contact.trace is not None:
-            words, opened = answered(command, inner), inner.encode()
+            words, opened = describe_answer(command, inner), inner.encode()
             self.contact.note("in", outer.encode(), words, sealed=True, opened=opened)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from teds_provision.errors import UsageFailure, VaultChanged, VaultFailure, WrongPassphrase
 from teds_provision.lazy import late
-from teds_provision.vault.agent import asking
+from teds_provision.vault import agent
 from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.hardening import harden
 from teds_provision.vault.passphrase import PRODUCT, Costs
@@ -91,11 +91,11 @@ def create_vault(
     return vault, why
 
 
-def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, agent: bool = False) -> Vault:
+def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool = False) -> Vault:
     """Open the vault of a station; a second call in one process gives the same as it is now, without asking again.
 
-    With ``agent`` nobody is asked while ``unlock`` holds it open. Raises VaultFailure and its leaves: locked, missing,
-    damaged, wrong passphrase.
+    With ``use_agent`` nobody is asked while ``unlock`` holds it open. Raises VaultFailure and its leaves: locked,
+    missing, damaged, wrong passphrase.
     """
     harden()
     place = (home.resolve(), store_id, keystore)
@@ -107,7 +107,7 @@ def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, agent: boo
         except VaultChanged as failure:  # under another passphrase: that one has to be asked for
             changed = failure
     try:
-        _opened[place] = vault = _open(home, store_id, keystore, ask, agent=agent)
+        _opened[place] = vault = _open(home, store_id, keystore, ask, use_agent=use_agent)
     except WrongPassphrase:
         if changed is not None:  # it was the right one before
             raise changed from None
@@ -151,18 +151,18 @@ def _create(
     return file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
 
 
-def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, agent: bool) -> Vault:
+def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool) -> Vault:
     if keystore == "file":
-        return file_vault.FileVault.open(home, store_id, ask, held=asking.held(home, "file") if agent else None)
+        return file_vault.FileVault.open(home, store_id, ask, held=agent.held(home, "file") if use_agent else None)
     if keystore == "keyring":
         return keyring_vault.KeyringVault.open(store_id)
     if keystore.startswith("pkcs11:"):
-        pin = asking.held(home, "pkcs11") if agent else None
+        pin = agent.held(home, "pkcs11") if use_agent else None
         if pin is not None:
             try:
                 return pkcs11.Pkcs11Vault.open(home, store_id, keystore, _holding(pin, ask))
             except WrongPassphrase:  # the PIN is another one by now: a second try could lock the token
-                asking.lock(home)
+                agent.lock(home)
                 raise
         return pkcs11.Pkcs11Vault.open(home, store_id, keystore, ask)
     raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")

@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from teds_provision.protocol import commit, datasheet
+from teds_provision.protocol import datasheet
 from teds_provision.protocol.agreement import NodeAgreement, RequestPayload
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER, PrivateKey, SoftwareKey, normalise_signature, verify
@@ -561,12 +561,12 @@ def listed_is_enough(patch: Patch) -> None:
             raise Refused(Reason.DIGEST_MISMATCH)
         return {block: teds for block, teds in found.items() if teds is not None}
 
-    patch.setattr(commit, "_listed_blocks", listed)
+    patch.setattr(teds_access, "_listed_blocks", listed)
 
 
 def digest_of_data_blocks(patch: Patch) -> None:
     """Commit compares the digests of 108 with those of the data blocks."""
-    original = commit._listed_blocks
+    original = teds_access._listed_blocks
 
     def listed(flash: Flash, staged: Any, signed: Any) -> dict[Any, bytes]:
         blocks = {block: staged.get(block) or flash.teds(block) for block in signed.signed_blocks}
@@ -576,11 +576,11 @@ def digest_of_data_blocks(patch: Patch) -> None:
         right = {block: sha(teds) for block, teds in blocks.items() if teds is not None}
         return original(flash, staged, replace(signed, signed_blocks=right))
 
-    patch.setattr(commit, "_listed_blocks", listed)
+    patch.setattr(teds_access, "_listed_blocks", listed)
 
 
 def a_refused_commit_counts(patch: Patch) -> None:
-    original = commit.verified_commit
+    original = teds_access.verified_commit
 
     def committed(flash: Flash, *args: Any) -> Flash:
         try:
@@ -593,15 +593,19 @@ def a_refused_commit_counts(patch: Patch) -> None:
 
 
 def takes_an_old_sequence(patch: Patch) -> None:
+    original = teds_access.verified_commit
+
     def forgetful(flash: Flash, staged: Any, verify: Any) -> Flash:
-        return commit.verified_commit(replace(flash, sequence=flash.sequence - 1), staged, verify)
+        return original(replace(flash, sequence=flash.sequence - 1), staged, verify)
 
     patch.setattr(teds_access, "verified_commit", forgetful)
 
 
 def any_s_in_a_datasheet(patch: Patch) -> None:
+    original = teds_access.verified_commit
+
     def lenient(flash: Flash, staged: Any, verified: Any) -> Flash:
-        return commit.verified_commit(flash, staged, _lenient(verified))
+        return original(flash, staged, _lenient(verified))
 
     patch.setattr(teds_access, "verified_commit", lenient)
 
@@ -621,7 +625,7 @@ def _decoded(text: Callable[[bytes], bytes]) -> Bend:
 
                 return original(frame(text(teds[4:-2])))
 
-        patch.setattr(commit, "security", Lax)
+        patch.setattr(teds_access, "security", Lax)
 
     return bend
 
@@ -671,7 +675,7 @@ def refuses_111(patch: Patch) -> None:
                 raise security.NotCanonical("A field 111 is unknown here.")
             return shown
 
-    patch.setattr(commit, "security", Strict)
+    patch.setattr(teds_access, "security", Strict)
 
 
 def signs_without_111(patch: Patch) -> None:

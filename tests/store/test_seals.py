@@ -14,8 +14,7 @@ import pytest
 from teds_provision.errors import PolicyRefused, StoreChanged, WrongPassphrase
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
-from teds_provision.station.rewrap import rewrap
-from teds_provision.station.station import Station, initialise
+from teds_provision.station.station import Station, initialise, rewrap
 from teds_provision.store import Revocation, TrustRecord, WhitelistEntry
 from teds_provision.vault import forget_vaults, passphrase
 

@@ -15,8 +15,7 @@ import pytest
 
 from teds_provision import files
 from teds_provision.cli.main import run as in_process
-from teds_provision.vault import forget_vaults
-from teds_provision.vault.agent import asking, holding
+from teds_provision.vault import agent, forget_vaults
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, clean_environment, spawn
 from tests.vault.softhsm import PIN, loaded, unload
@@ -30,7 +29,7 @@ def home(tmp_path: Path) -> Iterator[Path]:
     forget_vaults()
     make_station(tmp_path / "home").close()
     yield tmp_path / "home"
-    asking.lock(tmp_path / "home")
+    agent.lock(tmp_path / "home")
     forget_vaults()
 
 
@@ -46,7 +45,7 @@ def opens(home: Path, node: str = NODE) -> int:
 
 def process_of(home: Path) -> int:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
-        line.connect(str(home / asking.SOCKET))
+        line.connect(str(home / agent.SOCKET))
         return int.from_bytes(line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)[:4], "little")
 
 
@@ -63,14 +62,14 @@ def test_asked_once_and_closed_by_lock(home: Path) -> None:
     said = run(home, "unlock", "--for", "10m", passphrase=PASSPHRASE)
     assert said.code == 0, said
     assert said.json["unlocked"]
-    assert (home / asking.SOCKET).stat().st_mode & 0o777 == 0o600
-    assert 500 < (asking.seconds_left(home) or 0) <= 600
+    assert (home / agent.SOCKET).stat().st_mode & 0o777 == 0o600
+    assert 500 < (agent.seconds_left(home) or 0) <= 600
     assert [opens(home) for _ in range(2)] == [0, 0]
     (seen,) = [check for check in run(home, "doctor").json["checks"] if check["name"] == "unlock"]
     assert (seen["result"], seen["fix"]) == ("warning", "teds-provision lock")
     assert "unlocked for" in spawn("--home", home, "init").out
     assert run(home, "lock").json == {"locked": True, "was_open": True}
-    assert not (home / asking.SOCKET).exists()
+    assert not (home / agent.SOCKET).exists()
     assert opens(home, "0f" * 10) == 7
     acts = [
         (entry["outcome"], entry["detail"]) for entry in run(home, "log").json["entries"] if entry["act"] == "vault"
@@ -80,22 +79,22 @@ def test_asked_once_and_closed_by_lock(home: Path) -> None:
 
 def test_it_ends_by_itself_at_the_time(home: Path) -> None:
     assert run(home, "unlock", "--for", "1s", passphrase=PASSPHRASE).code == 0
-    wait_until(lambda: not (home / asking.SOCKET).exists())
+    wait_until(lambda: not (home / agent.SOCKET).exists())
     assert opens(home) == 7
 
 
 def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The clock ran on while the wait stood still: the next one who asks gets nothing."""
     clock = [100.0]
-    monkeypatch.setattr(holding, "_now", lambda: clock[0])
+    monkeypatch.setattr(agent, "_now", lambda: clock[0])
     page = page_with(b"Fsecret")
-    listener = files.listen_alone(home / asking.SOCKET, 16)
-    thread = threading.Thread(target=holding.serve, args=(listener, page, 200.0))
+    listener = files.listen_alone(home / agent.SOCKET, 16)
+    thread = threading.Thread(target=agent.serve, args=(listener, page, 200.0))
     thread.start()
-    assert asking.held(home, "file") == b"secret"
-    assert asking.held(home, "pkcs11") is None
+    assert agent.held(home, "file") == b"secret"
+    assert agent.held(home, "pkcs11") is None
     clock[0] = 201.0
-    assert asking.held(home, "file") is None
+    assert agent.held(home, "file") is None
     thread.join(60)
     listener.close()
     assert not thread.is_alive()
@@ -104,16 +103,16 @@ def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.Mo
 
 def test_another_user_at_either_end_gets_nothing(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = page_with(b"Fsecret")
-    listener = files.listen_alone(home / asking.SOCKET, 16)
-    thread = threading.Thread(target=holding.serve, args=(listener, page, holding._now() + 60))
+    listener = files.listen_alone(home / agent.SOCKET, 16)
+    thread = threading.Thread(target=agent.serve, args=(listener, page, agent._now() + 60))
     thread.start()
-    for module in (asking, holding):
+    for end in (threading.current_thread(), thread):  # who asks, who answers
         with monkeypatch.context() as patch:
-            patch.setattr(module, "user_at", lambda line: os.geteuid() + 1)
-            assert asking.held(home, "file") is None
-            assert not asking.lock(home)
-    assert asking.held(home, "file") == b"secret"
-    assert asking.lock(home)
+            patch.setattr(agent, "user_at", lambda line, end=end: os.geteuid() + (threading.current_thread() is end))
+            assert agent.held(home, "file") is None
+            assert not agent.lock(home)
+    assert agent.held(home, "file") == b"secret"
+    assert agent.lock(home)
     thread.join(60)
     listener.close()
 
@@ -134,7 +133,7 @@ def test_the_process_keeps_its_secret(home: Path) -> None:
 def test_a_killed_one_is_none_and_is_replaced(home: Path) -> None:
     assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
     os.kill(process_of(home), signal.SIGKILL)
-    wait_until(lambda: asking.seconds_left(home) is None)
+    wait_until(lambda: agent.seconds_left(home) is None)
     assert opens(home) == 7
     assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
     first = process_of(home)
@@ -142,14 +141,14 @@ def test_a_killed_one_is_none_and_is_replaced(home: Path) -> None:
     assert process_of(home) != first
     assert opens(home) == 0
     os.kill(process_of(home), signal.SIGTERM)
-    wait_until(lambda: not (home / asking.SOCKET).exists())
+    wait_until(lambda: not (home / agent.SOCKET).exists())
 
 
 def test_what_changes_or_takes_the_keys_along_asks_all_the_same(home: Path, tmp_path: Path) -> None:
     assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
     assert run(home, "vault", "passphrase").code == 7
     assert run(home, "trust", "ca", "export", str(tmp_path / "ca.pem")).code == 7
-    assert asking.seconds_left(home)
+    assert agent.seconds_left(home)
 
 
 def test_a_new_passphrase_ends_it(home: Path) -> None:
@@ -162,7 +161,7 @@ def test_a_new_passphrase_ends_it(home: Path) -> None:
     os.close(more)
     words = ["--passphrase-fd", str(read), "vault", "passphrase", "--new-passphrase-fd", str(new)]
     assert in_process(["--home", str(home), *words]) == 0
-    assert asking.seconds_left(home) is None
+    assert agent.seconds_left(home) is None
     assert opens(home) == 7
     assert run(home, "unlock", passphrase=PASSPHRASE).code == 7
     assert run(home, "unlock", passphrase=NEW).code == 0
@@ -184,7 +183,7 @@ def test_a_token_is_asked_for_its_pin_once(tmp_path: Path, monkeypatch: pytest.M
         assert at_token("unlock", passphrase=PIN).json["keystore"] == "pkcs11"
         assert at_token("whitelist", "add", NODE).code == 0
     finally:
-        asking.lock(home)
+        agent.lock(home)
         unload()
 
 
@@ -193,11 +192,11 @@ def test_a_span_that_is_none_is_usage(home: Path, span: str) -> None:
     assert run(home, "unlock", "--for", span, passphrase=PASSPHRASE).code == 2
 
 
-def page_with(secret: bytes) -> holding.Page:
+def page_with(secret: bytes) -> agent.Page:
     read, write = os.pipe()
     os.write(write, secret)
     os.close(write)
-    page = holding.Page()
+    page = agent.Page()
     page.read(read)
     os.close(read)
     return page

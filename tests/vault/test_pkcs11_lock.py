@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import VaultFailure
-from teds_provision.vault import pkcs11_lock
+from teds_provision.vault import pkcs11
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_lock_lies_in_a_private_folder_of_this_user_alone(cache: Path) -> None:
-    with pkcs11_lock.exclusive("/lib/module.so"):
+    with pkcs11.exclusive("/lib/module.so"):
         (folder,) = cache.iterdir()
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
@@ -36,5 +36,5 @@ def test_a_folder_that_was_planted_is_refused(cache: Path, tmp_path: Path, plant
     else:
         folder.mkdir()
         folder.chmod(0o777)
-    with pytest.raises(VaultFailure, match="cannot be used"), pkcs11_lock.exclusive("/lib/module.so"):
+    with pytest.raises(VaultFailure, match="cannot be used"), pkcs11.exclusive("/lib/module.so"):
         pass

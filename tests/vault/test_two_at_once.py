@@ -19,11 +19,9 @@ import pytest
 
 from teds_provision.cli.context import App
 from teds_provision.errors import TedsProvisionError
-from teds_provision.station.rewrap import rewrap
-from teds_provision.station.station import Station
+from teds_provision.station.station import Station, rewrap
 from teds_provision.store import StoreLock
-from teds_provision.vault import choose, forget_vaults, passphrase
-from teds_provision.vault.agent import asking
+from teds_provision.vault import agent, choose, forget_vaults, passphrase
 from teds_provision.vault.passphrase import THROWAWAY, SealingKey
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, call
@@ -159,7 +157,7 @@ def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     monkeypatch.setattr(App, "ask_new", lambda self, prompt: world.answer(prompt))
     monkeypatch.setattr(App, "confirm", lambda self, question, *, yes: None if yes else world.answer(question))
     yield world
-    asking.lock(world.home)
+    agent.lock(world.home)
     forget_vaults()
 
 
@@ -226,7 +224,7 @@ def test_one_is_left_at_each_of_its_questions_beside_the_other(first: str, secon
         else:
             require_outcome(first, second, done)
         require_whole(world)
-        asking.lock(world.home)
+        agent.lock(world.home)
         shutil.rmtree(world.home)
         shutil.copytree(pristine, world.home)
         world.passphrase, world.ran = PASSPHRASE, []

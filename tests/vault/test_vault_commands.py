@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import VaultChanged, WrongPassphrase
-from teds_provision.station.rewrap import rewrap
-from teds_provision.station.station import Station
+from teds_provision.station.station import Station, rewrap
 from teds_provision.store import StoreLock
 from teds_provision.store.database import Database
 from teds_provision.vault import forget_vaults

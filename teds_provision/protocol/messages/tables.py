@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from teds_provision.protocol.messages.frames import SECURITY, Function, Reason
+from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, Reply, TedsFunction
 
 
 class Spec(NamedTuple):
@@ -313,3 +313,44 @@ NETWORK: Final[dict[tuple[int, int], Spec]] = {
     for service, entries in {1: _DISCOVERY, 2: _ACCESS, 3: _TEDS, 4: _EVENTS}.items()
     for number, spec in entries.items()
 }
+
+
+# In words, for people who look at what goes over a link: names, numbers and sizes, no content.
+
+
+def describe_command(command: Command) -> str:
+    """A command in words: name, class and function, payload octets; "Prove (128.8), 31 octets"."""
+    number = f"{command.command_class}.{command.function}"
+    kind = Function if command.command_class == SECURITY else TedsFunction
+    if command.command_class in (COMMON, SECURITY) and command.function in {int(each) for each in kind}:
+        number = f"{kind(command.function).name.replace('_', ' ').capitalize()} ({number})"
+    elif (spec := COMMANDS.get((command.command_class, command.function))) is not None:
+        number = f"{spec.name} ({number})"
+    return f"{number}, {len(command.payload)} octets"
+
+
+def describe_reply(reply: Reply) -> str:
+    """A reply in words: "success, 64 octets", "refusal 4"."""
+    if reply.ok:
+        return f"success, {len(reply.payload)} octets"
+    return f"refusal {reply.reason}" if len(reply.payload) == 1 else f"a refusal of {len(reply.payload)} octets"
+
+
+def describe_request(command: Command) -> str:
+    """As :func:`named`, and of a TEDS command which TEDS and where: "Read (1.2), 5 octets: TEDS 5 of channel 1 …"."""
+    text = describe_command(command)
+    payload = command.payload
+    if command.command_class != COMMON or not payload or command.function not in {int(each) for each in TedsFunction}:
+        return text
+    where = f"{text}: TEDS {payload[0]} of channel {command.channel}"
+    if command.function in (TedsFunction.READ, TedsFunction.WRITE) and len(payload) >= 5:
+        where += f" from octet {int.from_bytes(payload[1:5], 'big')}"
+    return where
+
+
+def describe_answer(command: Command, reply: Reply) -> str:
+    """A reply in words, with what it answers: "reply to Prove (128.8): success, 64 octets"."""
+    text = f"reply to {describe_command(command).rpartition(',')[0]}: {describe_reply(reply)}"
+    if reply.reason is not None and reply.reason in {int(each) for each in Reason}:
+        text += f" ({Reason(reply.reason).name.lower().replace('_', ' ')})"
+    return text

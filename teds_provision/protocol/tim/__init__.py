@@ -5,11 +5,10 @@ the hardware are injected. One :class:`Tim` serves all links of a node.
 
 ==============  ======================================================================================================
 ``node``        :class:`Tim`: routing, Identify, Prove, Reset, List
-``permission``  which command may be run when, and what claims forbid
+``permission``  where a command came from, which command may be run when, and what claims forbid
 ``sessions``    Open, Sealed, the lives of sessions
 ``agreeing``    Request and Confirm
-``teds_access`` Query, Read, Write, Update; the commit is ``protocol.commit``
-``origin``      where a command came from
+``teds_access`` Query, Read, Write, Update, and the commit
 ==============  ======================================================================================================
 
 Measuring and acting is ``protocol.operation`` (its ``role``, ``claims``, ``stream_role``, ``streams``); a node without

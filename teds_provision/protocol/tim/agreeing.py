@@ -21,7 +21,7 @@ from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, Verify, station_key_message, verify
 from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.protocol.session import NodeSession, OneTime
-from teds_provision.protocol.tim.origin import Origin
+from teds_provision.protocol.tim.permission import Origin
 
 PENDING_SECONDS: Final = 60.0
 

@@ -36,8 +36,7 @@ from teds_provision.protocol.operation.role import Inner, OperationRole
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import LAST_COUNTER, NodeSession, OneTime
 from teds_provision.protocol.tim.agreeing import Agreeing
-from teds_provision.protocol.tim.origin import Origin
-from teds_provision.protocol.tim.permission import Permission, of_teds
+from teds_provision.protocol.tim.permission import Origin, Permission, of_teds
 from teds_provision.protocol.tim.sessions import Sessions
 from teds_provision.protocol.tim.teds_access import Staging, TedsAccess
 

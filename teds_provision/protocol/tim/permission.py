@@ -10,9 +10,24 @@ from dataclasses import dataclass
 from typing import Final
 
 from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, Refused, TedsFunction
+from teds_provision.protocol.operation.hardware import Port
 from teds_provision.protocol.operation.role import OperationRole
-from teds_provision.protocol.session import OPEN_OCTETS
-from teds_provision.protocol.tim.origin import Origin
+from teds_provision.protocol.session import OPEN_OCTETS, NodeSession
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A command's link and port, whether it counts as tapped, and the session that it was sealed in (None: plain).
+
+    ``received`` is the tick at which its last frame came.
+    """
+
+    link: str
+    tapped: bool
+    port: Port
+    received: int
+    session: NodeSession | None = None
+
 
 _FUNCTIONS: Final = frozenset(Function)
 _TEDS_FUNCTIONS: Final = frozenset(TedsFunction)

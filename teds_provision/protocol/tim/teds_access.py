@@ -1,12 +1,13 @@
-"""TEDS access on the node: Query, Read, Write, Update (profile.md, "Writing to flash"). Pure."""
+"""TEDS access on the node: Query, Read, Write, Update, and the commit (profile.md, "Writing to flash"). Pure."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
-from teds_provision.protocol.commit import verified_commit
+from teds_provision.protocol import datasheet
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import Verify, verify
@@ -21,7 +22,9 @@ from teds_provision.protocol.messages.frames import (
     TedsStatus,
 )
 from teds_provision.protocol.session import NodeSession
-from teds_provision.teds.codec.model import MANUFACTURER, TEXT_BASED
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.model import MANUFACTURER, TEXT_BASED, AccessCode
+from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
 
 STAGED_SECONDS: Final = 60.0
@@ -158,3 +161,47 @@ def _block(command: Command, octets: int) -> BlockId:
     if not can_be_stored(block):
         raise Refused(Reason.NO_SUCH_TEDS)
     return block
+
+
+# The commit: what Update of TEDS 128 verifies before anything is stored, in order (profile.md, "Writing to flash").
+
+
+def _demand(holds: bool, reason: Reason) -> None:
+    if not holds:
+        raise Refused(reason)
+
+
+def verified_commit(flash: Flash, staged: Mapping[BlockId, bytes], verify: Verify = verify) -> Flash:
+    """Return the state that the commit of ``staged`` leads to; raises Refused with the first check that fails."""
+    for block, teds in staged.items():
+        _demand(datasheet.passes_own_check(block, teds), Reason.BAD_FORM)
+    try:
+        signed = security.decode(staged[SECURITY])
+    except NotCanonical:
+        raise Refused(Reason.BAD_FORM) from None
+    _demand(signed.signed, Reason.BAD_FORM)
+    _demand(datasheet.own_values(signed), Reason.BAD_FORM)
+    own = (flash.node_key, flash.node_key_signature)
+    _demand((signed.node_key, signed.node_key_signature) == own, Reason.BAD_SIGNATURE)
+    _demand(datasheet.station_signature_good(signed, flash.ca or b"", verify), Reason.BAD_SIGNATURE)
+    _demand(datasheet.signature_good(signed, staged[SECURITY], flash.uuid, verify), Reason.BAD_SIGNATURE)
+    blocks = _listed_blocks(flash, staged, signed)
+    for (_, access_code), teds in blocks.items():
+        _demand(access_code != AccessCode.META or datasheet.meta_names(teds, flash.uuid), Reason.WRONG_UUID)
+    ahead = signed.sequence - flash.sequence
+    _demand(0 < ahead <= datasheet.SEQUENCE_WINDOW, Reason.STALE_SEQUENCE)
+    _demand(signed.key_epoch == flash.epoch, Reason.WRONG_EPOCH)
+    kept = {block: teds for block, teds in flash.blocks.items() if block in flash.read_only and block not in blocks}
+    stored = {**kept, **blocks, SECURITY: staged[SECURITY]}
+    return replace(flash, blocks=stored, sequence=signed.sequence, provisioned=True)
+
+
+def _listed_blocks(flash: Flash, staged: Mapping[BlockId, bytes], signed: SecurityTeds) -> dict[BlockId, bytes]:
+    blocks: dict[BlockId, bytes] = {}
+    for block, digest in signed.signed_blocks.items():
+        teds = staged[block] if block in staged else flash.teds(block)
+        if teds is None or hashlib.sha256(teds).digest() != digest:
+            raise Refused(Reason.DIGEST_MISMATCH)
+        blocks[block] = teds
+    _demand(staged.keys() - {SECURITY} <= blocks.keys(), Reason.DIGEST_MISMATCH)
+    return blocks

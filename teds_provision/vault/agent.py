@@ -1,0 +1,226 @@
+"""``unlock``: a process that holds what opens the vault, in memory alone, until its time is over or ``lock``.
+
+Commands ask it over a Unix socket of mode 0600 in the home, and each side looks at who is at the other end
+(SO_PEERCRED). Linux only. A request is one octet. ``S``: kind (one octet) ‖ secret, to the end of the stream. ``T``:
+seconds left, u32. ``L``: nothing, the stream ends when the secret is gone.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NoReturn
+
+from teds_provision.errors import VaultFailure
+from teds_provision.files import listen_alone, short_path
+from teds_provision.lazy import late
+from teds_provision.vault.hardening import harden
+
+if TYPE_CHECKING:
+    import ctypes
+else:  # for the process that holds: commands that only ask do not wait for it
+    ctypes = late("ctypes")
+
+SOCKET: Final = "agent.sock"
+SECRET, TIME, END = b"S", b"T", b"L"
+KINDS: Final = {"file": b"F", "pkcs11": b"P"}
+MOST_OCTETS: Final = 1024
+MOST_SECONDS: Final = 12 * 3600
+_ANSWER_SECONDS: Final = 3.0
+
+
+def held(home: Path, kind: str) -> bytes | None:
+    """What opens the vault of this kind, None where nobody holds it open."""
+    answer = _asked(home, SECRET)
+    return answer[1:] if answer[:1] == KINDS[kind] and len(answer) > 1 else None
+
+
+def seconds_left(home: Path) -> int | None:
+    """How long the vault is still held open, None where it is not."""
+    answer = _asked(home, TIME)
+    return struct.unpack(">I", answer)[0] if len(answer) == 4 else None
+
+
+def lock(home: Path) -> bool:
+    """Have the secret wiped and the process end; False where there was none."""
+    there = seconds_left(home) is not None
+    _asked(home, END)
+    return there
+
+
+def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
+    """Hold ``secret`` for so many seconds, in a process of its own; one that is there ends first.
+
+    Raises VaultFailure where this system has no such sockets, or the process does not come up.
+    """
+    if not hasattr(socket, "SO_PEERCRED"):
+        raise VaultFailure("This system does not say who is at the other end of a socket: unlock needs Linux.")
+    lock(home)
+    package = Path(__file__).parents[2]
+    # -P and an appended folder: neither the folder that the user is in, nor ours, comes before Python's own modules.
+    code = f"import sys; sys.path.append({str(package)!r}); from teds_provision.vault import agent; agent.main()"
+    command = [sys.executable, "-P", "-c", code, str(home.resolve()), str(seconds)]
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd="/",
+        start_new_session=True,  # the terminal's Ctrl-C and its end are not for it
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        with suppress(BrokenPipeError), process.stdin as stream:
+            stream.write(KINDS[kind] + secret)
+        ready = process.stdout.readline()
+    finally:
+        process.stdout.close()
+    if ready != b"ready\n":
+        process.kill()
+        process.wait()
+        raise VaultFailure(f"The vault cannot be held open: {SOCKET} in {home} does not come up.")
+
+
+def _asked(home: Path, request: bytes) -> bytes:
+    """The whole answer; empty where nobody of this user's own listens."""
+    path = home / SOCKET
+    if not path.is_socket() or not hasattr(socket, "SO_PEERCRED"):
+        return b""
+    answer = b""
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line, short_path(path) as name:
+        line.settimeout(_ANSWER_SECONDS)
+        line.connect(name)
+        if user_at(line) != os.geteuid():
+            return b""
+        line.sendall(request)
+        while len(answer) <= MOST_OCTETS and (more := line.recv(MOST_OCTETS)):
+            answer += more
+    return answer
+
+
+def user_at(line: socket.socket) -> int:
+    """The uid of the process at the other end, as the kernel noted it (socket(7), SO_PEERCRED)."""
+    _, uid, _ = struct.unpack("3i", line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))
+    return int(uid)
+
+
+# The process itself: started by ``unlock``, gone when its time is over. The secret comes through stdin straight
+# into one page of memory that is locked (mlock), left out of dumps and of children, and filled with zeros at the end.
+# The process cannot be traced by others of the same user and leaves no core dump. Its time runs on while the machine
+# sleeps.
+
+_LOOK_SECONDS: Final = 20.0
+"""A sleeping machine stops the wait, not the clock: so often it is looked at again."""
+_CLIENT_SECONDS: Final = 2.0
+
+
+def main() -> None:
+    """Hold the secret of standard input; arguments: the home, and for how many seconds."""
+    home, seconds = Path(sys.argv[1]), int(sys.argv[2])
+    harden()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, _end)
+    page = Page()
+    path = home / SOCKET
+    try:
+        page.read(0)
+        listener = listen_alone(path, 16)
+        ours = path.stat().st_ino
+        os.write(1, b"ready\n")
+        _give_up_streams()
+        try:
+            serve(listener, page, _now() + seconds)
+        finally:
+            with suppress(OSError):
+                if path.stat().st_ino == ours:
+                    path.unlink()
+            listener.close()
+    finally:
+        page.wipe()
+
+
+class Page:
+    """One page of memory for one secret of at most 1024 octets."""
+
+    def __init__(self) -> None:
+        self._memory = mmap.mmap(-1, mmap.PAGESIZE)
+        self._length = 0
+        address = ctypes.addressof(ctypes.c_char.from_buffer(self._memory))
+        self.locked = ctypes.CDLL(None).mlock(ctypes.c_void_p(address), ctypes.c_size_t(mmap.PAGESIZE)) == 0
+        """Whether it stays out of the swap: a limit of the system may forbid that (ulimit -l)."""
+        for advice in ("MADV_DONTDUMP", "MADV_DONTFORK"):
+            with suppress(OSError, AttributeError):
+                self._memory.madvise(getattr(mmap, advice))
+
+    def read(self, descriptor: int) -> None:
+        """Take in all that a pipe holds, without a copy in Python's own memory; raises ValueError for too much."""
+        view = memoryview(self._memory)
+        while got := os.readv(descriptor, [view[self._length :]]):
+            self._length += got
+            if self._length > MOST_OCTETS:
+                raise ValueError("longer than any secret")
+
+    def view(self) -> memoryview:
+        """The secret, where it lies."""
+        return memoryview(self._memory)[: self._length]
+
+    def wipe(self) -> None:
+        """Fill the page with zeros."""
+        ctypes.memset(ctypes.addressof(ctypes.c_char.from_buffer(self._memory)), 0, mmap.PAGESIZE)
+        self._length = 0
+
+
+def serve(listener: socket.socket, page: Page, until: float) -> None:
+    """Answer this user's commands until the time is over, or one says to end; the page is wiped then."""
+    try:
+        while (left := until - _now()) > 0:
+            if select.select([listener], [], [], min(left, _LOOK_SECONDS))[0]:
+                line, _ = listener.accept()
+                with line, suppress(OSError):
+                    if not _answer(line, page, until):
+                        return
+    finally:
+        page.wipe()
+
+
+def _answer(line: socket.socket, page: Page, until: float) -> bool:
+    """Serve one command; False where the secret is to go."""
+    line.settimeout(_CLIENT_SECONDS)
+    if user_at(line) != os.geteuid():
+        return True
+    request, left = line.recv(1), until - _now()
+    if left <= 0 or request == END:
+        page.wipe()  # before the stream ends, which tells the other side that it is gone
+        return False
+    if request == SECRET:
+        line.sendall(page.view())
+    elif request == TIME:
+        line.sendall(struct.pack(">I", int(left)))
+    return True
+
+
+def _give_up_streams() -> None:
+    """Let go of whoever started this: no pipe of theirs stays open."""
+    null = os.open(os.devnull, os.O_RDWR)
+    for descriptor in (0, 1, 2):
+        os.dup2(null, descriptor)
+    os.close(null)
+
+
+def _now() -> float:
+    """Seconds of a clock that runs on while the machine sleeps."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    raise SystemExit(0)
