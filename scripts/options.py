@@ -77,7 +77,8 @@ def configuration() -> str:
         "```",
         "",
         "A key that no command knows is an error that names its line. `teds-provision config show` lists what is set,",
-        "and where. Flags are `true` or `false` in the file, `1` or `0` in a variable. `make man` writes this page.",
+        "and where; `config set` and `config unset` change the file.",
+        "Flags are `true` or `false` in the file, `1` or `0` in a variable. `make man` writes this page.",
         "",
     ]
     for path, command in commands():

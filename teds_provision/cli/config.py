@@ -1,21 +1,26 @@
-"""``config``: what is set, where, and to what; ``completion``: the lines that a shell wants."""
+"""``config``: what is set, where, and to what, and how to set it; ``completion``: the lines that a shell wants."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision.cli import completing
-from teds_provision.cli.configuration import as_parameters, config_path, read_config
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.configuration import as_parameters, config_path, problems, read_config, read_config_text
+from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.main import COMPLETE
 from teds_provision.cli.option_names import OPTIONS
 from teds_provision.cli.options import COMMAND_SETTINGS, command, examples
-from teds_provision.errors import BadData
+from teds_provision.errors import BadData, UsageFailure
+from teds_provision.files import write_whole
+from teds_provision.limits import load_toml
+from teds_provision.store import StoreLock
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,10 +32,15 @@ _PREFIX = "TEDS_PROVISION_"
     context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision config show", "teds-provision config path")
 )
 def config() -> None:
-    """Show the settings in config.toml and the environment. docs/configuration.md lists every option and variable."""
+    """Show and change the settings in config.toml and the environment. docs/configuration.md lists them all."""
 
 
-@config.command("path", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision config path"))
+@config.command(
+    "path",
+    context_settings=COMMAND_SETTINGS,
+    short_help="Print the path of config.toml.",
+    epilog=examples("teds-provision config path"),
+)
 @pass_app
 def path_(app: App) -> None:
     """Print the path of this home's config.toml, whether or not it exists."""
@@ -87,19 +97,26 @@ def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any
 
 def _check_value(root: click.Context, name: str, value: Any, place: Path) -> None:
     """Have click read a value as the command would; raises BadData."""
+    found = _parameter(root, name)
+    if found is None:
+        return
+    path, command, option = found
+    try:
+        option.process_value(click.Context(command, parent=root, info_name=path), value)
+    except click.BadParameter as error:
+        said = error.message.rstrip(".")
+        raise BadData(f"{place}: {name} = {value!r}: {said}.", hint="Fix that line.") from error
+
+
+def _parameter(root: click.Context, name: str) -> tuple[str, click.Command, click.Parameter] | None:
+    """The first command that a setting serves, with its path and the option that is meant; None for a broker."""
     *words, option = name.replace("_", "-").split(".")
+    wanted = next(iter(as_parameters({option: None})))
     for path, options in OPTIONS.items():
         if option in options and path.split()[: len(words)] == words:
-            found = _command(root, path)
-            parameter = next(iter(as_parameters({option: value})))
-            for each in found.params:
-                if each.name == parameter:
-                    try:
-                        each.process_value(click.Context(found, parent=root, info_name=path), value)
-                    except click.BadParameter as error:
-                        said = error.message.rstrip(".")
-                        raise BadData(f"{place}: {name} = {value!r}: {said}.", hint="Fix that line.") from error
-            return
+            command = _command(root, path)
+            return next(((path, command, each) for each in command.params if each.name == wanted), None)
+    return None
 
 
 def _command(root: click.Context, path: str) -> click.Command:
@@ -116,6 +133,154 @@ def _table(console: Console, settings: list[dict[str, Any]]) -> None:
     width = max(len(str(setting["name"])) for setting in settings)
     for setting in settings:
         console.print(f"{setting['name']:{width}}  {setting['value']}  [{setting['source']}]", markup=False)
+
+
+@config.command(
+    "set",
+    context_settings=COMMAND_SETTINGS | {"ignore_unknown_options": True},
+    short_help="Write a setting to config.toml.",
+    epilog=examples(
+        "teds-provision config set can 'socketcan:can0?bitrate=500000'",
+        "teds-provision config set provision.via can",
+        "teds-provision config set whitelist.add.dry-run true",
+    ),
+)
+@click.argument("name")
+@click.argument("value")
+@click.pass_context
+@pass_app
+def set_(app: App, ctx: click.Context, name: str, value: str) -> None:
+    """Write a setting to config.toml, as NAME for every command that has this option, or COMMAND.NAME for one.
+
+    Comments and the other settings stay. A flag takes true or false; several values are written ["a", "b"].
+    """
+    root, place = ctx.find_root(), config_path(app.home)
+    typed = _typed(root, name, value)
+    changed = _edit(app, "config set", name, typed)
+    verb = "Set" if changed else "Nothing to do:"
+    app.emit({"settings": [{"name": name, "value": typed, "source": str(place)}]}, f"{verb} {name} = {_toml(typed)}")
+
+
+@config.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Remove a setting from config.toml.",
+    epilog=examples("teds-provision config unset provision.via"),
+)
+@click.argument("name")
+@pass_app
+def unset(app: App, name: str) -> None:
+    """Remove a setting from config.toml; comments and the other settings stay."""
+    changed = _edit(app, "config unset", name, None)
+    told = f"Removed {name}." if changed else f"Nothing to do: {name} is not set in config.toml."
+    app.emit({"settings": [], "removed": name if changed else None}, told)
+
+
+def _typed(root: click.Context, name: str, value: str) -> Any:
+    """The value as the option reads it, typed as TOML has it; raises UsageFailure for a name or value that is none."""
+    *words, option = name.replace("_", "-").split(".")
+    listed: Any = None
+    if value.startswith("["):
+        with suppress(BadData):
+            listed = load_toml(f"x = {value}", name)["x"]
+    nested: dict[str, Any] = {option: value if listed is None else listed}
+    for word in reversed(words):
+        nested = {word: nested}
+    for problem in problems(nested, ""):
+        raise UsageFailure(f"{name}: {problem.partition(': ')[2]}", hint="See docs/configuration.md.")
+    parameter = _parameter(root, name)
+    if listed is not None or parameter is None:  # a list, or the URL of a broker
+        return value if listed is None else listed
+    path, command, option_ = parameter
+    try:
+        read = option_.process_value(click.Context(command, parent=root, info_name=path), value)
+    except click.BadParameter as error:
+        raise UsageFailure(f"{name}: {error.message.rstrip('.')}.") from error
+    return read if isinstance(read, bool | int | float) else value
+
+
+def _edit(app: App, command: str, name: str, value: Any) -> bool:
+    """Set or (None) remove one setting under the store's lock; False where nothing had to change.
+
+    TOML has more ways to say a thing than this edit knows (inline tables, dotted keys): what it made is read again, and
+    written only if it says exactly what was meant. Raises BadData where it does not, with nothing changed.
+    """
+    place = config_path(app.home)
+    *table, key = name.replace("_", "-").split(".")
+    with StoreLock(app.home, command=command, notice=app.note):
+        text = read_config_text(place) or ""
+        wanted = _plain(load_toml(text, str(place)))
+        inner = wanted
+        for word in table:
+            inner = inner.setdefault(word, {})
+        if inner.get(key) == value:
+            return False
+        inner.pop(key, None)
+        if value is not None:
+            inner[key] = value
+        edited = _edited(text, table, key, value)
+        with suppress(BadData):
+            if _pruned(_plain(load_toml(edited, str(place)))) == _pruned(wanted):
+                write_whole(place, edited.encode())
+                return True
+    raise BadData(f"{place} writes {name} in a way that this command cannot edit.", hint=f"Edit it by hand: {place}")
+
+
+def _edited(text: str, table: list[str], key: str, value: Any) -> str:
+    """The text with one key of one table set, or (None) without its line; a comment behind the value stays."""
+    lines = text.splitlines()
+    start, end, here = (0, len(lines), not table) if not table else (len(lines), len(lines), False)
+    for number, line in enumerate(lines):
+        header = re.match(r"\s*\[([^\[\]]+)\]", line)
+        if header is not None and here:
+            end, here = number, False
+        elif header is not None and [w.strip().strip("'\"").replace("_", "-") for w in header[1].split(".")] == table:
+            start, end, here = number + 1, len(lines), True
+    for number in range(start, end):
+        found = re.match(rf"(\s*(['\"]?){key.replace('-', '[-_]')}\2\s*=\s*)(.*)", lines[number])
+        if found is None:
+            continue
+        if value is None:
+            del lines[number]
+        else:
+            lines[number] = f"{found[1]}{_toml(value)}{_comment(found[3])}"
+        return "\n".join([*lines, ""])
+    if value is None:
+        return text
+    if table and start == len(lines) and not here:
+        lines += [*([""] if lines else []), f"[{'.'.join(table)}]", f"{key} = {_toml(value)}"]
+        return "\n".join([*lines, ""])
+    said = [n for n in range(start, end) if lines[n].strip() and not lines[n].lstrip().startswith("#")]
+    first = next((n for n in range(start, end) if not lines[n].startswith("#")), end) if not table else start
+    lines.insert(said[-1] + 1 if said else first, f"{key} = {_toml(value)}")
+    return "\n".join([*lines, ""])
+
+
+def _comment(rest: str) -> str:
+    """What stands behind the value of a line, with the blanks before it: "" where there is no comment."""
+    for at in (n for n, character in enumerate(rest) if character == "#"):
+        with suppress(BadData):
+            load_toml(f"x = {rest[:at]}", "")
+            return rest[len(rest[:at].rstrip()) :]
+    return ""
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return str(value) if isinstance(value, int | float) and not isinstance(value, bool) else to_json(value)
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Names with dashes alone, so that both spellings are one setting."""
+    return {
+        name.replace("_", "-"): _plain(value) if isinstance(value, dict) else value for name, value in values.items()
+    }
+
+
+def _pruned(values: dict[str, Any]) -> dict[str, Any]:
+    """Without empty tables: they set nothing."""
+    inner = {name: _pruned(value) if isinstance(value, dict) else value for name, value in values.items()}
+    return {name: value for name, value in inner.items() if value != {}}
 
 
 @command("teds-provision completion bash", "teds-provision completion fish")

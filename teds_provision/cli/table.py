@@ -30,7 +30,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
     "Set up": {
         "trust": Entry("trust", "trust", "Manage trusted public keys of other stations and CAs."),
         "profile": Entry("profile", "profile", "List, show, check and create transducer types."),
-        "config": Entry("config", "config", "Show the settings in config.toml and the environment."),
+        "config": Entry("config", "config", "Show and change the settings in config.toml and the environment."),
         "completion": Entry("config", "completion", "Print the script that completes commands in your shell."),
         "doctor": Entry("doctor", "doctor", "Check reader, CAN, keyring, clock and store; suggest fixes."),
     },

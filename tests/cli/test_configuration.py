@@ -95,3 +95,41 @@ def test_a_shell_is_offered_what_fits(home: Path, words: str, offered: str) -> N
         check=False,
     )
     assert offered in [row.partition(",")[2] for row in done.stdout.splitlines()], done.stdout + done.stderr
+
+
+def test_a_setting_is_written_beside_what_stands_there_and_taken_away_again(home: Path) -> None:
+    file = home / "config.toml"
+    before = '# the bench\n\ncan = "socketcan:can9"  # left\n\n[provision]  # one\n# patience\ntimeout = 5\n'
+    file.write_text(before)
+    assert call(home, "config", "set", "can", "socketcan:can0#1").code == 0
+    assert call(home, "config", "set", "provision.via", "can").code == 0
+    assert call(home, "config", "set", "whitelist.add.dry-run", "true").code == 0
+    assert call(home, "config", "set", "timeout", "2.5").code == 0
+    assert call(home, "config", "set", "ncap.brokers.lab", "mqtts://lab").code == 0
+    assert file.read_text() == (
+        '# the bench\n\ncan = "socketcan:can0#1"  # left\ntimeout = 2.5\n\n'
+        '[provision]  # one\n# patience\ntimeout = 5\nvia = "can"\n\n'
+        '[whitelist.add]\ndry-run = true\n\n[ncap.brokers]\nlab = "mqtts://lab"\n'
+    )
+    told = call(home, "--json", "config", "set", "provision.via", "can").json["settings"]
+    assert told == [{"name": "provision.via", "value": "can", "source": str(file)}]
+    for name in ("provision.via", "whitelist.add.dry_run", "timeout", "ncap.brokers.lab"):
+        assert call(home, "config", "unset", name).code == 0
+    file.write_text(file.read_text().replace("\n[whitelist.add]\n", "").replace("\n[ncap.brokers]\n", ""))
+    assert file.read_text() == before.replace("can9", "can0#1")
+    assert call(home, "--json", "config", "unset", "provision.via").json["removed"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("cann", "x"), ("verify.profile", "x"), ("timeout", "soon"), ("provision.watch", "perhaps"), ("home", "/tmp")],
+)
+def test_a_setting_that_no_command_takes_is_not_written(home: Path, name: str, value: str) -> None:
+    assert call(home, "config", "set", name, value).code == 2
+    assert not (home / "config.toml").exists()
+
+
+def test_a_file_that_says_it_otherwise_is_left_to_its_owner(home: Path) -> None:
+    (home / "config.toml").write_text('provision = { via = "can" }\n')
+    assert call(home, "config", "set", "provision.via", "nfc").code == 8
+    assert (home / "config.toml").read_text() == 'provision = { via = "can" }\n'
