@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotWhitelisted, PolicyRefused
@@ -95,6 +95,10 @@ class Policy:
     def revocation(self, uuid: bytes) -> Revocation | None:
         """Why a node is denied, None if it is not."""
         return self._store.revocation(uuid)
+
+    def revocations_of(self, uuids: Sequence[bytes]) -> dict[bytes, Revocation]:
+        """Those of a page of nodes that are denied, with why."""
+        return {one.uuid: one for one in self._store.revocations_of(uuids)}
 
     def deny(self, revocation: Revocation) -> None:
         """Put a node on the deny list."""

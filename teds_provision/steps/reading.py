@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 from teds_provision.errors import StoreChanged
@@ -189,5 +190,7 @@ def _written(checks: Iterable[Check]) -> str:
     return json.dumps([[check.name, check.result, check.why] for check in checks], separators=(",", ":"))
 
 
-def _read(text: str) -> Iterator[Check]:
-    return (Check(name, result, why) for name, result, why in json.loads(text))
+@lru_cache(maxsize=1024)
+def _read(text: str) -> tuple[Check, ...]:
+    """The checks of a row; most nodes of a plant have the same."""
+    return tuple(Check(name, result, why) for name, result, why in json.loads(text))

@@ -124,7 +124,7 @@ def remember_page(station: Station, uuids: Sequence[bytes]) -> Remembered:
         station.point,
         _Pins(station.pins.among(station.nodes.of_page(uuids).values(), entries.values()), entries),
         _Policy(
-            {uuid: revocation for uuid in uuids if (revocation := station.policy.revocation(uuid)) is not None},
+            station.policy.revocations_of(uuids),
             tuple(station.policy.trusted_cas()),
             _counting(station, station.keys.cas_of_page(uuids)),
             tuple(station.policy.trusted_stations()),
@@ -293,7 +293,7 @@ def judge(station: Judging, uuid: bytes, octets: Iterable[Check], signers: Signe
         certifier = _certifier(station, uuid, signers)
         checks["signing station"] = _station(station, signers, certifier)
         checks["station certificate"] = _certificate(station, signers, certifier)
-    return sorted(checks.values(), key=lambda check: _ORDER.index(check.name))
+    return sorted(checks.values(), key=lambda check: _PLACES[check.name])
 
 
 _ORDER: Final = (
@@ -301,6 +301,7 @@ _ORDER: Final = (
     "signing station", "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
     "possession", _SESSION,
 )  # fmt: skip
+_PLACES: Final = {name: place for place, name in enumerate(_ORDER)}
 ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed", "UUID"})
 """Checks of other TEDS than the Security TEDS."""
 

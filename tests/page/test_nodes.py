@@ -159,11 +159,11 @@ def test_a_verdict_that_rests_on_what_was_read_before_says_so_and_what_no_sessio
         head = page.locator(".node-head")
         head.get_by_text("Kept", exact=True).wait_for()
         head.get_by_text("Authentic", exact=True).wait_for()  # what no session said replaces nothing
-        head.get_by_text("Heard in no session: not authentic").wait_for()
+        head.get_by_text("Not verified: not authentic").wait_for()
         page.unroute_all()
         page.reload()
         head.get_by_text("Authentic", exact=True).wait_for()
-        assert head.get_by_text("Kept", exact=True).count() == head.get_by_text("Heard in no session").count() == 0
+        assert head.get_by_text("Kept", exact=True).count() == head.get_by_text("Not verified").count() == 0
 
 
 @pytest.mark.realtime

@@ -46,7 +46,7 @@ _STATUS: Final[tuple[tuple[type[TedsProvisionError], int], ...]] = (
 )
 ASKED: Final = "teds.asked"
 """Where in a request's scope the short members of its body stand, for the audit log."""
-_LONGEST_IN_LOG: Final = 200
+_LONGEST_IN_LOG, _MOST_IN_LOG = 200, 16
 _OTHERS: Final = 422  # guard, limits, bad data, policy: the request is understood and not done
 
 
@@ -89,6 +89,8 @@ async def body_of(request: Request, shape: type[Shape]) -> Shape:
 
 def _is_short(one: object) -> bool:
     """Whether a member is named in the log: no datasheet, no calibration."""
+    if isinstance(one, list | tuple):
+        return len(one) <= _MOST_IN_LOG and all(map(_is_short, one))
     return isinstance(one, bool | int | float) or (isinstance(one, str) and len(one) <= _LONGEST_IN_LOG)
 
 

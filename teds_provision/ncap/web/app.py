@@ -18,7 +18,7 @@ from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from teds_provision.api.operations import API
-from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError, UsageFailure
+from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import Listener
 from teds_provision.ncap.web import metrics
@@ -85,7 +85,7 @@ def _noted(daemon: Daemon) -> Callable[[Request, Exception], Awaitable[Response]
 
     async def answer(request: Request, error: Exception) -> Response:
         assert isinstance(error, TedsProvisionError)
-        told = not isinstance(error, UsageFailure | NotFound | StoreFailure) and "number" not in request.path_params
+        told = not isinstance(error, NotFound | StoreFailure) and "number" not in request.path_params
         if request.method not in SAFE and told:
             await changing(note, request, error)
         return answer_error(request, error)

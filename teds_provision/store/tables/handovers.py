@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from teds_provision.errors import PolicyRefused, UsageFailure
-from teds_provision.store.database import Database
+from teds_provision.store.database import Database, places
 from teds_provision.store.records import Direction, Handover, Holder, Revocation, Tombstone, TrustRecord, utc_now
 
 _MIN_FINGERPRINT_PREFIX = 16  # what people are shown
@@ -132,6 +133,10 @@ class HandoverTables:
     def revocation(self, uuid: bytes) -> Revocation | None:
         """Return why this node is denied, None if it is not."""
         return self._database.read_one(Revocation, "SELECT * FROM revocations WHERE uuid = ?", (uuid,))
+
+    def revocations_of(self, uuids: Sequence[bytes]) -> list[Revocation]:
+        """The entries of these nodes, at most a page of them."""
+        return self._database.read(Revocation, f"SELECT * FROM revocations WHERE uuid IN ({places(uuids)})", uuids)
 
     def put_revocation(self, revocation: Revocation) -> None:
         """Deny a node."""
