@@ -40,10 +40,10 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
     group = root.command
     settings = known_settings(group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    place = doctor_room.registry.Place(
+    system = doctor_room.registry.System(
         app.home, nfc, can, ble, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root)
     )
-    found = list(doctor_room.registry.examine(place))
+    found = list(doctor_room.registry.examine(system))
     findings = [finding for _, finding in found]
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
     code = doctor_room.registry.exit_code(found)

@@ -30,20 +30,20 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
 
     With --via can, every node on the bus is asked; --json lists several under "nodes".
     """
-    stop = talk.watching.Patience(None)
+    stop = talk.meeting.Patience(None)
     if watch:
         signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     several = len(links.places) > 1
     found: list[dict[str, Any]] = []
-    for came in steps.commands.identify_at(
+    for arrival in steps.commands.identify_at(
         app.station(), links, reporter_for(app, several=several), add=add, watch=watch, stop=stop
     ):
-        if came.error is not None:
-            app.fail_line(came.error, uuid=came.uuid.hex(), time=came.time)
-        elif came.result is not None:
-            found.append(_told(came.result))
+        if arrival.error is not None:
+            app.fail_line(arrival.error, uuid=arrival.uuid.hex(), time=arrival.time)
+        elif arrival.result is not None:
+            found.append(_told(arrival.result))
             if watch:
-                _emit(app, found.pop() | {"time": came.time})
+                _emit(app, found.pop() | {"time": arrival.time})
     if not watch:
         _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
 

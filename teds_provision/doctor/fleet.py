@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision import teds
-from teds_provision.doctor.registry import Finding, Place, check
+from teds_provision.doctor.registry import Finding, System, check
 from teds_provision.errors import BadData, NotFound, StoreChanged, StoreFailure, VaultFailure
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml
@@ -19,9 +19,9 @@ _SHOWN: Final = 5
 
 
 @check("config", "machine")
-def config(place: Place) -> Iterator[Finding]:
+def config(system: System) -> Iterator[Finding]:
     """Is config.toml what it should be: TOML, with keys that some command knows."""
-    path = place.home / "config.toml"
+    path = system.home / "config.toml"
     if not path.exists():
         yield Finding("config", "skipped", "There is no config.toml.")
         return
@@ -30,30 +30,30 @@ def config(place: Place) -> Iterator[Finding]:
     except (BadData, NotFound) as error:
         yield Finding("config", "failed", error.message, error.hint or "Mend or remove the file.")
         return
-    unknown = list(_unknown(values, place))
+    unknown = list(_unknown(values, system))
     if unknown:
         names = ", ".join(unknown[:_SHOWN])
         yield Finding(
             "config", "failed", f"{path} has keys that no command knows: {names}.", f"Take them out of {path}."
         )
         return
-    bad = place.bad_value(values)
+    bad = system.bad_value(values)
     if bad:
         yield Finding("config", "failed", bad, "Mend that line.")
     else:
         yield Finding("config", "ok", f"{path} holds {len(values)} settings.")
 
 
-def _unknown(values: dict[str, Any], place: Place) -> Iterator[str]:
-    if place.settings is None:
+def _unknown(values: dict[str, Any], system: System) -> Iterator[str]:
+    if system.settings is None:
         return
-    known = {table: {name.replace("-", "_") for name in names} for table, names in place.settings.items()}
+    known = {table: {name.replace("-", "_") for name in names} for table, names in system.settings.items()}
     for key, value in values.items():
         name = key.replace("-", "_")
         if not isinstance(value, dict):
             if name not in known[""]:
                 yield key
-        elif key.replace("_", "-") not in place.settings:
+        elif key.replace("_", "-") not in system.settings:
             yield f"[{key}]"
         else:
             allowed = known[key.replace("_", "-")]
@@ -61,15 +61,15 @@ def _unknown(values: dict[str, Any], place: Place) -> Iterator[str]:
 
 
 @check("profiles", "machine")
-def profiles(place: Place) -> Iterator[Finding]:
+def profiles(system: System) -> Iterator[Finding]:
     """Can every profile in this home be read; the shipped ones are tested where they are made."""
-    folder = place.home / "profiles"
+    folder = system.home / "profiles"
     if not folder.is_dir():
         yield Finding("profiles", "skipped", f"There is no folder {folder}.")
         return
     listed = [
         one
-        for one in teds.profile.list_profiles(teds.profile.default_folders(place.home))
+        for one in teds.profile.list_profiles(teds.profile.default_folders(system.home))
         if folder in one.path.parents
     ]
     for one in listed:
@@ -81,19 +81,19 @@ def profiles(place: Place) -> Iterator[Finding]:
 
 
 @check("store file", "store")
-def store_file(place: Place) -> Iterator[Finding]:
+def store_file(system: System) -> Iterator[Finding]:
     """Is the store there where the vault is: one without the other is a loss."""
-    if (place.home / "vault.json").exists() and not has_store(place.home):
-        why = f"The vault is in {place.home}, and its store is gone: names, pins and wrapped keys of every node."
+    if (system.home / "vault.json").exists() and not has_store(system.home):
+        why = f"The vault is in {system.home}, and its store is gone: names, pins and wrapped keys of every node."
         yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
 
 
 @check("nodes", "store")
-def nodes(place: Place) -> Iterator[Finding]:
+def nodes(system: System) -> Iterator[Finding]:
     """What waits for somebody: calibrations that have ended, names twice, drafts, nodes never verified, rotations."""
-    if not has_store(place.home):
+    if not has_store(system.home):
         return
-    with Store.open(place.home) as opened:
+    with Store.open(system.home) as opened:
         tally = opened.tally(datetime.now(UTC).strftime("%Y-%m-%d"))
     told = [
         (tally.overdue, "with a calibration that has ended", "teds-provision nodes --due 0"),
@@ -111,13 +111,13 @@ def nodes(place: Place) -> Iterator[Finding]:
 
 
 @check("seals", "store")
-def seals(place: Place) -> Iterator[Finding]:
+def seals(system: System) -> Iterator[Finding]:
     """Do the rows that decide whom the station believes carry its seal; only where nobody has to be asked for that."""
-    if not has_store(place.home):
+    if not has_store(system.home):
         return
-    station = Station.open(place.home, ask=place.ask or _nobody)
+    station = Station.open(system.home, ask=system.ask or _nobody)
     try:
-        if place.ask is None and station.identity.keystore != "keyring":  # which opens by itself, or not at all
+        if system.ask is None and station.identity.keystore != "keyring":  # which opens by itself, or not at all
             why = "Pins and trust are checked where the vault opens; no passphrase was given."
             yield Finding("seals", "skipped", why, "teds-provision --passphrase-fd 3 doctor 3<FILE")
             return

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.doctor.registry import Finding, Place, Result, check
+from teds_provision.doctor.registry import Finding, Result, System, check
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
 from teds_provision.links import can as can_room
 from teds_provision.links import nfc as nfc_room
@@ -43,33 +43,33 @@ _LISTEN_SECONDS: Final = 0.5
 
 
 @check("nfc readers", "link")
-def readers(place: Place) -> Iterator[Finding]:
+def readers(system: System) -> Iterator[Finding]:
     """Every USB reader that nfcpy knows: may this user open it, and does something else hold it.
 
     What is wrong with one is a failure only where a USB reader was asked for.
     """
     found = False
-    for device in sorted(place.at("/sys/bus/usb/devices").glob("*")):
+    for device in sorted(system.at("/sys/bus/usb/devices").glob("*")):
         ids = _ids(device)
         if ids not in READERS:
             continue
         found = True
-        yield _reader(place, device, ids)
+        yield _reader(system, device, ids)
     if not found:
         yield Finding("nfc readers", "skipped", f"No USB reader of the {len(READERS)} that nfcpy knows is plugged in.")
-    yield from _pcscd(place, found)
+    yield from _pcscd(system, found)
 
 
-def _reader(place: Place, device: Path, ids: tuple[int, int]) -> Finding:
+def _reader(system: System, device: Path, ids: tuple[int, int]) -> Finding:
     vendor, product = ids
     name = f"reader usb:{vendor:04x}:{product:04x}"
     what = READERS[ids]
-    bad: Result = "failed" if (place.nfc or "").startswith("usb") else "warning"
+    bad: Result = "failed" if (system.nfc or "").startswith("usb") else "warning"
     try:
         bus, number = (int((device / part).read_text()) for part in ("busnum", "devnum"))
     except (OSError, ValueError):
         return Finding(name, "warning", f"{what} is going away or was just plugged in.", "Run the doctor again.")
-    node = place.at(f"/dev/bus/usb/{bus:03}/{number:03}")
+    node = system.at(f"/dev/bus/usb/{bus:03}/{number:03}")
     held = {os.path.basename(os.path.realpath(link)) for link in device.parent.glob(f"{device.name}:*/driver")}
     driver = next(iter(held - {"usbfs"}), None)
     if driver is not None:
@@ -84,12 +84,12 @@ def _reader(place: Place, device: Path, ids: tuple[int, int]) -> Finding:
             'TAG+="uaccess", GROUP="plugdev", MODE="0660"'
         )
         fix = f"echo '{rule}' | sudo tee /etc/udev/rules.d/70-nfc.rules, then plug the reader in again"
-        return Finding(name, bad, f"This user may not open {what} at {_shown(place, node)}.", fix)
-    return Finding(name, "ok", f"{what} at {_shown(place, node)}: --nfc usb:{vendor:04x}:{product:04x}.")
+        return Finding(name, bad, f"This user may not open {what} at {_shown(system, node)}.", fix)
+    return Finding(name, "ok", f"{what} at {_shown(system, node)}: --nfc usb:{vendor:04x}:{product:04x}.")
 
 
-def _pcscd(place: Place, found: bool) -> Iterator[Finding]:
-    for name in place.at("/proc").glob("[0-9]*/comm"):
+def _pcscd(system: System, found: bool) -> Iterator[Finding]:
+    for name in system.at("/proc").glob("[0-9]*/comm"):
         try:
             running = name.read_text().strip() == "pcscd"
         except OSError:
@@ -105,10 +105,10 @@ def _pcscd(place: Place, found: bool) -> Iterator[Finding]:
 
 
 @check("pc/sc", "link")
-def pcsc(place: Place) -> Iterator[Finding]:
+def pcsc(system: System) -> Iterator[Finding]:
     """Which PC/SC readers pcscd offers; a failure only where one was asked for."""
-    asked = (place.nfc or "").partition(":")[0] == "pcsc"
-    if place.system != Path("/"):
+    asked = (system.nfc or "").partition(":")[0] == "pcsc"
+    if system.root != Path("/"):
         yield Finding("pc/sc", "skipped", "Another machine's folders are looked at.")
         return
 
@@ -126,9 +126,9 @@ def pcsc(place: Place) -> Iterator[Finding]:
 
 
 @check("serial ports", "machine")
-def serial_ports(place: Place) -> Iterator[Finding]:
+def serial_ports(system: System) -> Iterator[Finding]:
     """May this user open the serial ports that a reader or a CAN adapter could be behind."""
-    ports = sorted(path for kind in ("USB", "ACM", "AMA") for path in place.at("/dev").glob(f"tty{kind}*"))
+    ports = sorted(path for kind in ("USB", "ACM", "AMA") for path in system.at("/dev").glob(f"tty{kind}*"))
     if not ports:
         yield Finding("serial ports", "skipped", "There is none that a reader could be behind.")
         return
@@ -141,7 +141,7 @@ def serial_ports(place: Place) -> Iterator[Finding]:
 
 
 @check("nfc loopback", "machine")
-def nfc_loopback(place: Place) -> Iterator[Finding]:
+def nfc_loopback(system: System) -> Iterator[Finding]:
     """Do datagrams reach this machine's own loopback: simulated readers need nothing else."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
@@ -160,14 +160,14 @@ def nfc_loopback(place: Place) -> Iterator[Finding]:
 
 
 @check("nfc", "link")
-def nfc(place: Place) -> Iterator[Finding]:
+def nfc(system: System) -> Iterator[Finding]:
     """Open the reader that was asked for, and look what lies on it."""
-    if place.nfc is None:
+    if system.nfc is None:
         yield Finding("nfc", "skipped", "No reader was named, so none was opened.", "")
         return
 
     try:
-        reader = nfc_room.reader.open_reader(place.nfc)
+        reader = nfc_room.reader.open_reader(system.nfc)
     except (NoReader, UsageFailure) as failure:
         yield Finding("nfc", "failed", failure.message, failure.hint)
         return
@@ -179,15 +179,15 @@ def nfc(place: Place) -> Iterator[Finding]:
     finally:
         reader.close()
     lies = "a tag lies on it" if tag else "nothing lies on it"
-    fix = "" if tag or not place.nfc.startswith("udp") else f"teds-provision node run DIR --nfc {place.nfc}"
-    yield Finding("nfc", "ok" if tag or not fix else "warning", f"{reader.name} on {place.nfc} opens; {lies}.", fix)
+    fix = "" if tag or not system.nfc.startswith("udp") else f"teds-provision node run DIR --nfc {system.nfc}"
+    yield Finding("nfc", "ok" if tag or not fix else "warning", f"{reader.name} on {system.nfc} opens; {lies}.", fix)
 
 
 @check("can interfaces", "machine")
-def can_interfaces(place: Place) -> Iterator[Finding]:
+def can_interfaces(system: System) -> Iterator[Finding]:
     """Every CAN interface of the kernel: is it up, and at which bit rate."""
     found = False
-    for interface in sorted(place.at("/sys/class/net").glob("*")):
+    for interface in sorted(system.at("/sys/class/net").glob("*")):
         try:
             kind, flags = int((interface / "type").read_text()), int((interface / "flags").read_text(), 16)
         except (OSError, ValueError):
@@ -196,7 +196,7 @@ def can_interfaces(place: Place) -> Iterator[Finding]:
             continue
         found = True
         name, up = f"can {interface.name}", bool(flags & _IFF_UP)
-        rate, state = _bitrate(place, interface.name)
+        rate, state = _bitrate(system, interface.name)
         at = f", {rate} bit/s" if rate else ""
         if not up:
             fix = f"sudo ip link set {interface.name} up type can bitrate {rate or 500000}"
@@ -220,9 +220,9 @@ def _kernel_can() -> bool:
     return True
 
 
-def _bitrate(place: Place, name: str) -> tuple[int, str]:
+def _bitrate(system: System, name: str) -> tuple[int, str]:
     """Bit rate (0: unknown) and state as ``ip`` tells them; sysfs has neither."""
-    if place.system != Path("/"):
+    if system.root != Path("/"):
         return 0, ""
     words = ["ip", "-details", "-json", "link", "show", name]
     try:
@@ -234,7 +234,7 @@ def _bitrate(place: Place, name: str) -> tuple[int, str]:
 
 
 @check("can loopback", "machine")
-def can_loopback(place: Place) -> Iterator[Finding]:
+def can_loopback(system: System) -> Iterator[Finding]:
     """Do frames of a simulated bus come back, without leaving this machine (hop limit 0)."""
     channel = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
     arrived, why, fix = _self_test(f"udp_multicast:{channel}?hop_limit=0&port={free_port()}")
@@ -259,14 +259,14 @@ def _self_test(spec: str) -> tuple[bool, str, str]:
 
 
 @check("can", "link")
-def can(place: Place) -> Iterator[Finding]:
+def can(system: System) -> Iterator[Finding]:
     """Open the bus that was asked for; listen a moment for errors, and for another station of our address."""
-    if place.can is None:
+    if system.can is None:
         yield Finding("can", "skipped", "No bus was named, so none was opened.", "")
         return
 
     try:
-        bus = can_room.bus.Bus(can_room.spec.parse_spec(place.can))
+        bus = can_room.bus.Bus(can_room.spec.parse_spec(system.can))
     except (LinkFailure, UsageFailure) as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
@@ -296,8 +296,8 @@ def _ids(device: Path) -> tuple[int, int]:
     return vendor, product
 
 
-def _shown(place: Place, node: Path) -> str:
-    shown = f"/{node.relative_to(place.system)}"
+def _shown(system: System, node: Path) -> str:
+    shown = f"/{node.relative_to(system.root)}"
     try:
         return f"{shown} (mode {stat.S_IMODE(node.stat().st_mode):04o})"
     except OSError:
@@ -314,20 +314,20 @@ _MANY: Final = 5
 
 
 @check("bluetooth switches", "machine")
-def switches(place: Place) -> Iterator[Finding]:
+def switches(system: System) -> Iterator[Finding]:
     """Does the kernel know a Bluetooth adapter, and is it blocked by rfkill or by a switch."""
-    found = sorted(path.name for path in place.at("/sys/class/bluetooth").glob("hci*") if ":" not in path.name)
+    found = sorted(path.name for path in system.at("/sys/class/bluetooth").glob("hci*") if ":" not in path.name)
     if not found:
         yield Finding("bluetooth switches", "skipped", "The kernel knows no Bluetooth adapter.")
         return
-    blocked = list(_blocked(place))
+    blocked = list(_blocked(system))
     yield from blocked
     if not blocked:
         yield Finding("bluetooth switches", "ok", f"{', '.join(found)}: not blocked.")
 
 
-def _blocked(place: Place) -> Iterator[Finding]:
-    for switch in sorted(place.at("/sys/class/rfkill").glob("rfkill*")):
+def _blocked(system: System) -> Iterator[Finding]:
+    for switch in sorted(system.at("/sys/class/rfkill").glob("rfkill*")):
         try:
             kind, name = (switch / "type").read_text().strip(), (switch / "name").read_text().strip()
             soft, hard = ((switch / side).read_text().strip() == "1" for side in ("soft", "hard"))
@@ -344,15 +344,15 @@ def _blocked(place: Place) -> Iterator[Finding]:
 
 
 @check(_BLUETOOTH, "link")
-def bluetooth(place: Place) -> Iterator[Finding]:
+def bluetooth(system: System) -> Iterator[Finding]:
     """System bus, bluetoothd, its adapters: switched on, central role, connections that are held."""
-    if place.system != Path("/") and "DBUS_SYSTEM_BUS_ADDRESS" not in place.environment:
+    if system.root != Path("/") and "DBUS_SYSTEM_BUS_ADDRESS" not in system.environment:
         yield Finding(_BLUETOOTH, "skipped", "Another machine's folders are looked at.")
         return
-    asked = place.ble is not None
+    asked = system.ble is not None
     try:
-        spec = parse_spec(place.ble or "")
-        found = adapters(place.environment.get("DBUS_SYSTEM_BUS_ADDRESS"))
+        spec = parse_spec(system.ble or "")
+        found = adapters(system.environment.get("DBUS_SYSTEM_BUS_ADDRESS"))
         _require(found, spec)
     except (NoReader, UsageFailure) as failure:
         yield Finding(_BLUETOOTH, "failed" if asked else "skipped", failure.message, failure.hint if asked else "")

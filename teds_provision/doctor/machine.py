@@ -13,7 +13,7 @@ from typing import Final
 
 from teds_provision import store as store_room
 from teds_provision import vault
-from teds_provision.doctor.registry import Finding, Place, check
+from teds_provision.doctor.registry import Finding, System, check
 from teds_provision.errors import StoreFailure
 from teds_provision.lazy import install_command
 from teds_provision.store.database import has_store
@@ -39,7 +39,7 @@ _TOLERANCE_SECONDS: Final = 120
 
 
 @check("python", "machine")
-def python(place: Place) -> Iterator[Finding]:
+def python(system: System) -> Iterator[Finding]:
     """Is this Python new enough."""
     version = platform.python_version()
     enough = sys.version_info[:2] >= _MIN_PYTHON
@@ -48,7 +48,7 @@ def python(place: Place) -> Iterator[Finding]:
 
 
 @check("libraries", "machine")
-def libraries(place: Place) -> Iterator[Finding]:
+def libraries(system: System) -> Iterator[Finding]:
     """Are the libraries there, new enough, and not shadowed."""
     present, missing, old = [], [], []
     for name, least in _LIBRARIES.items():
@@ -85,14 +85,14 @@ def _shadowed() -> Iterator[Finding]:
 
 
 @check("argon2id", "machine")
-def argon2id(place: Place) -> Iterator[Finding]:
+def argon2id(system: System) -> Iterator[Finding]:
     """Can this OpenSSL derive keys from passphrases."""
     vault.passphrase.SealingKey.derive("a self-test, no secret", costs=vault.passphrase.THROWAWAY)
     yield Finding("argon2id", "ok", "Passphrases can be used.")
 
 
 @check("libusb", "machine")
-def libusb(place: Place) -> Iterator[Finding]:
+def libusb(system: System) -> Iterator[Finding]:
     """Is the C library of USB readers there."""
     for name in _LIBUSB:
         try:
@@ -101,26 +101,26 @@ def libusb(place: Place) -> Iterator[Finding]:
             continue
         yield Finding("libusb", "ok", f"{name} loads.")
         return
-    asked = (place.nfc or "").startswith("usb")
+    asked = (system.nfc or "").startswith("usb")
     why = "The C library libusb is missing: USB readers cannot be used (simulated and serial ones can)."
     yield Finding("libusb", "failed" if asked else "warning", why, "sudo apt install libusb-1.0-0")
 
 
 @check("clock", "machine")
-def clock(place: Place) -> Iterator[Finding]:
+def clock(system: System) -> Iterator[Finding]:
     """Is the time one that a signature may carry: plausible, and not before what was signed already."""
     now = datetime.now(UTC)
     fix = "sudo timedatectl set-ntp true, or: sudo date --utc --set '2026-01-31 12:00'"
     if not _FIRST_YEAR <= now.year <= _LAST_YEAR:
         yield Finding("clock", "failed", f"The clock says {now:%Y-%m-%d}, which cannot be.", fix)
         return
-    last = _last_entry(place)
+    last = _last_entry(system)
     if last is not None and (last - now).total_seconds() > _TOLERANCE_SECONDS:
         yield Finding(
             "clock", "failed", f"The clock says {now:%Y-%m-%d %H:%M} UTC, before the last entry of the audit log.", fix
         )
         return
-    drift = _drift(place)
+    drift = _drift(system)
     if drift is not None and abs(drift) > _TOLERANCE_SECONDS:
         why = f"The hardware clock differs from the system's by {drift:.0f} s."
         yield Finding("clock", "warning", why, "sudo hwclock --systohc, once the system's time is right")
@@ -128,21 +128,21 @@ def clock(place: Place) -> Iterator[Finding]:
     yield Finding("clock", "ok", f"{now:%Y-%m-%d %H:%M} UTC.")
 
 
-def _last_entry(place: Place) -> datetime | None:
-    if not has_store(place.home):
+def _last_entry(system: System) -> datetime | None:
+    if not has_store(system.home):
         return None
     try:
-        with store_room.Store.open(place.home) as store:
+        with store_room.Store.open(system.home) as store:
             latest = store.audit.latest()
         return datetime.strptime(latest, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if latest is not None else None
     except (StoreFailure, ValueError):  # the checks of the store say so
         return None
 
 
-def _drift(place: Place) -> float | None:
+def _drift(system: System) -> float | None:
     """Seconds that the hardware clock is ahead; it is assumed to run in UTC, else a whole time zone shows."""
     try:
-        seconds = int(place.at("/sys/class/rtc/rtc0/since_epoch").read_text())
+        seconds = int(system.at("/sys/class/rtc/rtc0/since_epoch").read_text())
     except (OSError, ValueError):
         return None
     drift = seconds - time.time()

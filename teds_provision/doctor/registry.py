@@ -1,7 +1,7 @@
 """``doctor``: named checks of this machine, its links and the station, each with its cause and the cure.
 
-A check is a function from a :class:`Place` to findings, registered under a name. It opens no reader and no bus unless
-the user named one, changes nothing, and looks at the system below ``Place.system`` only, so that tests can show it a
+A check is a function from a :class:`System` to findings, registered under a name. It opens no reader and no bus unless
+the user named one, changes nothing, and looks at the system below ``System.root`` only, so that tests can show it a
 machine with any hardware.
 """
 
@@ -31,7 +31,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Place:
+class System:
     """Where to look: the station's home, the root of the file system, the environment, and the links asked for."""
 
     home: Path
@@ -39,7 +39,7 @@ class Place:
     can: str | None = None
     ble: str | None = None
     workspace: Path = field(default_factory=Path.cwd)
-    system: Path = Path("/")
+    root: Path = Path("/")
     environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
     settings: Mapping[str, frozenset[str]] | None = None
     """Names that config.toml may have, by table ("" outside of one); None where nobody knows them."""
@@ -50,10 +50,10 @@ class Place:
 
     def at(self, path: str) -> Path:
         """A path of the system, below the root that is looked at."""
-        return self.system / path.lstrip("/")
+        return self.root / path.lstrip("/")
 
 
-Look = Callable[[Place], Iterator[Finding]]
+Look = Callable[[System], Iterator[Finding]]
 CHECKS: Final[dict[str, tuple[Room, Look]]] = {}
 _MODULES: Final = ("machine", "links", "station", "fleet")
 
@@ -68,13 +68,13 @@ def check(name: str, room: Room) -> Callable[[Look], Look]:
     return register
 
 
-def examine(place: Place) -> Iterator[tuple[Room, Finding]]:
+def examine(system: System) -> Iterator[tuple[Room, Finding]]:
     """Run every check in turn; one that fails in an unforeseen way is itself a finding, and the next one runs."""
     for module in _MODULES:
         import_module(f"teds_provision.doctor.{module}")  # fills the registry
     for name, (room, look) in CHECKS.items():
         try:
-            for finding in look(place):
+            for finding in look(system):
                 yield room, finding
         except TedsProvisionError as error:
             yield room, Finding(name, "failed", error.message, error.hint)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision import vault as vault_room
-from teds_provision.doctor.registry import Finding, Place, check
+from teds_provision.doctor.registry import Finding, System, check
 from teds_provision.errors import NoKeyring, NotFound, StoreFailure, VaultFailure
 from teds_provision.files import open_to_read
 from teds_provision.store import Choice, Store
@@ -28,22 +28,22 @@ _INIT: Final = "teds-provision init"
 
 
 @check("home", "store")
-def home(place: Place) -> Iterator[Finding]:
+def home(system: System) -> Iterator[Finding]:
     """Is the home this user's alone, and each file in it too. Looked at before anything opens (and mends) it."""
-    if not place.home.is_dir():
-        yield Finding("home", "skipped", f"There is no station in {place.home} yet.", _INIT)
+    if not system.home.is_dir():
+        yield Finding("home", "skipped", f"There is no station in {system.home} yet.", _INIT)
         return
-    status = place.home.stat()
+    status = system.home.stat()
     if status.st_uid != os.geteuid():
-        why = f"{place.home} belongs to another user."
-        yield Finding("home", "warning", why, f"sudo chown -R $USER {place.home}, or use another --home")
+        why = f"{system.home} belongs to another user."
+        yield Finding("home", "warning", why, f"sudo chown -R $USER {system.home}, or use another --home")
     elif status.st_mode & 0o022:
-        yield Finding("home", "failed", f"Others may write in {place.home}.", f"chmod 700 {place.home}")
+        yield Finding("home", "failed", f"Others may write in {system.home}.", f"chmod 700 {system.home}")
     elif status.st_mode & 0o055:
-        yield Finding("home", "warning", f"Others may look into {place.home}.", f"chmod 700 {place.home}")
+        yield Finding("home", "warning", f"Others may look into {system.home}.", f"chmod 700 {system.home}")
     else:
-        yield Finding("home", "ok", f"{place.home} is this user's alone.")
-    open_files = [path for path in sorted(place.home.iterdir()) if _open_to_others(path)]
+        yield Finding("home", "ok", f"{system.home} is this user's alone.")
+    open_files = [path for path in sorted(system.home.iterdir()) if _open_to_others(path)]
     if open_files:
         names = " ".join(str(path) for path in open_files)
         why = f"Others may read {', '.join(path.name for path in open_files)}."
@@ -56,9 +56,9 @@ def _open_to_others(path: Path) -> bool:
 
 
 @check("disk", "store")
-def disk(place: Place) -> Iterator[Finding]:
+def disk(system: System) -> Iterator[Finding]:
     """Is there room to write."""
-    where = next(path for path in (place.home, *place.home.absolute().parents) if path.is_dir())
+    where = next(path for path in (system.home, *system.home.absolute().parents) if path.is_dir())
     free = shutil.disk_usage(where).free
     enough = free >= _MIN_FREE
     fix = "" if enough else "Free some space: a full disk stops every command that changes something."
@@ -66,12 +66,12 @@ def disk(place: Place) -> Iterator[Finding]:
 
 
 @check("store", "store")
-def store(place: Place) -> Iterator[Finding]:
+def store(system: System) -> Iterator[Finding]:
     """Is the store whole, does its audit log hold, does anyone hold it, and is there a backup."""
-    if not has_store(place.home):
+    if not has_store(system.home):
         yield Finding("store", "skipped", _NO_STATION, _INIT)
         return
-    with Store.open(place.home) as opened:
+    with Store.open(system.home) as opened:
         damage = opened.damage()
         if damage is not None:
             yield Finding("store", "failed", f"The store is damaged: {damage}.", "teds-provision restore FILE")
@@ -84,7 +84,7 @@ def store(place: Place) -> Iterator[Finding]:
         yield Finding("store", "ok", f"Whole; {count} nodes, {opened.count('whitelist')} whitelisted.")
         yield from _audit(opened)
         yield from _backups(opened, count)
-    yield from _lock(place)
+    yield from _lock(system)
 
 
 def _audit(opened: Store) -> Iterator[Finding]:
@@ -110,8 +110,8 @@ def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
     yield Finding("backup", "warning" if old else "ok", f"The last one is {days} days old.", fix if old else "")
 
 
-def _lock(place: Place) -> Iterator[Finding]:
-    holder = holder_of(place.home)
+def _lock(system: System) -> Iterator[Finding]:
+    holder = holder_of(system.home)
     if holder is None:
         yield Finding("lock", "ok", "Nobody holds the store.")
     else:
@@ -119,9 +119,9 @@ def _lock(place: Place) -> Iterator[Finding]:
 
 
 @check("keyring", "store")
-def keyring(place: Place) -> Iterator[Finding]:
+def keyring(system: System) -> Iterator[Finding]:
     """Which keyring would hold the keys, is it one that may, and does it answer; a failure only where it is used."""
-    used = _keystore(place)
+    used = _keystore(system)
     try:
         with _quiet_logging():
             name = vault_room.keyring_vault.inspect()
@@ -152,27 +152,27 @@ def _quiet_logging() -> Iterator[None]:
 
 
 @check("vault", "store")
-def vault(place: Place) -> Iterator[Finding]:
+def vault(system: System) -> Iterator[Finding]:
     """Is what holds the station's keys there; nobody is asked for a passphrase or PIN."""
-    used = _keystore(place)
+    used = _keystore(system)
     if used is None:
         yield Finding("vault", "skipped", _NO_STATION, _INIT)
     elif used == "file":
-        yield _file_vault(place)
+        yield _file_vault(system)
     elif used == "keyring":
-        with Store.open(place.home) as opened:
+        with Store.open(system.home) as opened:
             yield Finding("vault", "ok", f"{vault_room.keyring_vault.KeyringVault.open(opened.id).description}.")
     else:
         token = vault_room.pkcs11_token.find_token(vault_room.pkcs11_uri.Pkcs11Uri.parse(used))
-        if not (place.home / "vault-pkcs11.json").exists():
+        if not (system.home / "vault-pkcs11.json").exists():
             raise VaultFailure("The file vault-pkcs11.json is missing.", hint="teds-provision restore FILE")
         yield Finding("vault", "ok", f"The token {token.label.strip()!r} is there.")
 
 
 @check("unlock", "store")
-def unlocked(place: Place) -> Iterator[Finding]:
+def unlocked(system: System) -> Iterator[Finding]:
     """Does a process hold the vault open."""
-    left = agent.seconds_left(place.home)
+    left = agent.seconds_left(system.home)
     if left is None:
         yield Finding("unlock", "ok", "No process holds the vault open.")
     else:
@@ -180,9 +180,9 @@ def unlocked(place: Place) -> Iterator[Finding]:
         yield Finding("unlock", "warning", why, "teds-provision lock")
 
 
-def _file_vault(place: Place) -> Finding:
-    with Store.open(place.home) as opened:
-        content = vault_room.file_vault.read_sealed(place.home / "vault.json")
+def _file_vault(system: System) -> Finding:
+    with Store.open(system.home) as opened:
+        content = vault_room.file_vault.read_sealed(system.home / "vault.json")
         if content.get("store") != opened.id:
             raise VaultFailure("vault.json belongs to another store.", hint="teds-provision restore FILE")
     memory = content.get("memory_kib")
@@ -193,11 +193,11 @@ def _file_vault(place: Place) -> Finding:
     return Finding("vault", "ok", f"The passphrase file is there (Argon2id, {memory >> 10} MiB).")
 
 
-def _keystore(place: Place) -> str | None:
-    if not has_store(place.home):
+def _keystore(system: System) -> str | None:
+    if not has_store(system.home):
         return None
     try:
-        with Store.open(place.home) as opened:
+        with Store.open(system.home) as opened:
             facts = opened.facts()
             return facts.keystore if facts is not None else None
     except StoreFailure:  # the check of the store says so
@@ -205,14 +205,14 @@ def _keystore(place: Place) -> str | None:
 
 
 @check("keys folder", "machine")
-def keys_folder(place: Place) -> Iterator[Finding]:
+def keys_folder(system: System) -> Iterator[Finding]:
     """Does the workspace's ``keys/`` hold public keys only."""
-    folder = place.workspace / "keys"
+    folder = system.workspace / "keys"
     if not folder.is_dir():
         yield Finding("keys folder", "skipped", "There is no folder keys/ here.")
         return
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    private = [str(path.relative_to(place.workspace)) for path in files if holds_private_key(path)]
+    private = [str(path.relative_to(system.workspace)) for path in files if holds_private_key(path)]
     if private:
         fix = f"git rm --cached {' '.join(private)}; take it away, and make a new key: this one is no secret any more"
         yield Finding("keys folder", "failed", f"Private keys: {', '.join(private)}.", fix)

@@ -44,9 +44,8 @@ from teds_provision.steps.read import survey
 from teds_provision.steps.reading import verdict_of
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
-from teds_provision.talk.meeting import meet, onward, refuse_twins, without_twins
+from teds_provision.talk.meeting import Patience, meet, onward, refuse_twins, watch_nodes, without_twins
 from teds_provision.talk.progress import Reporter
-from teds_provision.talk.watching import Patience, watch_nodes
 
 _TOKEN_WORKERS: Final = 1
 _SHOWN: Final = 5
@@ -211,10 +210,12 @@ class Boards:
         return Totals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), worst)
 
     def _as_they_come(self, questions: Questions) -> Iterator[Board]:
-        for came in watch_nodes(self._links, lambda node: self._provision(node, questions), self._reporter, self.stop):
-            row = self._rows.pop(came.uuid, None)
+        for arrival in watch_nodes(
+            self._links, lambda node: self._provision(node, questions), self._reporter, self.stop
+        ):
+            row = self._rows.pop(arrival.uuid, None)
             number = row.number if row is not None else None
-            board = Board(came.uuid, came.seconds, came.result, came.error, number, came.place)
+            board = Board(arrival.uuid, arrival.seconds, arrival.result, arrival.error, number, arrival.place)
             self.stop.renew()
             yield board
             if self.progress is not None and not (self.progress.open if self._request.watch else self.progress.untried):

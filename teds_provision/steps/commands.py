@@ -44,9 +44,8 @@ from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouc
 from teds_provision.steps.write import Low, Written, wait_for_charge, write
 from teds_provision.store import DatasheetRecord, Draft
 from teds_provision.talk.conversation import HEARD, Conversation, SessionLost
-from teds_provision.talk.meeting import meet, meet_everyone
+from teds_provision.talk.meeting import Arrival, meet, meet_everyone, watch_nodes
 from teds_provision.talk.progress import Reporter
-from teds_provision.talk.watching import Came, watch_nodes
 from teds_provision.teds.codec import security
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
@@ -145,7 +144,7 @@ def identify_at(
     add: bool = False,
     watch: bool = False,
     stop: threading.Event | None = None,
-) -> Iterator[Came[Found]]:
+) -> Iterator[Arrival[Found]]:
     """Identify who is there, or (``watch``) whoever comes until ``stop``; ``add`` whitelists what proves its key.
 
     With ``watch`` an error ends one node only. Without it that is so where another node was identified, and it is told
@@ -162,7 +161,7 @@ def identify_at(
         for node, found in _side_by_side(nodes, lambda node: _one(station, node, add)):
             if isinstance(found, Found):
                 identified = True
-                yield Came(node.uuid, links.places[0], 0.0, found)
+                yield Arrival(node.uuid, links.places[0], 0.0, found)
                 continue
             first = first or found
             if len(nodes) > 1:

@@ -20,7 +20,7 @@ import teds_provision.links
 from teds_provision.doctor import machine as doctor_machine
 from teds_provision.doctor import registry
 from teds_provision.doctor.links import READERS
-from teds_provision.doctor.registry import CHECKS, Finding, Place, examine, exit_code
+from teds_provision.doctor.registry import CHECKS, Finding, System, examine, exit_code
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.store import Draft, Facts, KeyRecord, Marks, NodeRecord, Store, StoreLock, WhitelistEntry
@@ -31,35 +31,35 @@ from tests.places import free_bus, free_reader
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Place:
+def system(tmp_path: Path) -> System:
     """A machine without any hardware, and no station."""
     (tmp_path / "system").mkdir()
     (tmp_path / "work").mkdir()
-    return Place(tmp_path / "home", workspace=tmp_path / "work", system=tmp_path / "system", environment={})
+    return System(tmp_path / "home", workspace=tmp_path / "work", root=tmp_path / "system", environment={})
 
 
 @pytest.fixture
-def stationed(place: Place) -> Iterator[Place]:
+def stationed(system: System) -> Iterator[System]:
     forget_vaults()
-    make_station(place.home).close()
-    yield place
+    make_station(system.home).close()
+    yield system
     forget_vaults()
 
 
-def look(place: Place, name: str) -> list[Finding]:
+def look(system: System, name: str) -> list[Finding]:
     """What one check finds."""
     if name not in CHECKS:  # each of its modules has its own; who examines loads them all
-        list(examine(Place(place.home / "nowhere")))
-    return list(CHECKS[name][1](place))
+        list(examine(System(system.home / "nowhere")))
+    return list(CHECKS[name][1](system))
 
 
-def by_name(place: Place) -> dict[str, Finding]:
-    return {finding.name: finding for _, finding in examine(place)}
+def by_name(system: System) -> dict[str, Finding]:
+    return {finding.name: finding for _, finding in examine(system)}
 
 
-def plug_in(place: Place, vendor: int, product: int, *, driver: str | None = None, node: bool = True) -> None:
+def plug_in(system: System, vendor: int, product: int, *, driver: str | None = None, node: bool = True) -> None:
     """A USB device as sysfs and devfs show it."""
-    devices = place.at("/sys/bus/usb/devices")
+    devices = system.at("/sys/bus/usb/devices")
     device, interface = devices / "1-2", devices / "1-2:1.0"
     device.mkdir(parents=True)
     interface.mkdir()
@@ -67,26 +67,26 @@ def plug_in(place: Place, vendor: int, product: int, *, driver: str | None = Non
     for name, text in texts.items():
         (device / name).write_text(text + "\n")
     if driver is not None:
-        target = place.at(f"/sys/bus/usb/drivers/{driver}")
+        target = system.at(f"/sys/bus/usb/drivers/{driver}")
         target.mkdir(parents=True)
         (interface / "driver").symlink_to(target)
     if node:
-        file = place.at("/dev/bus/usb/001/005")
+        file = system.at("/dev/bus/usb/001/005")
         file.parent.mkdir(parents=True)
         file.touch(mode=0o666)
 
 
-def test_a_machine_without_anything_has_no_failure(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={place.home}/no-bus")
-    found = list(examine(place))
+def test_a_machine_without_anything_has_no_failure(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={system.home}/no-bus")
+    found = list(examine(system))
     assert exit_code(found) == 0
     assert [finding for _, finding in found if finding.result == "failed"] == []
     assert all(finding.why.endswith((".", ")")) for _, finding in found)
-    assert not place.home.exists()
+    assert not system.home.exists()
 
 
-def test_the_registry_holds_every_check(place: Place) -> None:
-    list(examine(place))
+def test_the_registry_holds_every_check(system: System) -> None:
+    list(examine(system))
     machine = ["python", "libraries", "argon2id", "libusb", "clock"]
     links = ["nfc readers", "pc/sc", "serial ports", "nfc loopback", "nfc", "can interfaces", "can loopback", "can"]
     links += ["bluetooth switches", "bluetooth"]
@@ -122,9 +122,9 @@ def test_the_shipped_udev_rules_have_a_line_for_each_of_them() -> None:
     assert {(int(vendor, 16), int(product, 16)) for vendor, product in found} == set(READERS)
 
 
-def test_a_free_reader_is_named_with_its_path(place: Place) -> None:
-    plug_in(place, 0x054C, 0x06C3)
-    (reader,) = look(place, "nfc readers")
+def test_a_free_reader_is_named_with_its_path(system: System) -> None:
+    plug_in(system, 0x054C, 0x06C3)
+    (reader,) = look(system, "nfc readers")
     assert (reader.name, reader.result) == ("reader usb:054c:06c3", "ok")
     assert "/dev/bus/usb/001/005" in reader.why
     assert "--nfc usb:054c:06c3" in reader.why
@@ -132,47 +132,47 @@ def test_a_free_reader_is_named_with_its_path(place: Place) -> None:
 
 @pytest.mark.parametrize(("ids", "driver"), [((0x04E6, 0x5591), "pn533_usb"), ((0x054C, 0x06C1), "port100")])
 def test_a_kernel_driver_that_holds_a_reader_is_named_with_its_removal(
-    place: Place, ids: tuple[int, int], driver: str
+    system: System, ids: tuple[int, int], driver: str
 ) -> None:
-    plug_in(place, *ids, driver=driver)
-    (reader,) = look(place, "nfc readers")
+    plug_in(system, *ids, driver=driver)
+    (reader,) = look(system, "nfc readers")
     assert (reader.result, driver in reader.why) == ("warning", True)
     assert f"modprobe -r {driver}" in reader.fix
-    (asked,) = look(Place(place.home, nfc="usb", system=place.system), "nfc readers")
+    (asked,) = look(System(system.home, nfc="usb", root=system.root), "nfc readers")
     assert asked.result == "failed"
 
 
-def test_a_reader_that_this_user_may_not_open_gets_its_udev_rule(place: Place) -> None:
-    plug_in(place, 0x072F, 0x2200, node=False)
-    (reader,) = look(place, "nfc readers")
+def test_a_reader_that_this_user_may_not_open_gets_its_udev_rule(system: System) -> None:
+    plug_in(system, 0x072F, 0x2200, node=False)
+    (reader,) = look(system, "nfc readers")
     assert reader.result == "warning"
     assert 'ATTRS{idVendor}=="072f", ATTRS{idProduct}=="2200"' in reader.fix
     assert 'TAG+="uaccess"' in reader.fix
 
 
-def test_pcscd_is_a_trouble_only_beside_a_reader(place: Place) -> None:
-    comm = place.at("/proc/123/comm")
+def test_pcscd_is_a_trouble_only_beside_a_reader(system: System) -> None:
+    comm = system.at("/proc/123/comm")
     comm.parent.mkdir(parents=True)
     comm.write_text("pcscd\n")
-    assert [finding.result for finding in look(place, "nfc readers")] == ["skipped", "ok"]
-    plug_in(place, 0x072F, 0x2200, driver="usbfs")
-    reader, pcscd = look(place, "nfc readers")
+    assert [finding.result for finding in look(system, "nfc readers")] == ["skipped", "ok"]
+    plug_in(system, 0x072F, 0x2200, driver="usbfs")
+    reader, pcscd = look(system, "nfc readers")
     assert "held by another program" in reader.why
     assert (pcscd.result, "systemctl stop pcscd" in pcscd.fix) == ("warning", True)
 
 
-def test_other_usb_devices_are_none_of_ours(place: Place) -> None:
-    plug_in(place, 0x1D6B, 0x0002)
-    assert [finding.result for finding in look(place, "nfc readers")] == ["skipped"]
+def test_other_usb_devices_are_none_of_ours(system: System) -> None:
+    plug_in(system, 0x1D6B, 0x0002)
+    assert [finding.result for finding in look(system, "nfc readers")] == ["skipped"]
 
 
-def test_serial_ports_are_listed(place: Place) -> None:
-    place.at("/dev").mkdir()
-    place.at("/dev/ttyUSB0").touch()
-    (ports,) = look(place, "serial ports")
+def test_serial_ports_are_listed(system: System) -> None:
+    system.at("/dev").mkdir()
+    system.at("/dev/ttyUSB0").touch()
+    (ports,) = look(system, "serial ports")
     assert (ports.result, "ttyUSB0" in ports.why) == ("ok", True)
-    place.at("/dev/ttyACM0").symlink_to("gone")  # as good as closed, also to root
-    (ports,) = look(place, "serial ports")
+    system.at("/dev/ttyACM0").symlink_to("gone")  # as good as closed, also to root
+    (ports,) = look(system, "serial ports")
     assert (ports.result, "dialout" in ports.fix) == ("warning", True)
 
 
@@ -184,17 +184,17 @@ def test_serial_ports_are_listed(place: Place) -> None:
         ("tty:NONE7:pn532", ""),
     ],
 )
-def test_a_reader_that_was_asked_for_and_does_not_open_is_exit_5(place: Place, path: str, words: str) -> None:
-    asked = Place(place.home, nfc=path, system=place.system, workspace=place.workspace)
+def test_a_reader_that_was_asked_for_and_does_not_open_is_exit_5(system: System, path: str, words: str) -> None:
+    asked = System(system.home, nfc=path, root=system.root, workspace=system.workspace)
     (reader,) = look(asked, "nfc")
     assert (reader.result, words in reader.why) == ("failed", True)
     assert reader.fix
     assert exit_code([("link", reader)]) == 5
 
 
-def test_an_empty_simulated_reader_says_how_to_put_a_node_on_it(place: Place) -> None:
+def test_an_empty_simulated_reader_says_how_to_put_a_node_on_it(system: System) -> None:
     path = free_reader()
-    (reader,) = look(Place(place.home, nfc=path, system=place.system), "nfc")
+    (reader,) = look(System(system.home, nfc=path, root=system.root), "nfc")
     assert (reader.result, f"--nfc {path}" in reader.fix) == ("warning", True)
 
 
@@ -202,33 +202,33 @@ def test_an_empty_simulated_reader_says_how_to_put_a_node_on_it(place: Place) ->
 
 
 @pytest.mark.parametrize(("flags", "result"), [("0x40081", "ok"), ("0x40080", "warning")])
-def test_a_can_interface_of_the_kernel_is_up_or_gets_its_command(place: Place, flags: str, result: str) -> None:
+def test_a_can_interface_of_the_kernel_is_up_or_gets_its_command(system: System, flags: str, result: str) -> None:
     for name, kind in (("can0", "280"), ("eth0", "1")):
-        folder = place.at(f"/sys/class/net/{name}")
+        folder = system.at(f"/sys/class/net/{name}")
         folder.mkdir(parents=True)
         (folder / "type").write_text(kind + "\n")
         (folder / "flags").write_text(flags + "\n")
-    (interface,) = look(place, "can interfaces")
+    (interface,) = look(system, "can interfaces")
     assert (interface.name, interface.result) == ("can can0", result)
     assert ("ip link set can0 up type can bitrate 500000" in interface.fix) is (result == "warning")
 
 
-def test_frames_of_a_simulated_bus_come_back(place: Place) -> None:
-    (loopback,) = look(place, "can loopback")
+def test_frames_of_a_simulated_bus_come_back(system: System) -> None:
+    (loopback,) = look(system, "can loopback")
     assert (loopback.result, loopback.fix) == ("ok", "")
 
 
 @pytest.mark.parametrize("spec", ["socketcan:can99", "nonsense", "nosuch:can0", "socketcand:can0?port=1"])
-def test_a_bus_that_was_asked_for_and_does_not_open_is_exit_5(place: Place, spec: str) -> None:
-    asked = Place(place.home, can=spec, system=place.system)
+def test_a_bus_that_was_asked_for_and_does_not_open_is_exit_5(system: System, spec: str) -> None:
+    asked = System(system.home, can=spec, root=system.root)
     (bus,) = look(asked, "can")
     assert bus.result == "failed"
     assert bus.fix
 
 
-def test_a_bus_that_was_asked_for_opens(place: Place) -> None:
+def test_a_bus_that_was_asked_for_opens(system: System) -> None:
     spec = free_bus()
-    (bus,) = look(Place(place.home, can=spec), "can")
+    (bus,) = look(System(system.home, can=spec), "can")
     assert (bus.result, bus.why) == ("ok", f"{spec.partition('?')[0]} opens.")
 
 
@@ -242,7 +242,7 @@ def test_the_versions_asked_for_are_those_of_the_project() -> None:
     assert {name: declared[name] for name in doctor_machine._LIBRARIES} == doctor_machine._LIBRARIES
 
 
-def test_a_missing_an_old_and_a_shadowing_library_are_told(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_an_old_and_a_shadowing_library_are_told(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     real = metadata.version
 
     def version(name: str) -> str:
@@ -251,14 +251,14 @@ def test_a_missing_an_old_and_a_shadowing_library_are_told(place: Place, monkeyp
         return {"nfcpy": "0.13.5", "ndef": "0.2"}.get(name) or real(name)
 
     monkeypatch.setattr(metadata, "version", version)
-    libraries, ndeflib = look(place, "libraries")
+    libraries, ndeflib = look(system, "libraries")
     assert libraries.result == "failed"
     assert "msgpack is missing, nfcpy 0.13.5 (needs 1.0.4)" in libraries.why
     assert libraries.fix == f"{sys.executable} -m pip install 'nfcpy>=1.0.4' 'msgpack>=1.0'"
     assert (ndeflib.result, "pip uninstall --yes ndef" in ndeflib.fix) == ("failed", True)
 
 
-def test_a_clock_that_went_back_is_told(stationed: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_went_back_is_told(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
     assert look(stationed, "clock")[0].result == "ok"
     monkeypatch.setattr("teds_provision.store.audit.utc_now", lambda: "2099-01-01T00:00:00Z")
     with Store.open(stationed.home) as store:
@@ -268,30 +268,30 @@ def test_a_clock_that_went_back_is_told(stationed: Place, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(("ahead", "result"), [(0, "ok"), (86_000, "warning")])
-def test_a_hardware_clock_that_differs_is_told(place: Place, ahead: int, result: str) -> None:
-    clock = place.at("/sys/class/rtc/rtc0/since_epoch")
+def test_a_hardware_clock_that_differs_is_told(system: System, ahead: int, result: str) -> None:
+    clock = system.at("/sys/class/rtc/rtc0/since_epoch")
     clock.parent.mkdir(parents=True)
     clock.write_text(f"{int(time.time()) + ahead}\n")
-    assert look(place, "clock")[0].result == result
+    assert look(system, "clock")[0].result == result
 
 
-def test_a_check_that_breaks_is_a_finding_and_the_others_run(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(place: Place) -> Iterator[Finding]:
+def test_a_check_that_breaks_is_a_finding_and_the_others_run(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(system: System) -> Iterator[Finding]:
         raise OSError("a library fell over")
         yield
 
-    list(examine(place))
+    list(examine(system))
     monkeypatch.setitem(registry.CHECKS, "clock", ("machine", broken))
-    found = by_name(place)
+    found = by_name(system)
     assert (found["clock"].result, "fell over" in found["clock"].why) == ("failed", True)
     assert "keys folder" in found
-    assert exit_code(list(examine(place))) == 1
+    assert exit_code(list(examine(system))) == 1
 
 
 # -- the station -------------------------------------------------------------------------------------------------------
 
 
-def test_a_healthy_station_has_nothing_that_failed(stationed: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_healthy_station_has_nothing_that_failed(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={stationed.home}/no-bus")
     found = by_name(stationed)
     for name in ("home", "store", "audit log", "backup", "lock", "disk"):
@@ -300,7 +300,7 @@ def test_a_healthy_station_has_nothing_that_failed(stationed: Place, monkeypatch
     assert (found["vault"].result, "cheaply" in found["vault"].why) == ("warning", True)
 
 
-def test_a_home_open_to_others_gets_its_chmod(stationed: Place) -> None:
+def test_a_home_open_to_others_gets_its_chmod(stationed: System) -> None:
     stationed.home.chmod(0o777)
     assert [(one.result, one.fix) for one in look(stationed, "home")] == [("failed", f"chmod 700 {stationed.home}")]
     stationed.home.chmod(0o755)
@@ -310,7 +310,7 @@ def test_a_home_open_to_others_gets_its_chmod(stationed: Place) -> None:
     assert f"chmod 600 {stationed.home / 'vault.json'}" in files.fix
 
 
-def test_a_damaged_store_and_a_broken_chain_are_exit_7(stationed: Place) -> None:
+def test_a_damaged_store_and_a_broken_chain_are_exit_7(stationed: System) -> None:
     with closing(sqlite3.connect(stationed.home / "store.sqlite3")) as connection, connection:
         connection.execute("DROP TRIGGER audit_is_never_changed")
         connection.execute("UPDATE audit SET outcome = 'x'")
@@ -325,7 +325,7 @@ def test_a_damaged_store_and_a_broken_chain_are_exit_7(stationed: Place) -> None
     assert exit_code(found) == 7
 
 
-def test_who_holds_the_store_is_named(stationed: Place) -> None:
+def test_who_holds_the_store_is_named(stationed: System) -> None:
     with StoreLock(stationed.home, command="provision"):
         lock = next(one for one in look(stationed, "store") if one.name == "lock")
     assert lock.result == "warning"
@@ -334,13 +334,13 @@ def test_who_holds_the_store_is_named(stationed: Place) -> None:
     assert (lock.result, lock.why) == ("ok", "Nobody holds the store.")
 
 
-def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: Place) -> None:
+def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: System) -> None:
     (stationed.home / "vault.json").unlink()
     vault = by_name(stationed)["vault"]
     assert (vault.result, "restore" in vault.fix) == ("failed", True)
 
 
-def test_nodes_without_a_backup_are_a_warning(stationed: Place) -> None:
+def test_nodes_without_a_backup_are_a_warning(stationed: System) -> None:
     with Store.open(stationed.home) as store:
         store.put_node(NodeRecord(bytes(10)))
     backup = next(one for one in look(stationed, "store") if one.name == "backup")
@@ -350,7 +350,7 @@ def test_nodes_without_a_backup_are_a_warning(stationed: Place) -> None:
     assert next(one for one in look(stationed, "store") if one.name == "backup").result == "ok"
 
 
-def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={stationed.home}/no-bus")
     with Store.open(stationed.home) as store:
         store.put_facts(Facts("bench", "keyring"))
@@ -360,7 +360,7 @@ def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: Place, monkeypa
     assert "null" in by_name(stationed)["keyring"].why
 
 
-def test_a_token_whose_module_is_missing_is_a_failure(stationed: Place) -> None:
+def test_a_token_whose_module_is_missing_is_a_failure(stationed: System) -> None:
     with Store.open(stationed.home) as store:
         store.put_facts(Facts("bench", "pkcs11:token=bench?module-path=/nowhere/module.so"))
     vault = by_name(stationed)["vault"]
@@ -387,14 +387,14 @@ def private_keys() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", ["pkcs8.pem", "sec1.pem", "pkcs8.der", "sec1.der", "ssh", "key.jwk"])
-def test_a_private_key_in_the_keys_folder_is_found_in_every_form(place: Place, name: str) -> None:
-    folder = place.workspace / "keys" / "stations"
+def test_a_private_key_in_the_keys_folder_is_found_in_every_form(system: System, name: str) -> None:
+    folder = system.workspace / "keys" / "stations"
     folder.mkdir(parents=True)
     (folder / "bench.pem").write_text(to_pem(SoftwareKey.generate().point))
     (folder.parent / "README.md").write_text("Public keys only.\n")
-    assert look(place, "keys folder")[0].result == "ok"
+    assert look(system, "keys folder")[0].result == "ok"
     (folder / name).write_bytes(private_keys()[name])
-    (keys,) = look(place, "keys folder")
+    (keys,) = look(system, "keys folder")
     assert (keys.result, f"keys/stations/{name}" in keys.why) == ("failed", True)
 
 
@@ -407,33 +407,33 @@ def test_the_keys_folder_of_this_project_holds_no_private_key() -> None:
 # -- the fleet ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_broken_config_is_told_and_the_rest_is_still_looked_at(stationed: Place) -> None:
+def test_a_broken_config_is_told_and_the_rest_is_still_looked_at(stationed: System) -> None:
     (stationed.home / "config.toml").write_text("home = [")
     found = by_name(stationed)
     assert (found["config"].result, found["store"].result) == ("failed", "ok")
     assert "not valid TOML" in found["config"].why
 
 
-def test_keys_that_no_command_knows_are_named(stationed: Place) -> None:
+def test_keys_that_no_command_knows_are_named(stationed: System) -> None:
     known = {"": frozenset({"via", "no-input"}), "provision": frozenset({"profile", "yes"})}
-    place = replace(stationed, settings=known)
+    system = replace(stationed, settings=known)
     (stationed.home / "config.toml").write_text("via = 'nfc'\nno_input = true\n[provision]\nprofile = 'x'\n")
-    assert by_name(place)["config"].result == "ok"
+    assert by_name(system)["config"].result == "ok"
     (stationed.home / "config.toml").write_text("vai = 'nfc'\n[provision]\nprofle = 'x'\n[provisoin]\n")
-    config = by_name(place)["config"]
+    config = by_name(system)["config"]
     assert (config.result, all(word in config.why for word in ("vai", "provision.profle", "[provisoin]"))) == (
         "failed",
         True,
     )
 
 
-def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: Place) -> None:
+def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: System) -> None:
     (stationed.home / "store.sqlite3").unlink()
     found = by_name(stationed)["store file"]
     assert (found.result, "restore" in found.fix) == ("failed", True)
 
 
-def test_what_waits_for_somebody_is_told(stationed: Place) -> None:
+def test_what_waits_for_somebody_is_told(stationed: System) -> None:
     assert look(stationed, "nodes")[0].result == "ok"
     with Store.open(stationed.home) as store:
         for number in range(3):
@@ -448,12 +448,12 @@ def test_what_waits_for_somebody_is_told(stationed: Place) -> None:
         assert word in why
 
 
-def test_seals_are_checked_where_the_passphrase_is_given(stationed: Place) -> None:
+def test_seals_are_checked_where_the_passphrase_is_given(stationed: System) -> None:
     assert look(stationed, "seals")[0].result == "skipped"
     forget_vaults()
-    place = replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
-    assert look(place, "seals")[0].result == "ok"
+    system = replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
+    assert look(system, "seals")[0].result == "ok"
     with Store.open(stationed.home) as store:
         store.put_whitelist(WhitelistEntry(bytes(10), "ab" * 32))
-    found = look(place, "seals")[0]
+    found = look(system, "seals")[0]
     assert (found.result, bytes(10).hex() in found.why) == ("failed", True)

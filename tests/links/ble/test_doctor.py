@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.doctor import links
-from teds_provision.doctor.registry import Finding, Place
+from teds_provision.doctor.registry import Finding, System
 from teds_provision.links.ble.port import BlePort
 
 from .radio import Radio, needs_dbus
@@ -16,14 +16,14 @@ from .radio import Radio, needs_dbus
 Air = Callable[..., Radio]
 
 
-def place(tmp_path: Path, bus: str = "", ble: str | None = None) -> Place:
+def system(tmp_path: Path, bus: str = "", ble: str | None = None) -> System:
     system = tmp_path / "system"
     system.mkdir(exist_ok=True)
     environment = {"DBUS_SYSTEM_BUS_ADDRESS": bus} if bus else {}
-    return Place(tmp_path / "home", ble=ble, system=system, environment=environment)
+    return System(tmp_path / "home", ble=ble, root=system, environment=environment)
 
 
-def switch(there: Place, kind: str, *, soft: int = 0, hard: int = 0) -> list[Finding]:
+def switch(there: System, kind: str, *, soft: int = 0, hard: int = 0) -> list[Finding]:
     (there.at("/sys/class/bluetooth/hci0")).mkdir(parents=True, exist_ok=True)
     folder = there.at(f"/sys/class/rfkill/rfkill{kind}")
     folder.mkdir(parents=True)
@@ -33,25 +33,25 @@ def switch(there: Place, kind: str, *, soft: int = 0, hard: int = 0) -> list[Fin
 
 
 def test_switches_are_read_from_the_kernel(tmp_path: Path) -> None:
-    assert [each.result for each in links.switches(place(tmp_path))] == ["skipped"]
-    assert [each.result for each in switch(place(tmp_path), "wlan", soft=1)] == ["ok"]
-    (soft,) = switch(place(tmp_path), "bluetooth", soft=1)
+    assert [each.result for each in links.switches(system(tmp_path))] == ["skipped"]
+    assert [each.result for each in switch(system(tmp_path), "wlan", soft=1)] == ["ok"]
+    (soft,) = switch(system(tmp_path), "bluetooth", soft=1)
     assert (soft.result, soft.fix) == ("warning", "rfkill unblock bluetooth")
 
 
 def test_a_switch_of_the_machine_is_named(tmp_path: Path) -> None:
-    (hard,) = switch(place(tmp_path), "bluetooth", soft=1, hard=1)
+    (hard,) = switch(system(tmp_path), "bluetooth", soft=1, hard=1)
     assert "switch" in hard.fix
 
 
 def test_no_bus_is_a_failure_only_where_ble_was_asked_for(tmp_path: Path) -> None:
     nowhere = f"unix:path={tmp_path}/nothing"
-    (quiet,) = links.bluetooth(place(tmp_path, nowhere))
-    (asked,) = links.bluetooth(place(tmp_path, nowhere, ble="auto"))
+    (quiet,) = links.bluetooth(system(tmp_path, nowhere))
+    (asked,) = links.bluetooth(system(tmp_path, nowhere, ble="auto"))
     assert (quiet.result, quiet.fix) == ("skipped", "")
     assert asked.result == "failed"
     assert "systemctl start bluetooth" in asked.fix
-    (wrong,) = links.bluetooth(place(tmp_path, nowhere, ble="hci0?speed=3"))
+    (wrong,) = links.bluetooth(system(tmp_path, nowhere, ble="hci0?speed=3"))
     assert "no option" in wrong.why
 
 
@@ -63,7 +63,7 @@ def test_adapters_as_bluetoothd_has_them(
     radio = air(1)
 
     def look(ble: str | None = "auto") -> Finding:
-        (found,) = links.bluetooth(place(tmp_path, radio.address, ble))
+        (found,) = links.bluetooth(system(tmp_path, radio.address, ble))
         return found
 
     assert look().result == "ok"

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.doctor import links as doctor
-from teds_provision.doctor.registry import Place
+from teds_provision.doctor.registry import System
 from teds_provision.errors import LinkFailure, UsageFailure
 from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame
@@ -188,8 +188,8 @@ def test_the_doctor_names_another_station_of_our_address_with_its_cure(hub: Hub,
     thread = threading.Thread(target=talk)
     thread.start()
     try:
-        (found,) = list(doctor.can(Place(tmp_path, can=hub.spec)))
-        (other,) = list(doctor.can(Place(tmp_path, can=hub.spec + "&source=0xF2")))
+        (found,) = list(doctor.can(System(tmp_path, can=hub.spec)))
+        (other,) = list(doctor.can(System(tmp_path, can=hub.spec + "&source=0xF2")))
     finally:
         stop.set()
         thread.join()
