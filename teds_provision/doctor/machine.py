@@ -28,7 +28,6 @@ _LIBRARIES: Final = {
     "can-isotp": "2.0.6",
     "msgpack": "1.0",
     "keyring": "25.2",
-    "pint": "0.24",
     "numpy": "1.26",
     "defusedxml": "0.7.1",
 }

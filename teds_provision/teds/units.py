@@ -2,7 +2,7 @@
 
 ``parse_unit("degC")`` gives the exponents that go into a TEDS together with scale and offset into SI;
 ``format_units`` gives the way back. The units people use every day stand in a table here, so that building a datasheet
-need not load ``pint`` (0.4 s); every other spelling goes to ``pint``. The tests hold the table against ``pint``.
+and their products need not load ``pint`` (0.4 s); rare ones go to it (extra ``units``). The tests hold both against it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData
+from teds_provision.lazy import how_to_install
 from teds_provision.limits import LIMITS
 from teds_provision.teds.codec.model import UNIT_PARTS, Units
 
@@ -235,7 +236,7 @@ def parse_unit(text: str) -> WrittenUnit:
         return WrittenUnit(text, NAMED[name], scale, offset)
     if not text:
         raise _unknown(text)
-    return _ratio(text) or _by_pint(text)
+    return _ratio(text) or _compound(text) or _by_pint(text)
 
 
 def parse_units(text: str) -> Units:
@@ -267,10 +268,50 @@ _PLAIN_UNIT: Final = re.compile(
 )
 
 
-@cache
-def _registry() -> pint.UnitRegistry[Any]:
-    import pint
+_FACTOR: Final = re.compile(
+    r"\s*(?P<sign>[*·/]?)\s*(?P<name>1|°?[^\W\d_²³¹⁰⁴-⁹]+)\s*(?:(?:\^|\*\*)(?P<power>-?[0-9]{1,2}(?:\.5)?)|(?P<upper>⁻?[¹²³]))?(?=\s|[*·/)]|\Z)"
+)
+_UPPER: Final = str.maketrans("⁻¹²³", "-123")
 
+
+def _compound(text: str) -> WrittenUnit | None:
+    """Products and quotients of units of our own table, from left to right; None where it is anything else."""
+    upper, slash, lower = text.partition("/(")
+    if slash and (not lower.endswith(")") or "/" in lower):  # one denominator in brackets, and nothing after it
+        return None
+    factors: list[tuple[re.Match[str], int]] = []
+    for part, side in ((upper, 1), (lower[:-1], -1)) if slash else ((upper, 1),):
+        at = 0
+        while at < len(part):
+            match = _FACTOR.match(part, at)
+            if match is None or (at == 0 and match["sign"]):
+                return None
+            factors.append((match, -side if match["sign"] == "/" else side))
+            at = match.end()
+    out, scale = dict.fromkeys(UNIT_PARTS, Fraction(0)), 1.0
+    for match, side in factors:
+        name = match["name"]
+        named = TABLE.get(name)
+        if named is None and name not in NAMED and name != "1":
+            return None
+        units = Units() if name == "1" else NAMED[name if named is None else named[0]]
+        power = side * Fraction(match["power"] or (match["upper"] or "1").translate(_UPPER))
+        if units.interpretation != PRODUCT:
+            return None
+        for base in UNIT_PARTS:
+            out[base] += power * getattr(units, base)
+        if named is not None:  # its offset is left out: in a product a temperature is a difference
+            scale *= named[1] ** float(power)
+    _representable(text, out)
+    return WrittenUnit(text, from_exponents(PRODUCT, out), scale)
+
+
+@cache
+def _registry() -> pint.UnitRegistry[Any] | None:
+    try:
+        import pint
+    except ImportError:
+        return None
     return pint.UnitRegistry()
 
 
@@ -278,6 +319,12 @@ def _by_pint(text: str) -> WrittenUnit:
     if _PLAIN_UNIT.fullmatch(text) is None:
         raise _unknown(text)
     registry = _registry()
+    if registry is None:
+        unknown = _unknown(text)
+        raise BadData(
+            f"{unknown.message[:-1]} that is known without the package pint.",
+            hint=f"{unknown.hint} A rare unit needs pint. {how_to_install('units')}",
+        )
     try:
         parsed = registry.parse_units(text)
         scale = registry.Quantity(1.0, parsed).to_root_units()

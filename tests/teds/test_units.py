@@ -111,6 +111,35 @@ def test_the_table_agrees_with_pint() -> None:
         ), text
 
 
+@pytest.mark.parametrize(
+    "form",
+    ["{}*{}", "{}/{}", "{}·{}", "{} {}", "{}**3/{}", "{}^-1/{}", "{}²/{}**2", "1/{}/{}", "K/({}*{})", "{}/{}**0.5"],
+)
+def test_products_of_the_table_agree_with_pint(form: str) -> None:
+    """A stride through all pairs: what is computed here is what the whole of pint says."""
+    names = [name for name in [*u.TABLE, *u.NAMED] if name.isalpha() and name not in {"rev", "Nm", "mNm", "gn"}]
+    for first, second in zip(names, names[7:] + names[:7], strict=True):
+        text = form.format(first, second)
+        ours = u._compound(text)
+        if ours is None:  # a ratio, a count
+            continue
+        by_pint = u._by_pint(text)
+        assert (ours.units, ours.scale, ours.offset) == (by_pint.units, pytest.approx(by_pint.scale), 0.0), text
+
+
+@pytest.mark.parametrize("text", ["N/mm", "kg/m**3", "W/(m*K)", "1/K", "degC/min", "m/s³"])
+def test_products_need_no_pint(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setattr(u, "_registry", lambda: None)
+    assert u.parse_unit(text).units.interpretation == u.PRODUCT
+
+
+def test_a_rare_unit_without_pint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(u, "_registry", lambda: None)
+    with pytest.raises(BadData, match="without the package pint") as caught:
+        u.parse_unit("furlong/fortnight")
+    assert "teds-provision[units]" in caught.value.hint
+
+
 @pytest.mark.parametrize("text", ["newtn", "degree celsius of", "", "3 +", "USD", "m**0.3", "m/", "]["])
 def test_what_is_no_unit_is_refused_with_its_text_and_a_cure(text: str) -> None:
     with pytest.raises(BadData) as caught:
