@@ -357,6 +357,7 @@ def confirm_other_link(probe: Probe) -> str:
 @rule("confirm-newest", "Key agreement", Stage.AGREEMENT)
 def confirm_newest(probe: Probe) -> str:
     """What pends goes at a new good Request: the tagS of the one before gets 12."""
+    tapped_or_bus(probe)
     first, _ = agree(probe)
     if probe.keep is not None:  # a node that takes it shall not be lost
         probe.keep(first)

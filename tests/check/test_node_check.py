@@ -162,6 +162,19 @@ def test_a_reply_that_is_torn_each_time_is_the_nodes_fault(station: Station, via
     assert all(("very bad bus" in check.detail) == (via == "can") for check in torn.values())
 
 
+def test_a_good_node_with_nfc_that_is_checked_over_its_bus_fails_no_rule(station: Station) -> None:
+    """Its Request is for a tap: "confirm-newest" called that a broken rule."""
+
+    class Untapped(FaultyLink):
+        def reference(self, octets: bytes) -> bytes:
+            return self.board.tim.handle(octets, link=self.name, tapped=False)
+
+    report = check_node(station, talk(board := Board(), Untapped(board, via="can")), factory=True)
+    assert not names(report, "failed")
+    assert {"agreement", "confirm-newest"} <= names(report, "skipped")
+    assert board.state.state == NodeState.FACTORY
+
+
 def test_a_board_that_refuses_what_it_announces_fails_and_is_not_skipped(
     station: Station, patch: pytest.MonkeyPatch
 ) -> None:

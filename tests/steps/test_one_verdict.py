@@ -128,6 +128,21 @@ def test_a_kept_image_that_lacks_a_teds_of_field_108_is_none(station: Station, b
 # -- kept, and read again --------------------------------------------------------------------------------------------
 
 
+def test_a_kept_image_stands_for_no_row_but_the_one_that_was_read_of_it_in_a_session(
+    station: Station, board: Board
+) -> None:
+    row = station.nodes.reading(board.uuid)
+    assert row is not None
+    other = row.digests[:-1] + bytes([row.digests[-1] ^ 1])
+    for changed in (replace(row, digests=other), replace(row, c=None)):
+        station._store.drop_reading(board.uuid)
+        assert station._store.put_reading(changed)
+        found = looked(station, board)
+        assert not found.kept, "all of it was read"
+        assert (found.verified.verdict, found.judged.origin) == ("authentic", "session")
+        assert shown(station, board) == ("authentic", "session")
+
+
 def test_in_the_same_power_up_nothing_is_read_again(station: Station, board: Board) -> None:
     link = over_the_bus(board)
     with talk(board, link) as node:
