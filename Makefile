@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage mutants api test-other vectors-c sbom firmware firmware-arm clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage mutants api test-other vectors-c sbom firmware firmware-arm room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -134,9 +134,13 @@ api: $(VENV)/.dev
 test-other:
 	@$(MAKE) --no-print-directory unit VENV=.venv-$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 
-# The figures of the house: circles, late imports, complexity, drawers, lines.
+# The figures of the house: circles, late imports, complexity, full folders, lines.
 house: $(VENV)/.dev
 	$(BIN)/python scripts/house.py
+
+# The tests of a room and of the rooms that import it: make room ROOM=store
+room: $(VENV)/.dev
+	$(BIN)/python -m pytest -n 2 --dist worksteal --hypothesis-profile gate -m '$(USUAL)' $$($(BIN)/python scripts/room.py $(ROOM))
 
 # The model of a key's life, by SPIN: the rules hold, each broken one is found.
 model: $(VENV)/.made
