@@ -1,7 +1,9 @@
-"""How much of the house a factory node passes through: modules entered by its ``provision``, own functions called.
+"""How much of the house a task passes through: modules entered by each of five verbs, own functions called.
 
 ``python -m benchmarks.entered``; `make house` prints its last line. One node over NFC in a process of its own is
-provisioned in this one, from the look for a tag to the verdict; only calls of functions of ours are counted.
+provisioned in this one, from the look for a tag to the verdict. Then ``identify``, ``verify``, ``measure`` and
+``export-keys`` run whole, from their words to their exit code, against a node on a CAN bus. Only calls of functions of
+ours are counted.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from inspect import CO_OPTIMIZED
 from pathlib import Path
 from types import FrameType
@@ -26,6 +28,11 @@ from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from teds_provision.vault.passphrase import THROWAWAY
+from tests.bench import PASSPHRASE, make_station
+from tests.cli.shell import call
+from tests.e2e.desk import ANGLE
+from tests.handover.desk import trust
+from tests.measure.hall import Hall
 
 PACKAGE = str(Path(__file__).resolve().parent.parent / "teds_provision")
 
@@ -70,8 +77,37 @@ def _quiet(_notice: Notice) -> None:
     return None
 
 
+def verbs(folder: Path) -> Iterator[tuple[str, Counter[str]]]:
+    """Run each verb on a station with one provisioned node on its bus, and count."""
+    folder.mkdir()
+    hall = Hall(folder, {"a": ANGLE})
+    try:
+        home = hall.station.home
+        with (
+            closing(make_station(folder / "other", "other")) as other,
+            closing(Station.open(home, ask=lambda *_: PASSPHRASE)) as own,
+        ):
+            trust(own, other, "other")
+        hall.nodes["a"].start()
+        uuid, link = hall.nodes["a"].uuid, ("--can", hall.can, "--via", "can")
+        told: tuple[tuple[object, ...], ...] = (
+            ("identify", *link),
+            ("verify", uuid, *link),
+            ("measure", uuid, "--duration", "1", *link),
+            ("export-keys", "--to", "other", uuid, "--output", folder / "keys.jwe", "--yes"),
+        )
+        for words in told:
+            calls: Counter[str] = Counter()
+            with counted(calls):
+                done = call(home, "--json", *words)
+            assert done.code == 0, done
+            yield str(words[0]), calls
+    finally:
+        hall.close()
+
+
 def main() -> None:
-    """Provision, count, tell."""
+    """Provision and run the verbs, count, tell."""
     secret = secrets.token_hex(8)
     calls: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -80,6 +116,8 @@ def main() -> None:
         )
         provision_one(station, calls)
         station.close()
+        for verb, entered in verbs(Path(folder) / "verbs"):
+            print(f"{verb:12} {len(entered):4} modules entered, {entered.total()} own functions called")
     for file, count in calls.most_common(10):
         print(f"{count:6} {Path(file).relative_to(PACKAGE)}")
     print(f"{len(calls)} modules entered, {calls.total()} own functions called")
