@@ -200,8 +200,8 @@ def set_value(
     stop = threading.Event()
     links = over_the_bus(links)
     with (
-        measure.sources.beside(station, links, f"set {uuid.hex()}"),
-        trusted_node(app, station, links, uuid, by="set") as trusted,
+        measure.sources.beside(station, links, f"set {uuid.hex()}") as own,
+        trusted_node(app, station, own, uuid, by="set") as trusted,
         ending(stop),
     ):
         actuator = measure.held_actuator.HeldActuator(trusted, channel, unit=unit, dead_man=dead_man)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 
 from teds_provision.errors import AddressConflict, StoreLocked
 from teds_provision.links import LinkSettings
@@ -26,14 +27,16 @@ _MASK = 0x1FFF0000
 
 @contextmanager
 def sole_user(station: Station, ports: Sequence[CanPort], command: str) -> Iterator[None]:
-    """Use the source addresses of these ports alone.
+    """Use the source addresses of these ports alone; where none was named, each takes the next one that is free.
 
-    Raises StoreLocked (7) where another process of this home has one, and names it; AddressConflict (5) where another
-    machine is heard to measure under it.
+    Raises StoreLocked (7) where another process of this home has the one that was named, and names it; AddressConflict
+    (5) where another machine is heard to measure under it.
     """
     with ExitStack() as stack:
         for port in ports:
-            mark = _enter(stack, station, port.spec, command, shared=False)
+            mark, source = _enter(stack, station, port.spec, command, shared=False)
+            if source != port.spec.source:
+                port.use_source(source)
             # After a process that was killed its nodes still send to us, for a lease: nobody else is behind that.
             if not mark.left_behind:
                 _require_alone(port)
@@ -41,26 +44,45 @@ def sole_user(station: Station, ports: Sequence[CanPort], command: str) -> Itera
 
 
 @contextmanager
-def beside(station: Station, links: LinkSettings, command: str) -> Iterator[None]:
+def beside(station: Station, links: LinkSettings, command: str) -> Iterator[LinkSettings]:
     """Have short sessions from the source address of ``links``, beside others who do; over a reader there is none.
 
-    Raises StoreLocked (7) where a measurement has the address.
+    Gives the links with the address in them: the next free one where none was named and a measurement has it. Raises
+    StoreLocked (7) where a measurement has the one that was named.
     """
-    wheres = [place.removeprefix("can:") for place in links.places] if links.via == "can" else []
+    if links.via != "can":
+        yield links
+        return
     with ExitStack() as stack:
-        for where in wheres:
-            _enter(stack, station, parse_spec(where), command, shared=True)
-        yield
+        wheres = []
+        for place in links.places:
+            where = place.removeprefix("can:")
+            spec = parse_spec(where)
+            _, source = _enter(stack, station, spec, command, shared=True)
+            word = "" if spec.source_named else f"{'&' if '?' in where else '?'}source=0x{source:02X}"
+            wheres.append(where + word)
+        yield replace(links, can=tuple(wheres))
 
 
-def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, shared: bool) -> Mark:
-    try:
-        return stack.enter_context(station.measurements.source(spec.wire, spec.source, command=command, shared=shared))
-    except Taken as taken:
+def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, shared: bool) -> tuple[Mark, int]:
+    """Hold the mark of the first source address that is free; gives both."""
+    first: Taken | None = None
+    for source in spec.sources:
+        mark = station.measurements.source(spec.wire, source, command=command, shared=shared)
+        try:
+            return stack.enter_context(mark), source
+        except Taken as taken:
+            first = first or taken
+    assert first is not None
+    if not spec.source_named:
         raise StoreLocked(
-            f"Source address 0x{spec.source:02X} on {spec.text} is in use by {taken.holder}.",
-            hint=f"Add source={_another(spec.source)} to --can, or end that process.",
-        ) from taken
+            f"Every source address on {spec.text} is in use, 0x{spec.source:02X} by {first.holder}.",
+            hint="End one of those processes.",
+        ) from first
+    raise StoreLocked(
+        f"Source address 0x{spec.source:02X} on {spec.text} is in use by {first.holder}.",
+        hint=f"Add source={_another(spec.source)} to --can, or leave source= out, or end that process.",
+    ) from first
 
 
 def _another(source: int) -> str:

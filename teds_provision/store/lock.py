@@ -168,6 +168,11 @@ class Mark(_HeldFile):
         """Whether somebody holds it now, alone or shared."""
         return _held_by(self._path) is not None
 
+    @property
+    def is_taken_alone(self) -> bool:
+        """Whether somebody holds it now who shares it with nobody."""
+        return _held_by(self._path, shared=True) is not None
+
 
 class Taken(StoreLocked):
     """Somebody else holds a :class:`Mark`; ``holder`` names the process."""
@@ -186,13 +191,13 @@ def holder_of(home: Path) -> str | None:
     return _held_by(home / FILE_NAME)
 
 
-def _held_by(path: Path) -> str | None:
+def _held_by(path: Path, *, shared: bool = False) -> str | None:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:
         return None
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return _holder(descriptor)
     finally:

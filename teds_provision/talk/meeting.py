@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from teds_provision.errors import AddressConflict, NoReader, StoreLocked, TedsProvisionError, UsageFailure
 from teds_provision.links import Contact, LinkSettings, Notice, open_place, open_port, open_ports
@@ -19,6 +19,9 @@ from teds_provision.station.station import Station
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.progress import Reporter
+
+if TYPE_CHECKING:
+    from teds_provision.links.can.port import CanPort
 
 _SHOWN = 5
 
@@ -81,14 +84,20 @@ def likely_address(station: Station, uuid: bytes) -> int:
 
 
 def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
-    """Raise StoreLocked where a process of this station measures the node from the same source address.
+    """Keep off the source address from which a process of this station measures the node.
 
-    A session belongs to a pair of addresses: another one from here would end that one's.
+    A session belongs to a pair of addresses: another one from here would end that one's. Where none was named the next
+    free one is taken; raises StoreLocked where one was, or none is free.
     """
-    spec = getattr(port, "spec", None)
-    if spec is None or port.via != "can" or not station.measurements.is_running(uuid):
+    if port.via != "can" or not hasattr(port, "spec") or not station.measurements.is_running(uuid):
         return
-    if station.measurements.source(spec.wire, spec.source).is_taken:
+    bus = cast("CanPort", port)
+    spec = bus.spec
+    if station.measurements.source(spec.wire, spec.source).is_taken_alone:
+        for source in spec.sources:
+            if not station.measurements.source(spec.wire, source).is_taken_alone:
+                bus.use_source(source)
+                return
         other = 0xF2 if spec.source == 0xF1 else 0xF1
         raise StoreLocked(
             f"Node {uuid.hex()} is being measured from source address 0x{spec.source:02X}.",

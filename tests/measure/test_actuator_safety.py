@@ -26,7 +26,7 @@ from tests.links.can.hub import Hub
 from tests.measure.hall import Hall, events
 from tests.measure.sinks.test_ros1 import Master, master  # noqa: F401  the fixture
 from tests.measure.sinks.test_ros1 import pytestmark as what_ros_needs
-from tests.ncap.service import Service, verified
+from tests.ncap.service import Service, verdict, verified
 from tests.pace import PATIENCE, until
 from tests.places import ros_domain
 
@@ -376,7 +376,7 @@ def held(hall: Hall, *words: object) -> Iterator[Service]:
     hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
     service = Service(hall.desk, hall.station).start(*words)
     uuid = hall.nodes["g"].uuid
-    assert verified(service, uuid)["verdict"] == "authentic"
+    assert verdict(verified(service, uuid)) == "authentic"
     with service.client() as asked:
         asked.request("PUT", f"/nodes/{uuid}/channels/1", {"value": 0.05, "hold": 30})
     Journal.of(hall).moves()

@@ -133,21 +133,45 @@ def test_the_end_of_a_duration_is_not_moved_by_a_restart(hall: Hall) -> None:
     hall.station.ask("group", "delete", "short")
 
 
-def test_a_second_measurement_from_one_source_address_is_refused_and_named(hall: Hall) -> None:
+def test_a_second_measurement_from_a_source_address_that_was_named_is_refused_and_told(hall: Hall) -> None:
     a, g = hall.nodes["a"].uuid, hall.nodes["g"].uuid
     best_of(3, WHOLE, lambda: beside_refused(hall, a, g))
+
+
+def test_where_no_source_address_is_named_the_next_free_one_is_taken(hall: Hall) -> None:
+    a, g = hall.nodes["a"].uuid, hall.nodes["g"].uuid
+    best_of(3, WHOLE, lambda: beside_by_itself(hall, a, g))
+
+
+def beside_by_itself(hall: Hall, a: str, g: str) -> float:
+    first, second = hall.begin(g, "--rate", 50), hall.begin(a, "--rate", 20)
+    for running in (first, second):
+        running.wait_for('"event":"data"')
+    acted = hall.station.run("--json", "set", g, 1, 0.05, "--hold", 0.1, "--can", hall.can)
+    assert (acted.code, events(acted.out)[0]["applied"]["channel"]) == (0, 1), acted
+    assert hall.ask("sample", g)["samples"]
+    assert hall.ask("verify", g, "--via", "can")["verdict"] == "authentic"
+    assert hall.ask("sample", a)["samples"]
+    shares = []
+    for running in (second, first):
+        running.signal(signal.SIGTERM)
+        lines = events(running.end().out)
+        shares.append(missing(lines))
+        assert ran(lines) == ["running", "ended"]
+    return max(shares)
 
 
 def beside_refused(hall: Hall, a: str, g: str) -> float:
     first = hall.begin(g, "--rate", 50)
     first.wait_for('"event":"data"')
+    named = ("--can", f"{hall.can}&source=0xF1")
     for words in (["measure", g], ["measure", a], ["set", g, 1, 0.05, "--hold", 0.1]):  # each would open sessions
-        refused = hall.ask(*words, code=7)["error"]
+        refused = hall.station.ask(*words, *named, code=7)["error"]
         assert refused["code"] == "store-locked"
         assert f"pid {first.process.pid} (measure {g})" in refused["message"]
         assert "source=0xF2" in refused["hint"]
     for words in (["sample", g], ["verify", g, "--via", "can"]):
-        refused = hall.ask(*words, code=7)["error"]
+        refused = hall.station.ask(*words, *named, code=7)["error"]
         assert "is being measured from source address 0xF1" in refused["message"]
     assert hall.ask("sample", a)["samples"], "a node that nobody measures"
     first.signal(signal.SIGTERM)
@@ -307,11 +331,11 @@ def test_a_node_that_is_revoked_in_the_middle_is_measured_no_more(hall: Hall) ->
     assert running.end(60).code == 6
 
 
-def test_a_set_point_holds_its_source_address_too(hall: Hall) -> None:
+def test_a_set_point_holds_its_source_address_too_where_it_was_named(hall: Hall) -> None:
     g = hall.nodes["g"].uuid
     acting = hall.station.start("--json", "set", g, 1, 0.05, "--dead-man", 10_000, "--can", hall.can)
     acting.wait_for('"applied"')
-    refused = events(hall.begin(g, "--rate", 10).end().out)[-1]["error"]
+    refused = events(hall.begin(g, "--rate", 10, can=f"{hall.can}&source=0xF1").end().out)[-1]["error"]
     assert refused["code"] == "store-locked"
     assert f"(set {g})" in refused["message"]
     acting.signal(signal.SIGTERM)

@@ -30,8 +30,9 @@ mount -t tmpfs memory /memory; mkdir /memory/upper /memory/work
 mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000,ro,cache=loose root /host || echo "no 9p"
 mount -t overlay -o lowerdir=/host,upperdir=/memory/upper,workdir=/memory/work whole /root || echo "no overlay"
 mount -t proc proc /root/proc; mount -t sysfs sys /root/sys; mount -t devtmpfs dev /root/dev
-mkdir -p /root/dev/pts /root/dev/shm; mount -t devpts pts /root/dev/pts; mount -t tmpfs shm /root/dev/shm
-mount -t tmpfs tmp /root/tmp; mount -t tmpfs run /root/run; mkdir -p /root/run/dbus
+mkdir -p /root/dev/pts; mount -t devpts pts /root/dev/pts
+MEMORY
+mkdir -p /root/run/dbus
 ip link set lo up
 for module in $(cat /scene.modules); do insmod /root$module || echo "insmod $module failed"; done
 echo "booted in $(cut -d' ' -f1 /proc/uptime) s"
@@ -89,6 +90,15 @@ def tell(name: str, **what: Any) -> None:
     sys.__stdout__.flush()  # type: ignore[union-attr]
 
 
+def in_memory(*used: Path) -> list[str]:
+    """What of these folders gets a file system of its own in memory: those in which nothing lies that is ``used``.
+
+    A checkout in the temporary folder of the system would be hidden by it. The files of the host are never written to
+    in either case: what is written goes into the memory above them.
+    """
+    return [place for place in ("/dev/shm", "/tmp", "/run") if not any(one.is_relative_to(place) for one in used)]
+
+
 def _in_order(names: tuple[str, ...]) -> list[str]:
     """Modules and what they need, in the order in which they are loaded; paths below the kernel's folder."""
     needs: dict[str, tuple[str, list[str]]] = {}
@@ -115,9 +125,10 @@ def _boot_image(scene: str, modules: tuple[str, ...], folder: Path) -> Path:
     inside = [str(FOLDER / "modules" / module) for module in _in_order(modules)]
     (tree / "scene.modules").write_text("\n".join(inside) + "\n")
     init = tree / "init"
-    init.write_text(
-        _INIT.replace("ROOT", str(ROOT)).replace("PYTHON -m", f"{sys.executable} -m").replace("SCENE", scene)
-    )
+    used = (ROOT, FOLDER.resolve(), Path(sys.executable), Path(sys.executable).resolve(), Path(sys.prefix).resolve())
+    mounts = [f"mkdir -p /root{place}; mount -t tmpfs memory /root{place}" for place in in_memory(*used)]
+    words = _INIT.replace("MEMORY", "\n".join(mounts)).replace("ROOT", str(ROOT))
+    init.write_text(words.replace("PYTHON -m", f"{sys.executable} -m").replace("SCENE", scene))
     init.chmod(0o755)
     names = "\n".join(str(path.relative_to(tree)) for path in sorted(tree.rglob("*")))
     packed = subprocess.run(

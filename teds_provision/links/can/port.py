@@ -6,6 +6,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Final
 
 from teds_provision.errors import LinkFailure, NoNode
@@ -75,6 +76,11 @@ class CanPort:
                     self._bus = None
                 self._bus = SharedBus(Bus(self.spec, self.trace))
             return self._bus
+
+    def use_source(self, source: int) -> None:
+        """Speak from another source address from now on: the bus is opened anew by whoever needs it next."""
+        self.close()
+        self.spec = replace(self.spec, source=source)
 
     def listen(self, wanted: Callable[[Frame], bool]) -> Ear:
         """Hear every frame for which ``wanted`` is true, data frames and announcements above all; see SharedBus."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 from urllib.parse import unquote
 
@@ -40,6 +40,7 @@ class CanSpec:
     fd: bool = False
     node: int | None = None
     source: int = FIRST_STATION
+    source_named: bool = field(default=False, compare=False)
     bitrate: int = DEFAULT_BITRATE
     data_bitrate: int = DEFAULT_DATA_BITRATE
     pace: bool = False
@@ -49,6 +50,12 @@ class CanSpec:
     def text(self) -> str:
         """Interface and channel, to name the bus in a message."""
         return f"{self.interface}:{self.channel}"
+
+    @property
+    def sources(self) -> tuple[int, ...]:
+        """The source addresses that it may be used under, the first choice first: where one was named, that alone."""
+        others = [one for one in range(FIRST_STATION, LAST_STATION + 1) if one != self.source]
+        return (self.source,) if self.source_named else (self.source, *others)
 
     @property
     def wire(self) -> str:
@@ -83,6 +90,7 @@ def parse_spec(text: str) -> CanSpec:
         fd=fd,
         node=node,
         source=FIRST_STATION if source is None else source,
+        source_named=source is not None,
         bitrate=bitrate or DEFAULT_BITRATE,
         data_bitrate=data_bitrate or DEFAULT_DATA_BITRATE,
         pace=pace,
