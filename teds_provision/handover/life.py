@@ -103,7 +103,7 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
         raise UsageFailure("A node cannot replace itself.")
     before = station.nodes.get(old)
     if before is None:
-        raise NotFound(f"Nothing is known of node {old.hex()}.", hint="See: teds-provision nodes")
+        raise NotFound(f"Node {old.hex()} is not known here.", hint="See: teds-provision nodes")
     station.policy.require_not_given_away(old)
     station.policy.require_whitelisted(new)
     after = station.nodes.get(new) or NodeRecord(new)

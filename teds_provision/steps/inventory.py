@@ -44,7 +44,7 @@ def search(station: Station, text: str | None = None, *, state: str | None = Non
     exact = _exact(station, text) if number is None and not any(more.values()) else None
     found = [exact] if exact is not None else station.nodes.find(Search(text, number, **more))
     if not found:
-        raise NotFound(f"Nothing is known of {text!r}.", hint="See: teds-provision nodes.")
+        raise NotFound(f"No node matches {text!r}.", hint="See: teds-provision nodes.")
     return found
 
 
