@@ -25,6 +25,7 @@ from teds_provision.vault import agent, choose, forget_vaults, passphrase
 from teds_provision.vault.passphrase import THROWAWAY, SealingKey
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, call
+from tests.pace import until
 
 NODES = [number.to_bytes(10, "big") for number in range(1, 5)]
 NEW = "four other random words"
@@ -225,6 +226,7 @@ def test_one_is_left_at_each_of_its_questions_beside_the_other(first: str, secon
             require_outcome(first, second, done)
         require_whole(world)
         agent.lock(world.home)
+        until(lambda: not (world.home / agent.SOCKET).exists())  # the ended agent takes it away
         shutil.rmtree(world.home)
         shutil.copytree(pristine, world.home)
         world.passphrase, world.ran = PASSPHRASE, []
