@@ -151,6 +151,7 @@ def test_a_refused_change_stands_in_the_log_with_who_asked_for_what_and_why(
     body = json.dumps({"uuid": hand, "channel": 2, "name": "other"})
     assert service.raw("PUT", "/api/v1/names", headers, body).status == 409
     assert service.raw("PUT", "/api/v1/names", headers, '{"no such": 1}').status == 422, "no request, no entry"
+    assert service.raw("GET", "/api/v1/log?since=yesterday", headers).status == 422, "it changes nothing: no entry"
     [noted] = asked.request("GET", "/log?act=api&limit=1")["entries"]
     assert (noted["actor"], noted["outcome"], noted["failed"]) == ("robot 8", "frozen", True)
     facts = noted["facts"]

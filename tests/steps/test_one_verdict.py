@@ -139,6 +139,9 @@ def test_a_kept_image_stands_for_no_row_but_the_one_that_was_read_of_it_in_a_ses
         assert station._store.put_reading(changed)
         found = looked(station, board)
         assert not found.kept, "all of it was read"
+        again = station.nodes.reading(board.uuid)
+        assert again is not None
+        assert again.digests == row.digests, "it was read"
         assert (found.verified.verdict, found.judged.origin) == ("authentic", "session")
         assert shown(station, board) == ("authentic", "session")
 
