@@ -185,7 +185,7 @@ def test_what_cannot_be_replaced(pair: Pair) -> None:
     first, second = (board.uuid for board in pair.boards)
     with pytest.raises(UsageFailure):
         plan_takeover(pair.north, first, first, copy_calibration=False)
-    with pytest.raises(NotFound, match="Nothing is known"):
+    with pytest.raises(NotFound, match="is not known here"):
         plan_takeover(pair.north, bytes(10), second, copy_calibration=False)
     with pytest.raises(NotWhitelisted):
         plan_takeover(pair.north, first, bytes(10), copy_calibration=False)
