@@ -41,6 +41,7 @@
  *   BREAK_KEEPS_OLD      the node opens sessions under the key before the present one too
  *   BREAK_SESSION        a session outlives the Confirm that replaces its key
  *   BREAK_SESSION_RESET  a session outlives a reset
+ *   BREAK_RESET_KEEPS    a reset leaves the node's key in flash
  *   BREAK_MEASURED_ON    a session goes on although the station has given the node away
  *   BREAK_ERASE          a node that was cut in Confirm does not erase the old key when it starts
  */
@@ -133,6 +134,7 @@ byte bundles;
 byte given_to[STATIONS];	/* to whom it gave the node, until it is handed back, undone or rotated away */
 bool restored;			/* a store was lost and came back older: keys may be gone (docs/profile.md, "What a cut leaves behind") */
 byte commits, restores, resets;
+byte wiped;			/* the key that the last reset took from the node */
 
 #define HOLDS(s, k) ((k) != 0 && (st[s].held & BIT(k)))
 #ifdef BREAK_KEEPS_OLD
@@ -449,7 +451,10 @@ end:
 
 	/* -- reset, by hand or in a session: the node forgets its key, never epoch and sequence ------------------------------------ */
 	:: atomic { UP && resets < RESETS && node_key != 0 ->
-		resets++; node_key = 0; overtaken = ram;
+		resets++; wiped = node_key; overtaken = ram;
+#ifndef BREAK_RESET_KEEPS
+		node_key = 0;
+#endif
 #ifndef BREAK_RESET_RAM
 		ram = 0;
 #endif
@@ -546,6 +551,7 @@ end:
 #ifdef SESSIONS_TOO
 	:: atomic { OUTLIVED(0) || OUTLIVED(1) || OUTLIVED(2) -> assert(false) }	/* no session outlives its key, or a move */
 #endif
+	:: atomic { wiped != 0 && node_key == wiped -> assert(false) }	/* what a reset took is no key any more */
 #ifdef SLOTS
 	:: atomic { !booting && residue -> assert(false) }	/* a node that answers has one key in its flash */
 #endif
