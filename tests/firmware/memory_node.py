@@ -66,8 +66,9 @@ class MemoryNode:
         )
 
     def close(self) -> None:
-        """Give its memory back."""
-        self._library.memory_free(self._board)
+        """Give its memory back; once, whoever else closes it."""
+        board, self._board = self._board, ctypes.c_void_p()
+        self._library.memory_free(board)
 
     def _random(self, kind: bytes, out: Any, length: int) -> int:
         octets = self._draw(kind.decode(), length)
