@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -157,20 +158,24 @@ def test_a_device_that_never_ends_is_no_file_either(bench: Path, command: str) -
     assert (code in (3, 8), seconds < SECONDS, megabytes < MEGABYTES) == (True, True, True), (said, seconds, megabytes)
 
 
+LAUNCH = """import os, subprocess, sys
+process = subprocess.Popen(sys.argv[2:], stdin=subprocess.DEVNULL, pass_fds=[int(sys.argv[1])])
+_, status, used = os.wait4(process.pid, 0)
+print(os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, file=sys.stderr)
+"""
+"""A small process between: what is forked counts its parent's memory as its own, and that of the tests is large."""
+
+
 def measured(home: Path, *command: object) -> tuple[int, float, float, str]:
     """How a command ended in a process of its own: exit code, seconds of processor, megabytes at most, stdout."""
     read, write = os.pipe()
     os.write(write, PASSPHRASE.encode() + b"\n")
     os.close(write)
     line = [*PROGRAM, "--home", home, "--json", "--passphrase-fd", read, *command]
-    process = subprocess.Popen(
-        list(map(str, line)), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=[read],
-        env=clean_environment(PYTHONPATH=str(ROOT)),
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", LAUNCH, str(read), *map(str, line)], capture_output=True, pass_fds=[read],
+        env=clean_environment(PYTHONPATH=str(ROOT)), text=True, check=True,
     )  # fmt: skip
     os.close(read)
-    assert process.stdout is not None
-    said = process.stdout.read().decode()
-    process.stdout.close()
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    return process.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, said
+    code, seconds, megabytes = done.stderr.splitlines()[-1].split()
+    return int(code), float(seconds), float(megabytes), done.stdout

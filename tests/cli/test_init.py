@@ -166,5 +166,5 @@ def test_every_extra_that_a_hint_names_is_one() -> None:
         for path in (ROOT / "teds_provision").rglob("*.py")
         for extra in re.findall(r"how_to_install\(['\"]([^'\"]+)['\"]\)", path.read_text())
     }
-    assert named == {"ble", "ble-node", "label", "mqtt", "ncap", "pcsc", "pkcs11", "plot", "ros2"}
+    assert named == {"ble", "ble-node", "label", "mqtt", "ncap", "pcsc", "pkcs11", "plot", "ros2", "units"}
     assert named <= declared.keys()
