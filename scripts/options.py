@@ -52,7 +52,18 @@ def option_names() -> str:
         '"""The options of every command, by its path ("" for the program). Written by scripts/options.py."""\n\n'
         "from __future__ import annotations\n\nfrom typing import Final\n\n# fmt: off\n"
         "OPTIONS: Final[dict[str, frozenset[str]]] = {\n" + "\n".join(rows) + "\n}\n"
+        "FILES: Final = frozenset({" + ", ".join(f'"{name}"' for name in file_names()) + "})\n"
+        '"""Options that name a file or a folder, in every command that has them."""\n'
     ).replace("# fmt: off\n", "# fmt: off\n# ruff: noqa: E501\n")
+
+
+def file_names() -> list[str]:
+    """The options whose values are paths in every command that has them."""
+    kinds: dict[str, set[bool]] = {}
+    for _, command in commands():
+        for option in options_of(command):
+            kinds.setdefault(_long(option), set()).add(isinstance(option.type, click.Path))
+    return sorted(name for name, paths in kinds.items() if paths == {True})
 
 
 def configuration() -> str:
@@ -79,6 +90,9 @@ def configuration() -> str:
         "A key that no command knows is an error that names its line. `teds-provision config show` lists what is set,",
         "and where; `config set` and `config unset` change the file.",
         "Flags are `true` or `false` in the file, `1` or `0` in a variable. `make man` writes this page.",
+        "",
+        "A relative path in `config.toml` starts at the folder of `config.toml`, wherever you type the command;",
+        "`config set` writes the path that you gave from the root on.",
         "",
     ]
     for path, command in commands():

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision.cli import completing
-from teds_provision.cli.configuration import as_parameters, config_path, problems, read_config, read_config_text
+from teds_provision.cli.configuration import (
+    anchored,
+    as_parameters,
+    config_path,
+    problems,
+    read_config,
+    read_config_text,
+)
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.main import COMPLETE
 from teds_provision.cli.option_names import OPTIONS
@@ -72,7 +79,7 @@ def show(app: App, ctx: click.Context) -> None:
 
 def check_values(root: click.Context, values: Mapping[str, Any], place: Path) -> None:
     """Have click read every value of config.toml as its command would; raises BadData for the first that is bad."""
-    for name, value in _flat(values):
+    for name, value in _flat(anchored(dict(values), place.parent)):
         _check_value(root, name, value, place)
 
 
@@ -155,7 +162,7 @@ def set_(app: App, ctx: click.Context, name: str, value: str) -> None:
     Comments and the other settings stay. A flag takes true or false; several values are written ["a", "b"].
     """
     root, place = ctx.find_root(), config_path(app.home)
-    typed = _typed(root, name, value)
+    typed = _from_here(name, _typed(root, name, value))
     changed = _edit(app, "config set", name, typed)
     verb = "Set" if changed else "Nothing to do:"
     app.emit({"settings": [{"name": name, "value": typed, "source": str(place)}]}, f"{verb} {name} = {_toml(typed)}")
@@ -196,6 +203,20 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
     except click.BadParameter as error:
         raise UsageFailure(f"{name}: {error.message.rstrip('.')}.") from error
     return read if isinstance(read, bool | int | float) else value
+
+
+def _from_here(name: str, value: Any) -> Any:
+    """The value with its path as the person meant it, from the folder in which the command was typed."""
+    nested: dict[str, Any] = {}
+    inner = nested
+    *words, option = name.split(".")
+    for word in words:
+        inner = inner.setdefault(word, {})
+    inner[option] = value
+    whole: Any = anchored(nested, Path.cwd())
+    for word in (*words, option):
+        whole = whole[word]
+    return whole
 
 
 def _edit(app: App, command: str, name: str, value: Any) -> bool:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.cli.option_names import OPTIONS
+from teds_provision.cli.option_names import FILES, OPTIONS
 from teds_provision.cli.table import COMMANDS, GROUPS
 from teds_provision.errors import BadData, NotFound
 from teds_provision.lazy import late
@@ -29,6 +29,7 @@ PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "al
 NEVER_IN_FILE: Final = frozenset({"home", "help", "version", "passphrase-fd"})
 BROKERS: Final = "ncap brokers"
 """A table of names and URLs, not of options."""
+_BROKER_FILES: Final = ("password-file", "ca", "cert", "key")
 _LONGEST: Final = 40
 """More of a name is not shown."""
 _MEND: Final = "Fix or remove the file."
@@ -67,6 +68,36 @@ def as_parameters(values: dict[str, Any]) -> dict[str, Any]:
         PARAMETERS.get(name, name.replace("-", "_")): as_parameters(value) if isinstance(value, dict) else value
         for name, value in values.items()
     }
+
+
+def anchored(values: dict[str, Any], folder: Path, above: str = "") -> dict[str, Any]:
+    """The values with every path from the root on, relative ones from ``folder``: commands are typed anywhere."""
+    return {
+        name: anchored(value, folder, name) if isinstance(value, dict) else _whole(name, value, folder, above)
+        for name, value in values.items()
+    }
+
+
+def _whole(name: str, value: Any, folder: Path, above: str) -> Any:
+    plain = name.replace("_", "-")
+    if isinstance(value, list):
+        return [_whole(name, each, folder, above) for each in value]
+    if not isinstance(value, str) or not value:
+        return value
+    if above == "brokers":
+        return re.sub(rf"([?&](?:{'|'.join(_BROKER_FILES)})=)([^&#]+)", lambda m: m[1] + _from(folder, m[2]), value)
+    if (
+        plain in FILES
+        or (plain == "profile" and ("/" in value or value.endswith(".toml")))  # else a name
+        or (plain == "to" and above == "backup")
+        or (plain == "to" and above == "measure" and not re.match(r"[a-z0-9]+:", value))  # else a service
+    ):
+        return _from(folder, value)
+    return value
+
+
+def _from(folder: Path, path: str) -> str:
+    return os.path.abspath(os.path.join(folder, os.path.expanduser(path)))
 
 
 def home_of(home: Path | None) -> Path:
@@ -145,7 +176,7 @@ def _problems_of_brokers(values: dict[str, Any], text: str) -> Iterator[str]:
 
 def brokers_of(path: Path) -> dict[str, str]:
     """The brokers that requests may name, ``[ncap.brokers]``; raises BadData as :func:`read_config`."""
-    ncap = (read_config(path) or {}).get("ncap", {})
+    ncap = anchored(read_config(path) or {}, path.parent).get("ncap", {})
     return dict(ncap.get("brokers", {})) if isinstance(ncap, dict) else {}
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import click
 
 from teds_provision import __version__
-from teds_provision.cli.configuration import PARAMETERS, Defaults, as_parameters, config_path, read_config
+from teds_provision.cli.configuration import PARAMETERS, Defaults, anchored, as_parameters, config_path, read_config
 from teds_provision.cli.context import App, nowhere, say
 from teds_provision.cli.table import COMMANDS, SECTIONS
 from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError
@@ -115,12 +115,13 @@ _BROKEN: Final = "teds_provision.config_error"
 
 def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | None) -> Path | None:
     try:
-        values = read_config(config_path(home))
+        place = config_path(home)
+        values = read_config(place)
     except BadData as error:
         ctx.meta[_BROKEN] = error
         return home
     if values is not None:
-        ctx.default_map = Defaults(as_parameters(values))
+        ctx.default_map = Defaults(as_parameters(anchored(values, place.parent)))
     return home
 
 

@@ -64,3 +64,5 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "node create": frozenset({"uuid", "name", "teds", "profile", "max-message"}),
     "node run": frozenset({"nfc", "tag", "can", "ble", "source", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }
+FILES: Final = frozenset({"batch", "calibration", "certificate", "home", "image", "output", "plot", "receipt", "record", "recovery-key", "report", "request", "require", "teds", "tls-cert", "tls-key", "trace"})
+"""Options that name a file or a folder, in every command that has them."""

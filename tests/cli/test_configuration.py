@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.cli.configuration import anchored
+
 from .shell import call, clean_environment
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -133,3 +135,45 @@ def test_a_file_that_says_it_otherwise_is_left_to_its_owner(home: Path) -> None:
     (home / "config.toml").write_text('provision = { via = "can" }\n')
     assert call(home, "config", "set", "provision.via", "nfc").code == 8
     assert (home / "config.toml").read_text() == 'provision = { via = "can" }\n'
+
+
+def test_a_path_in_the_file_means_the_same_file_wherever_the_command_is_typed(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere, here = tmp_path / "elsewhere", tmp_path / "here"
+    elsewhere.mkdir()
+    here.mkdir()
+    (elsewhere / "gripper.toml").write_text("this is another profile")
+    (here / "gripper.toml").write_text((ROOT / "profiles" / "gripper.toml").read_text())
+    image = tmp_path / "image.json"
+    monkeypatch.chdir(here)
+    assert call(home, "config", "set", "profile", "./gripper.toml").code == 0
+    assert call(home, "config", "set", "build.output", "../image.json").code == 0
+    monkeypatch.chdir(elsewhere)
+    assert call(home, "whitelist", "add", UUID, "--fingerprint", "ab" * 32).code == 0
+    done = call(home, "build", UUID)
+    assert done.code == 0, done.err
+    assert image.is_file()
+
+
+def test_a_relative_path_in_the_file_starts_at_the_folder_of_the_file() -> None:
+    said = {
+        "trace": "frames.pcapng",
+        "profile": "gripper",
+        "provision": {"profile": "own/arm.toml", "name": "a/b"},
+        "backup": {"to": "office.pem"},
+        "measure": {"to": ["run.csv", "mqtt:lab"]},
+        "export-keys": {"to": "north"},
+        "ncap": {"brokers": {"lab": "mqtts://a@lab?password-file=secret/arm&ca=/etc/ca.pem"}},
+    }
+    folder = Path("/etc/teds")
+    assert anchored(said, folder) == {
+        "trace": "/etc/teds/frames.pcapng",
+        "profile": "gripper",
+        "provision": {"profile": "/etc/teds/own/arm.toml", "name": "a/b"},
+        "backup": {"to": "/etc/teds/office.pem"},
+        "measure": {"to": ["/etc/teds/run.csv", "mqtt:lab"]},
+        "export-keys": {"to": "north"},
+        "ncap": {"brokers": {"lab": "mqtts://a@lab?password-file=/etc/teds/secret/arm&ca=/etc/ca.pem"}},
+    }
+    assert anchored(anchored(said, folder), Path("/elsewhere")) == anchored(said, folder)
