@@ -33,6 +33,8 @@ class TextSink(FileSink):
         super().__init__(path)
         self._comma = "," if path.suffix.lower() == ".csv" else "\t"
         self._columns: dict[tuple[str, int], int] = {}
+        self._states: dict[str, str] = {}
+        """What stands in this part of each node that is not measured: it is tried again without a line each time."""
         self._templates: dict[tuple[str, tuple[int, ...], bool, str], tuple[str, list[int]]] = {}
         self._not_a_number = re.compile(f"(?<={self._comma})nan(?=[{self._comma}\n])")
 
@@ -42,9 +44,19 @@ class TextSink(FileSink):
         elif isinstance(item, tuple):
             if self._news(item) and self._columns:
                 self._new_part()
-        elif isinstance(item, NodeReport) and item.state != "running" and self._columns:
-            why = f"; {printable(item.why)}" if item.why else ""
-            self._line(f"# {iso(item.time)} {item.uuid} {item.state}: {counted(item)}{why}")
+        elif isinstance(item, NodeReport):
+            if item.state == "running":
+                self._states.pop(item.uuid, None)
+            elif self._columns:
+                self._state(item)
+
+    def _state(self, item: NodeReport) -> None:
+        why = f"; {printable(item.why)}" if item.why else ""
+        said = f"{item.state}: {counted(item)}{why}"
+        without_when = said.rpartition("; again in ")[0] or said
+        if self._states.get(item.uuid) != without_when:
+            self._states[item.uuid] = without_when
+            self._line(f"# {iso(item.time)} {item.uuid} {said}")
 
     def _begin(self) -> None:
         if self.facts:
@@ -62,7 +74,7 @@ class TextSink(FileSink):
     def _header(self) -> None:
         known = [self.facts[key] for key in sorted(self.facts)]
         self._columns = {one.key: place for place, one in enumerate(known)}
-        self._templates = {}
+        self._templates, self._states = {}, {}
         station = self.station
         self._line(f"# teds-provision measurement, text 1; times are unix seconds, clock: {station.clock}")
         self._line(f"# station: {printable(station.name)}; group: {printable(station.group) or 'none'}")

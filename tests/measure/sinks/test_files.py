@@ -238,6 +238,24 @@ def test_an_mcap_holds_the_facts_where_its_users_look(tmp_path: Path) -> None:
     assert json.loads(strings["/bench/reports"])["lost"] == 3
 
 
+def test_a_node_that_is_tried_again_gets_one_line_until_something_changes(tmp_path: Path) -> None:
+    path, times = tmp_path / "run.csv", iter(range(100))
+
+    def refused(why: str, state: str = "refused") -> NodeReport:
+        return NodeReport(ARM, state, why, time=1_795_000_000.0 + next(times))
+
+    other = refused("TEDS 3 of channel 1 has another digest; again in 8 s")
+    tries = [refused(f"the station is not trusted; again in {pause} s") for pause in (1, 2, 4, 8)]
+    back = NodeReport(ARM, "running", time=1_795_000_050.0)
+    record(path, [block(), *tries, other, back, tries[0], tries[1]])
+    said = [line for line in path.read_text().splitlines() if line.startswith("# ") and " refused: " in line]
+    assert [line.partition("; ")[2] for line in said] == [
+        "the station is not trusted; again in 1 s",
+        "TEDS 3 of channel 1 has another digest; again in 8 s",
+        "the station is not trusted; again in 1 s",
+    ]
+
+
 def test_chunks_of_an_mcap_are_small(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     record(path, [block(np.full((100, 8), 5), channels=tuple(range(1, 9)), index=100 * k) for k in range(20)])
