@@ -75,7 +75,7 @@ class Topics:
         self._nodes = {}
         for own in (self._known, self._strangers):
             alike = Counter(uuid[:8] for uuid in own)
-            wishes = {uuid: (name or f"n{uuid[:8]}",) for uuid, name in own.items()}
+            wishes = {uuid: (self._own_name(uuid, name) or f"n{uuid[:8]}",) for uuid, name in own.items()}
             more = {
                 uuid: (f"{name or 'n'}_{uuid[:8]}" if name and alike[uuid[:8]] == 1 else "", f"{name or 'n'}_{uuid}")
                 for uuid, name in own.items()
@@ -83,6 +83,18 @@ class Topics:
             self._nodes |= _apart(wishes, more, taken)
             taken |= set(self._nodes.values())
         self._made = {}
+
+    def _own_name(self, uuid: str, name: str) -> str:
+        """The name, with its own digits behind it where it ends in those of another node.
+
+        Two namesakes have their digits behind their names. When one of them goes, the running measurement goes on under
+        that name, and a third node that is called so must not get it in the next one.
+        """
+        digits = name.rpartition("_")[2]
+        if len(digits) not in (8, 20) or not all(one in "0123456789abcdef" for one in digits):
+            return name
+        another = any(one.startswith(digits) for one in chain(self._known, self._strangers) if one != uuid)
+        return f"{name}_{uuid[:8]}" if another else name
 
     def node(self, uuid: str) -> str:
         """Part of the node: ``arm``, ``n8d4d9da6``."""

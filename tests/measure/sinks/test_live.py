@@ -117,6 +117,16 @@ def test_no_two_topics_are_equal_whatever_was_chosen_and_made(
     assert all(some.node(uuid) == topics.node(uuid) for uuid in measured & nodes.keys())
 
 
+def test_who_is_named_as_a_namesake_is_published_never_gets_its_topics() -> None:
+    """A running measurement keeps its topics when the other namesake goes, and a third one may then be called so."""
+    arm, other, third = "8d4d9da65281f7000001", "0123456789abcdef0000", "8d4d9da75281f7000003"
+    running = Topics(StationFacts("bench", nodes={arm: "arm", other: "arm"})).node(arm)
+    later = Topics(StationFacts("bench", nodes={arm: "arm", third: running}))
+    assert running == f"arm_{arm[:8]}"
+    assert later.node(third) == f"{running}_{third[:8]}"
+    assert Topics(StationFacts("bench", nodes={third: "crane_20260101"})).node(third) == "crane_20260101"
+
+
 def test_a_stranger_takes_no_name_of_a_node_that_is_known() -> None:
     topics = Topics(replace(STATION, nodes={ARM: "arm"}))
     topics.learn([ANGLE, replace(FORCE, node="arm")])
