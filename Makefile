@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage mutants api test-other vectors-c sbom firmware firmware-arm room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -100,6 +100,11 @@ fuzz: .venv-fuzz/.ready
 # backups of 100,000 nodes; an hour and a half, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
+
+# A service on bad days: its clock set, its disk filled, an adapter pulled, 10,000 invented nodes, in rounds.
+MINUTES ?= 30
+soak: $(VENV)/.dev
+	$(BIN)/python -m tests.soak.run --minutes $(MINUTES)
 
 # Does a test notice when the code is broken? Rules of the profile by pattern, and random mutants; prints the survivors.
 # 300 within the hour on two cores: make mutants ROOM=steps COUNT=100, or ROOM=protocol/tim/teds_access.py
