@@ -150,6 +150,11 @@ class Lab:
             found: list[dict[str, Any]] = station.request("GET", "/measurements")["measurements"]
         return found
 
+    def measure(self, *names: str, rate: float = 100.0) -> None:
+        """Begin to measure nodes, as a request of a script."""
+        with client.connect(home=self.station.home) as station:
+            station.request("POST", "/measurements", {"uuids": [self.nodes[name].uuid for name in names], "rate": rate})
+
     def login(self, *, read_only: bool = False) -> str:
         """An address of the page with a token that works once."""
         with client.connect(home=self.station.home) as station:
