@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote, urlsplit
 
-from teds_provision.errors import LinkFailure, TedsProvisionError, UsageFailure
+from teds_provision.errors import LinkFailure, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.files import short_path
 
 if TYPE_CHECKING:
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 API: Final = "/api/v1"
 SOCKET: Final = "ncap.sock"
+LETTING_GO: Final = 5.0
+"""Seconds for the base station to let a node go."""
 
 
 class ApiError(TedsProvisionError):
@@ -313,6 +315,37 @@ class Client:
             lent = False
         try:
             yield lent
+        finally:
+            connection.close()
+
+    @contextmanager
+    def released(self, uuid: str, command: str) -> Iterator[bool]:
+        """Have a node that the base station measures let go for the length of the block; then it is measured again.
+
+        False where no base station runs, or it does not measure the node (``uuid``: 20 hex digits). Raises
+        PolicyRefused where it does not answer within :data:`LETTING_GO` seconds, or cannot let the node go.
+        """
+        connection = _UnixConnection(self._home / SOCKET, LETTING_GO)
+        try:
+            try:
+                connection.request("GET", f"{API}/nodes/{uuid}/let-go?for={quote(command, safe='')}")
+                answer = connection.getresponse()
+                said = answer.readline() if answer.status == 200 else b""
+            except LinkFailure:  # nobody listens
+                yield False
+                return
+            except (OSError, http.client.HTTPException) as error:
+                raise PolicyRefused(
+                    f"The base station measures, and did not release node {uuid} within {LETTING_GO:g} s.",
+                    hint="See: teds-provision ncap status. Or end the measurement first.",
+                ) from error
+            if said not in (b"let go\n", b"not measured\n"):
+                why = said.decode(errors="replace").removeprefix("refused: ").strip()
+                raise PolicyRefused(
+                    why or f"The base station did not release node {uuid}.",
+                    hint="See: teds-provision ncap status. Or end the measurement first.",
+                )
+            yield said == b"let go\n"
         finally:
             connection.close()
 

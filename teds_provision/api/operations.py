@@ -92,6 +92,9 @@ OPERATIONS: Final = (
               answers.Url, bodies.LoginLink),
     Operation("GET", "/lend", "Borrow the readers until this answer is closed (Unix socket only).", str,
               document=True),
+    Operation("GET", "/nodes/{uuid}/let-go",
+              "Have a measured node to write to until this answer is closed (Unix socket only).", str,
+              query={"for": _TEXT}, document=True),
     Operation("GET", "/openapi.json", "Get this description.", None),
 )  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TextIO
 
 import click
@@ -23,13 +23,17 @@ if TYPE_CHECKING:
 
     from rich.console import Console, RenderableType
 
+    from teds_provision import client
     from teds_provision.cli import console
     from teds_provision.station.station import Station
 else:
+    client = late("teds_provision.client")  # HTTP: only where a base station runs
     json = late("json")
     console = late("teds_provision.cli.console")  # rich
 
 _BEHIND = " [y/N]: "
+SOCKET: Final = "ncap.sock"
+"""``client.SOCKET``, which is loaded where it is there."""
 
 
 class App:
@@ -248,8 +252,15 @@ class App:
         station = station_room.station.Station.open(self.home, ask=self.ask_secret, tell=self.warn)
         station.notice = self.note
         station.use_agent = not self.has_passphrase
+        station.released = self._released
         self.closing(station.close)
         return station
+
+    def _released(self, uuid: bytes, command: str) -> AbstractContextManager[object]:
+        """Have the running `ncap` of this home let a node go that it measures."""
+        if not (self.home / SOCKET).exists():
+            return nullcontext()
+        return client.connect(home=self.home).released(uuid.hex(), command)
 
     def closing(self, close: Callable[[], None]) -> None:
         """Register what is to be closed when the command ends, however it ends."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from teds_provision.cli.context import App
+from teds_provision.cli.context import SOCKET, App
 from teds_provision.errors import NotFound, StoreFailure
 from teds_provision.files import require_no_pipe
 from teds_provision.lazy import late
@@ -28,8 +28,6 @@ else:
     recorder = late("teds_provision.trace.recorder")  # most runs have no trace
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
-_SOCKET = "ncap.sock"  # client.SOCKET, which is loaded where it is there
 
 COMMAND_SETTINGS: dict[str, Any] = {"auto_envvar_prefix": "TEDS_PROVISION"}
 """context_settings of every command: each option also reads TEDS_PROVISION_<NAME>."""
@@ -128,7 +126,7 @@ class Seconds(Number):
 def readers_for(via: str) -> Iterator[None]:
     """A running base station (`ncap run`) of this home lends its readers to a command that wants one."""
     app = App.current
-    if via != "nfc" or app is None or not (app.home / _SOCKET).exists():
+    if via != "nfc" or app is None or not (app.home / SOCKET).exists():
         yield
         return
     with client.connect(home=app.home).readers():

@@ -89,14 +89,30 @@ class NodeKeeper:
         self._halved = 0
         self._driven: TopicActuators | None = None
         self._told = ""
-        self._thread = threading.Thread(target=self._run, name=f"node {uuid.hex()[:8]}", daemon=True)
+        self._why = ""  # why it was asked to end, for its last report
+        self._thread = self._new_thread()
+
+    def _new_thread(self) -> threading.Thread:
+        return threading.Thread(target=self._run, name=f"node {self.uuid.hex()[:8]}", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Begin; one that has ended begins again, and its counts go on."""
+        if self.begun:
+            self._thread.join()
+            self._stop.clear()
+            self.done.clear()
+            self._why = ""
+            self._thread = self._new_thread()
         self._thread.start()
 
-    def stop(self) -> None:
-        """Ask it to end in order: Stop, Idle, Close."""
+    @property
+    def begun(self) -> bool:
+        """Whether it was ever started."""
+        return self._thread.ident is not None
+
+    def stop(self, why: str = "") -> None:
+        """Ask it to end in order: Stop, Idle, Close; its last report says ``why``."""
+        self._why = why
         self._stop.set()
         self._anew.set()
 
@@ -108,7 +124,8 @@ class NodeKeeper:
 
     def join(self, seconds: float) -> None:
         """Wait for its end."""
-        self._thread.join(seconds)
+        if self.begun:
+            self._thread.join(seconds)
 
     # -- the thread --------------------------------------------------------------------------------------------------
 
@@ -132,7 +149,7 @@ class NodeKeeper:
                 self._say(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
                 self._wait(min(pause, patience.left), began)
                 pause = min(2 * pause, LAST_PAUSE)
-            self._say("ended")
+            self._say("ended", why=self._why)
         finally:
             self._common_start.gone(self.uuid)
             if self._request.require is not None:

@@ -68,6 +68,7 @@ class Measurement:
     facts: StationFacts
     watcher: Watcher = field(default_factory=Watcher)
     began: Callable[[], None] = lambda: None
+    lent: set[bytes] = field(default_factory=set)
     keepers: list[NodeKeeper] = field(default_factory=list, init=False)
 
     def run(self, stop: threading.Event, duration: float | None = None) -> Ended:
@@ -83,6 +84,7 @@ class Measurement:
         self._shown: dict[str, str] = {}  # what was told of each sink last, and since when one waits
         self._waits: dict[str, float] = {}
         self._common_start = CommonStart(self.uuids, trigger=self.request.trigger)
+        self._ending = False
         opened: list[Sink] = []
         try:
             for sink in self.sinks:
@@ -101,7 +103,8 @@ class Measurement:
             for uuid in self.uuids
         ]
         for keeper in self.keepers:
-            keeper.start()
+            if keeper.uuid not in self.lent:
+                keeper.start()
         try:
             self._loop(stop, duration)
         finally:
@@ -151,7 +154,7 @@ class Measurement:
         return max(now + left, *first) + duration
 
     def _all_done(self) -> bool:
-        return all(keeper.done.is_set() for keeper in self.keepers)
+        return not self.lent and all(keeper.done.is_set() for keeper in self.keepers)
 
     def _gave_up(self) -> bool:
         """Whether no node ever ran and each has had its time."""
@@ -214,12 +217,34 @@ class Measurement:
 
         The node's other exchanges wait meanwhile: be brief. Raises nothing of its own.
         """
-        keeper = next((one for one in self.keepers if one.uuid == uuid), None)
+        keeper = self._keeper(uuid)
         if keeper is None:
             yield None
             return
         with keeper.turn:
             yield keeper.trusted
+
+    def let_go(self, uuid: bytes, why: str, seconds: float) -> bool:
+        """End one node in order for as long as somebody else works on it; False where that took longer."""
+        self.lent.add(uuid)
+        keeper = self._keeper(uuid)
+        if keeper is None or not keeper.begun:
+            return True
+        keeper.stop(why)
+        return keeper.done.wait(seconds)
+
+    def take_back(self, uuid: bytes) -> None:
+        """Measure a node again that was let go."""
+        keeper = self._keeper(uuid)
+        if keeper is None or uuid not in self.lent:
+            return
+        self.buses.expect([uuid])
+        if not self._ending:
+            keeper.start()
+        self.lent.discard(uuid)
+
+    def _keeper(self, uuid: bytes) -> NodeKeeper | None:
+        return next((one for one in self.keepers if one.uuid == uuid), None)
 
     def command(self, command: Command) -> None:
         """A set point that came by a sink."""
@@ -264,6 +289,7 @@ class Measurement:
     # -- the end -------------------------------------------------------------------------------------------------------
 
     def _end(self) -> None:
+        self._ending = True
         for keeper in self.keepers:
             keeper.stop()
         end = time.monotonic() + ENDING

@@ -33,6 +33,8 @@ from teds_provision.store import Measurement
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 
+LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; whoever asks waits 5
+LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 SCALAR_RATE: Final = 10.0
 """Values a second on a topic of one value, where a measurement does not say."""
 BUDGET: Final = 5000
@@ -51,6 +53,15 @@ class Running:
     reports: dict[str, dict[str, Any]] = field(default_factory=dict)
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
+
+
+@dataclass(eq=False)
+class Loan:
+    """A node (UUID in hex) that is let go to a writer, and why in half a sentence."""
+
+    uuid: str
+    why: str
+    ended: bool = False
 
 
 class Measuring:
@@ -75,6 +86,8 @@ class Measuring:
         self._buses, self._sinks, self._admits = buses, sinks, admits
         self._dead_man = dead_man
         self._running: dict[str, Running] = {}
+        self._loans: dict[str, list[Loan]] = {}
+        self._lending = threading.Lock()
         self._guard = threading.Lock()
         self._messages: tuple[float, int] = (time.monotonic(), 0)
         self._rate = 0.0
@@ -217,6 +230,41 @@ class Measuring:
         with measurement.session(bytes.fromhex(uuid)) as trusted:
             yield trusted
 
+    # -- nodes that a command of this home writes to -----------------------------------------------------------------
+
+    def let_go(self, loan: Loan) -> bool:
+        """Let a node go until :meth:`give_back`, so that somebody can write to it; False where nobody measures it.
+
+        It may be let go to several at once, who take turns at the node. Raises NodeBusy where its session did not end
+        in order within :data:`LETTING_GO` seconds; then it is measured on.
+        """
+        with self._lending:
+            job = self._job_of(loan.uuid)
+            if job is None or loan.ended:
+                return False
+            self._loans.setdefault(loan.uuid, []).append(loan)
+            if job.let_go(bytes.fromhex(loan.uuid), loan.why, LETTING_GO):
+                return True
+        self.give_back(loan)
+        raise NodeBusy(
+            f"Node {loan.uuid} is being measured and was not released within {LETTING_GO:g} s.", hint="Try again."
+        )
+
+    def give_back(self, loan: Loan) -> None:
+        """Measure it again, unless somebody else still has it."""
+        with self._lending:
+            loan.ended = True
+            loans = self._loans.get(loan.uuid, [])
+            if loan not in loans:
+                return
+            loans.remove(loan)
+            if loans:
+                return
+            del self._loans[loan.uuid]
+            job = self._job_of(loan.uuid)
+            if job is not None:
+                job.take_back(bytes.fromhex(loan.uuid))
+
     def sheet(self, uuid: str) -> Image | None:
         """The datasheet of a node that is measured: the one that its session verified, and that nobody may change."""
         with self.session(uuid) as trusted:
@@ -356,6 +404,8 @@ class Measuring:
         before = one.reports.get(said.uuid, {})
         one.reports[said.uuid] = report
         changed = (before.get("state"), before.get("why")) != (said.state, said.why)
+        if changed:
+            self._tell_who_comes(one, said, before.get("state"))
         facts: dict[str, Any] = {"report": report}
         if said.state == "running":
             facts |= {"present": True, "seen": time.time(), "problem": None}
@@ -368,6 +418,18 @@ class Measuring:
         self._roster.note(said.uuid, said.state if changed else None, **facts)
         if changed and one.job is not None and not one.stop.is_set():
             self._say(one, *_state_of(one, one.job))
+
+    def _tell_who_comes(self, one: Running, said: NodeReport, before: str | None) -> None:
+        """An event for each node that begins to be measured, is not any more, or waits, and why."""
+        if said.state == "running" and before != "running":
+            state = "joined"
+        elif said.state != "running" and before == "running":
+            state = "left"
+        elif said.state in ("waiting", "refused") and said.why:
+            state = "waiting"
+        else:
+            return
+        self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=said.why)
 
 
 def _state_of(one: Running, job: Job) -> tuple[str, str]:

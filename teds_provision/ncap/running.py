@@ -8,7 +8,7 @@ import os
 import signal
 import socket
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -72,6 +72,7 @@ def run(station: Station, settings: Settings, tell: Tell) -> None:
     Raises StoreLocked where this home has a daemon, LinkFailure where the address is taken, UsageFailure.
     """
     require_safe(settings)
+    station.released = lambda _uuid, _command: nullcontext()  # in this process the turns of each node see to that
     with Presence(station.home) as presence:
         local = presence.listen()
         tcp = listen(*settings.http) if settings.http is not None else None

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,6 +101,12 @@ class Station:
         self._run = threading.local()
         self.notice: Callable[[str], object] = lambda text: None
         """Told in one sentence whom this station waits for."""
+        self.released: Callable[[bytes, str], AbstractContextManager[object]] = lambda uuid, command: nullcontext()
+        """``with station.released(uuid, "write"):`` nobody of this home measures the node for the length of the block.
+
+        A command that writes enters it before it speaks to the node. Raises PolicyRefused where a running `ncap` does
+        not let the node go; where none runs, or in that process itself, there is nothing to do.
+        """
         self.use_agent = True
         """Whether what ``unlock`` holds open opens the vault; False where the passphrase itself is asked for."""
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later

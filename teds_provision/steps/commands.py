@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -69,20 +69,31 @@ class Visit:
 
 @contextmanager
 def at_node(
-    station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter, *, unlock: Unlock = "if held"
+    station: Station,
+    links: LinkSettings,
+    uuid: bytes,
+    reporter: Reporter,
+    *,
+    unlock: Unlock = "if held",
+    writes: str = "",
 ) -> Iterator[Visit]:
     """Meet node ``uuid`` on the chosen link and have it prove its key.
 
     The vault is opened before anyone is waited for: always, where a key of this node is held, or never. Another
-    command of this station that works on the same node is waited for. Raises NoReader, NoNode after ``links.timeout``
-    seconds, OtherKey, NotAuthentic, LinkFailure.
+    command of this station that works on the same node is waited for. ``writes`` is the command that writes to the
+    node: a running `ncap` of this home that measures it lets it go meanwhile. Raises NoReader, NoNode after
+    ``links.timeout`` seconds, OtherKey, NotAuthentic, LinkFailure; PolicyRefused where the node is not let go.
     """
 
     def before() -> None:
         if unlock != "never":
             station.unlock(None if unlock == "always" else uuid)
 
-    with meet(station, links, uuid, reporter, before=before) as node, station.turn(uuid):
+    with (
+        meet(station, links, uuid, reporter, before=before) as node,
+        station.turn(uuid),
+        station.released(uuid, writes) if writes else nullcontext(),
+    ):
         yield Visit(station, node, identify(station, node))
 
 
@@ -254,7 +265,7 @@ def agree_at(
         return AgreeDone(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
     if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
         confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
-    with at_node(station, links, uuid, reporter, unlock="always") as visit:
+    with at_node(station, links, uuid, reporter, unlock="always", writes="agree") as visit:
         return AgreeDone(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=confirm))
 
 
@@ -273,7 +284,7 @@ def set_address_at(
     uuid = station.nodes.resolve(node)
     if dry_run:
         return AddressDone(uuid, None)
-    with at_node(station, links, uuid, reporter) as visit:
+    with at_node(station, links, uuid, reporter, writes="address") as visit:
         return AddressDone(uuid, set_address(station, visit.node, address))
 
 
@@ -341,7 +352,7 @@ def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter
 
 def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter) -> ResetReceipt:
     """Reset a node; see :func:`reset_node`."""
-    with at_node(station, links, uuid, reporter) as visit:
+    with at_node(station, links, uuid, reporter, writes="reset") as visit:
         return reset_node(station, visit.node, visit.who)
 
 
@@ -451,7 +462,7 @@ def write_at(
         return WriteDone(wanted, None)
     if jump is not None:
         jump("The sequence of this node is then used up that far, for good. Write it?")
-    with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
+    with at_node(station, links.after_agreeing(), uuid, reporter, writes="write") as visit:
         visit.session()
         if not retyped:
             channels = {channel for channel, _ in wanted}
@@ -700,7 +711,7 @@ def bring_back(
         now = station.nodes.datasheet(uuid)
         before = now.unsigned_blocks() if now is not None else {}
         return BroughtBack(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
-    with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always") as visit:
+    with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always", writes="write") as visit:
         visit.session()
         present = survey(visit.node)
         keep = {block: present.image.blocks[block] for block in present.read_only}

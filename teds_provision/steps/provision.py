@@ -95,7 +95,7 @@ def provision(
     """
     run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype)
     try:
-        with station.turn(node.uuid), station.run():
+        with station.turn(node.uuid), station.released(node.uuid, "provision"), station.run():
             return run.run()
     except TedsProvisionError as error:
         with suppress(StoreFailure):  # a full disk must not hide what happened

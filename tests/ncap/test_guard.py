@@ -96,6 +96,7 @@ def refusals(port: int) -> list[tuple[str, str, str, dict[str, str | None], Any,
         ("less than no node", "GET", "/api/v1/nodes?offset=-1", {}, None, 422, "usage"),
         ("more than a thousand nodes", "GET", "/api/v1/nodes?limit=1001", {}, None, 422, "usage"),
         ("the readers over the net", "GET", "/api/v1/lend", {}, None, 422, "refused"),
+        ("a measured node over the net", "GET", f"/api/v1/nodes/{'00' * 10}/let-go", {}, None, 422, "refused"),
         ("a login link over the net", "POST", "/api/v1/login-link", JSON, "{}", 422, "refused"),
     ]  # fmt: skip
 

@@ -70,6 +70,7 @@ class Job:
         self.sinks = self._new_sinks()
         self.measurement: Measurement | None = None
         self.ended: Ended | None = None
+        self.lent: set[bytes] = set()
         self.error: TedsProvisionError | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -94,7 +95,14 @@ class Job:
             if duration is None and self.kept.ends is not None:
                 duration = max(0.1, self.kept.ends - time.time())
             self.measurement = measurement = Measurement(
-                self.station, buses, uuids, self.request, self.sinks, self._facts(), watcher or Watcher()
+                self.station,
+                buses,
+                uuids,
+                self.request,
+                self.sinks,
+                self._facts(),
+                watcher or Watcher(),
+                lent=self.lent,
             )
             measurement.began = lambda: self._began(duration)
             self._commands = measurement.command
@@ -118,6 +126,19 @@ class Job:
         self._stop.set()
         if self._thread is not None:
             self._thread.join(seconds)
+
+    def let_go(self, uuid: bytes, why: str, seconds: float) -> bool:
+        """Measure a node no more until :meth:`take_back`; False where it did not end in order within ``seconds``."""
+        self.lent.add(uuid)
+        measurement = self.measurement
+        return measurement is None or measurement.let_go(uuid, why, seconds)
+
+    def take_back(self, uuid: bytes) -> None:
+        """Measure a node again that was let go."""
+        measurement = self.measurement
+        if measurement is not None:
+            measurement.take_back(uuid)
+        self.lent.discard(uuid)
 
     @property
     def alive(self) -> bool:

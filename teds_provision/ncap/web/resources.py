@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -15,8 +16,9 @@ from starlette.routing import Route
 
 from teds_provision.api import bodies
 from teds_provision.api.operations import FURTHEST, LONGEST_TEXT, MOST_ENTRIES, MOST_NODES, document
-from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import NotFound, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.measuring import LONGEST_LOAN, Loan
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import body_of, changing, moving, reading
 from teds_provision.ncap.web.guard import CALLER, Caller
@@ -59,6 +61,7 @@ class Resources:
             Route("/login-link", self.login_link, methods=["POST"]),
             Route("/openapi.json", self.openapi),
             Route("/lend", self.lend),
+            Route("/nodes/{uuid}/let-go", self.let_go),
         ]
 
     async def _node_of(self, request: Request) -> str:
@@ -167,6 +170,34 @@ class Resources:
                     watch.give_back(request)
 
         return StreamingResponse(lent(), media_type="text/plain")
+
+    async def let_go(self, request: Request) -> Response:
+        """GET /nodes/UUID/let-go: a measured node is the caller's to write to until this answer is ended.
+
+        Over the socket alone. A caller that dies closes it, and one that hangs has the node for a while only.
+        """
+        caller: Caller = request.scope[CALLER]
+        if caller.kind != "socket":
+            raise PolicyRefused("A measured node is only let go to a command on the station's own machine.")
+        uuid = request.path_params["uuid"].lower()
+        measuring, until = self._daemon.measuring, time.monotonic() + LONGEST_LOAN
+        why = f"let go for {request.query_params.get('for', 'a command')[:40]}"
+        loan = Loan(uuid, why)
+
+        async def had() -> AsyncIterator[str]:
+            try:
+                try:
+                    yield "let go\n" if await changing(measuring.let_go, loan) else "not measured\n"
+                except TedsProvisionError as error:
+                    yield f"refused: {error.message}\n"
+                    return
+                while time.monotonic() < until:  # a client that has gone is seen when it is written to
+                    await asyncio.sleep(_LENT_LOOK)
+                    yield ".\n"
+            finally:  # nothing can be awaited here: the client may have gone
+                asyncio.get_running_loop().run_in_executor(None, measuring.give_back, loan)
+
+        return StreamingResponse(had(), media_type="text/plain")
 
     # -- nodes -------------------------------------------------------------------------------------------------------
 

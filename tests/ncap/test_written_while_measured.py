@@ -1,0 +1,185 @@
+"""A command that writes to a node which the running base station measures: it is let go, written, and given back."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision import client
+from teds_provision.errors import PolicyRefused
+from tests.e2e.desk import ANGLE, Desk
+from tests.ncap.test_survives import Lab
+from tests.pace import until
+
+pytestmark = pytest.mark.link
+HOLDER = """
+import sys, time
+from teds_provision import client
+with client.connect(home=sys.argv[1]).released(sys.argv[2], "write") as had:
+    print(had, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture(scope="module")
+def one_lab(tmp_path_factory: pytest.TempPathFactory, prepared: Path) -> Iterator[Lab]:
+    desk = Desk(tmp_path_factory.mktemp("written"), prepared)
+    try:
+        yield Lab(desk)
+    finally:
+        desk.clear()
+
+
+@pytest.fixture
+def lab(one_lab: Lab) -> Iterator[Lab]:
+    yield one_lab
+    one_lab.tidy()
+
+
+def told(lab: Lab) -> list[dict[str, Any]]:
+    """What the daemon said of the node being measured, in order."""
+    process = lab.service.process
+    assert process is not None
+    while process.read(0.1):
+        pass
+    lines = [json.loads(line) for line in process.out[: process.out.rfind("\n") + 1].splitlines()]
+    return [one for one in lines if one.get("event") == "measurement" and one.get("uuid") == lab.node.uuid]
+
+
+def states(lab: Lab) -> list[str]:
+    return [one["state"] for one in told(lab)]
+
+
+def calibrated(lab: Lab, most: float) -> Path:
+    """A calibration whose values end elsewhere."""
+    file = lab.desk.folder / f"to-{most}.csv"
+    file.write_text(f"# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,{most}\n")
+    return file
+
+
+def test_a_node_is_provisioned_while_it_is_measured_and_the_gap_is_told(lab: Lab) -> None:
+    """Its values follow the new calibration from then on, in the same measurement and the same recording."""
+    lab.service.start()
+    measurement = lab.measure(sinks=["gap.jsonl"])
+    words = ["--profile", ANGLE, "--calibration", calibrated(lab, 180.0), "--yes", *lab.desk.links.over("can")]
+    done = lab.service.station.ask("provision", lab.node.uuid, *words)
+    assert done["verdict"] == "authentic"
+    until(lambda: states(lab)[-1:] == ["joined"])
+    assert states(lab) == ["joined", "left", "joined"]
+    assert told(lab)[1]["why"] == "let go for provision"
+    assert told(lab)[1]["id"] == measurement
+    lab.flows()
+    lab.service.end()
+    lines = [json.loads(line) for line in (lab.service.station.home / "recordings/gap.jsonl").read_text().splitlines()]
+    assert len({one["fingerprint"] for one in lines if one["event"] == "channel"}) == 2
+    assert any(one["event"] == "status" and one["why"] == "let go for provision" for one in lines)
+
+
+def test_write_and_address_have_the_node_let_go_too(lab: Lab) -> None:
+    station, over = lab.service.station, lab.desk.links.over("can")
+    lab.service.start()
+    lab.measure()
+    sequence = station.ask("history", lab.node.uuid)["history"][0]["sequence"]
+    assert station.ask("write", lab.node.uuid, "--from", sequence, *over)["verified"]
+    lab.flows()
+    before = station.ask("nodes", lab.node.uuid)["nodes"][0]["can_address"]
+    other = before % 239 + 1
+    assert station.ask("address", lab.node.uuid, other, *over)
+    until(lambda: states(lab).count("joined") == 3, "it is measured at its new address")
+    lab.flows()
+    assert lab.state()["address"] == other
+    lab.service.end()
+
+
+def test_a_writer_that_is_killed_gives_the_node_back(lab: Lab) -> None:
+    lab.service.start()
+    lab.measure()
+    words = [sys.executable, "-c", HOLDER, lab.service.station.home, lab.node.uuid]
+    with subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "True\n"
+        until(lambda: states(lab)[-1:] == ["left"])
+        holder.kill()
+    until(lambda: states(lab)[-1:] == ["joined"], "the node is not given back")
+    lab.flows()
+    lab.service.end()
+
+
+def test_two_writers_have_it_and_it_comes_back_after_the_last(lab: Lab) -> None:
+    lab.service.start()
+    lab.measure()
+    home = lab.service.station.home
+    with client.connect(home=home).released(lab.node.uuid, "write") as first:
+        assert first is True
+        with client.connect(home=home).released(lab.node.uuid, "address") as second:
+            assert second is True
+        time.sleep(1.5)  # it would be back by now
+        assert states(lab)[-1] == "left"
+    until(lambda: states(lab)[-1] == "joined")
+    assert states(lab) == ["joined", "left", "joined"]
+    lab.service.end()
+
+
+def test_a_node_that_goes_while_its_writer_has_it_is_measured_when_it_comes_back(lab: Lab) -> None:
+    lab.service.start()
+    lab.measure()
+    with client.connect(home=lab.service.station.home).released(lab.node.uuid, "write"):
+        lab.node.kill()
+    lab.power()
+    until(lambda: states(lab)[-1] == "joined")
+    lab.flows()
+    lab.service.end()
+
+
+def test_a_measurement_that_is_deleted_under_a_writer_stays_deleted(lab: Lab) -> None:
+    lab.service.start()
+    measurement = lab.measure()
+    with client.connect(home=lab.service.station.home).released(lab.node.uuid, "write"), lab.service.client() as asked:
+        asked.end_measurement(measurement)
+    time.sleep(1.0)
+    assert states(lab)[-1] == "left"
+    assert lab.state()["measurement"] is None
+    lab.service.end()
+
+
+def test_what_nobody_measures_need_not_be_let_go(lab: Lab) -> None:
+    home = lab.service.station.home
+    with client.connect(home=home).released(lab.node.uuid, "write") as had:
+        assert had is False, "no base station runs"
+    lab.service.start()
+    with client.connect(home=home).released(lab.node.uuid, "write") as had:
+        assert had is False
+    lab.service.end()
+
+
+@pytest.mark.parametrize("answer", ["", "refused: It is busy.\n"], ids=["nothing", "no"])
+def test_a_base_station_that_does_not_answer_is_6(tmp_path: Path, answer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "LETTING_GO", 0.5)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / client.SOCKET))
+        listener.listen()
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                connection.recv(4096)
+                if answer:
+                    connection.sendall(f"HTTP/1.1 200 OK\r\nContent-Length: {len(answer)}\r\n\r\n{answer}".encode())
+                connection.recv(1)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        with pytest.raises(PolicyRefused) as refused, client.connect(home=tmp_path).released("00" * 10, "write"):
+            pass
+        assert refused.value.exit_code == 6
+        assert ("It is busy." in refused.value.message) == bool(answer)
+        thread.join(5)
