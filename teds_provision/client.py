@@ -253,6 +253,8 @@ class Client:
         self,
         *uuids: str,
         group: str | None = None,
+        match: str | None = None,
+        frozen: bool = False,
         channels: Sequence[int] = (),
         rate: float | None = None,
         kind: Kind | None = None,
@@ -262,10 +264,15 @@ class Client:
         dead_man: int | None = None,
         scalar_rate: float | None = None,
     ) -> Measurement:
-        """Measure nodes, or a ``group``, from now on; ``rate`` and ``scalar_rate`` in Hz, ``dead_man`` in ms."""
+        """Measure nodes, a ``group``, or whoever comes and is meant by ``match``, from now on.
+
+        ``rate`` and ``scalar_rate`` in Hz, ``dead_man`` in ms. ``frozen``: nobody joins later, none is let go.
+        """
         body = {
             "uuids": uuids,
             "group": group,
+            "match": match,
+            "frozen": frozen,
             "channels": channels,
             "rate": rate,
             "kind": kind,

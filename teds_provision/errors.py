@@ -143,6 +143,12 @@ class CalibrationMisfit(PolicyRefused):
     code = "calibration-misfit"
 
 
+class NoRoom(PolicyRefused):
+    """The bus, or the budget of messages, has no room for a node's data."""
+
+    code = "no-room"
+
+
 class NodeRefused(PolicyRefused):
     """The node refused a command; ``reason`` is the u8 of profile.md, "Reasons"."""
 

@@ -163,6 +163,8 @@ class Measurement(TypedDict):
 
     id: str
     group: str | None
+    match: Annotated[str | None, Meta(description="whoever comes and is meant by this; uuids are those that are in")]
+    frozen: bool
     uuids: list[Uuid]
     channels: NotRequired[list[int]]
     rate: float | None

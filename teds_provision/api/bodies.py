@@ -100,6 +100,14 @@ class NewMeasurement:
 
     group: str | None = None
     uuids: list[str] = field(default_factory=list)
+    match: (
+        Annotated[
+            str,
+            Meta(minLength=1, maxLength=1000, description="measure whoever comes: all, type:P, name:GLOB, group:G, …"),
+        ]
+        | None
+    ) = None
+    frozen: Annotated[bool, Meta(description="nobody joins later, and no writer has a node let go")] | None = None
     channels: list[Number] | None = None
     rate: Annotated[float, Meta(minimum=0.001, maximum=1e6, description="Hz, else the datasheet's")] | None = None
     kind: Kind | None = None
@@ -113,8 +121,9 @@ class NewMeasurement:
         oneOf=[
             {"required": ["group"], "properties": {"group": {"type": "string"}}},
             {"required": ["uuids"], "properties": {"uuids": {"type": "array", "minItems": 1}}},
+            {"required": ["match"], "properties": {"match": {"type": "string"}}},
         ],
-        description='A measurement needs either "group" or "uuids".',
+        description='A measurement needs one of "group", "uuids" and "match".',
     )
 
 

@@ -19,7 +19,7 @@ import click
 from teds_provision import client
 from teds_provision.cli.configuration import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, WholeNumber, command, examples, tracing
+from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples, tracing
 from teds_provision.cli.rendering import shown
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import how_to_install, late
@@ -29,11 +29,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.api.bodies import Mode
+    from teds_provision.measure import matching
     from teds_provision.ncap import running, settings
     from teds_provision.ncap.web import tokens
 else:
     running, settings = late("teds_provision.ncap.running"), late("teds_provision.ncap.settings")
     tokens = late("teds_provision.ncap.web.tokens")
+    matching = late("teds_provision.measure.matching")
 
 
 MOST: Final = 1000  # lines that may wait for somebody to read them
@@ -44,11 +46,16 @@ _FILE = FileToRead(exists=True)
 
 @command(
     "teds-provision ncap run --http 127.0.0.1:8351 --can socketcan:can0 --nfc usb",
+    "teds-provision ncap run --measure all --can socketcan:can0 --ros2",
     "teds-provision ncap run --can socketcan:can0 --record /var/lib/measured --mqtt mqtt://broker",
     name="run",
 )
 @click.option("--detection", type=click.Choice(["transparent", "whitelist"]), help="Which nodes to accept.")
 @click.option("--adopt", is_flag=True, help="In transparent mode, key factory nodes on a wired bus.")
+@click.option("--measure", metavar="all|GROUP|EXPR", help="Measure every authentic node that comes: all, a group, or "
+              "type:PROFILE, name:GLOB, group:NAME, 'angle >= 360 deg', joined by commas.")  # fmt: skip
+@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="With --measure: at most so many samples a second.")
+@click.option("--frozen", is_flag=True, help="With --measure: only the nodes known at the start, as one group array.")
 @click.option("--http", metavar="HOST:PORT", help="Serve the page and the API on this address, e.g. 127.0.0.1:8351.")
 @click.option(
     "--http-allow",
@@ -101,6 +108,8 @@ def run(
     Prints one line when it is ready, then one line per event.
     """
     _require_extra()
+    if wished["measure"] is None and (wished["rate"] is not None or wished["frozen"]):
+        raise UsageFailure("--rate and --frozen belong to --measure.", hint="Add --measure all.")
     places = [f"{link}:{one}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for one in named]
     sinks = [name for name, asked in (("ros1", ros1), ("ros2", ros2), (mqtt or "", mqtt)) if asked]
     wanted = settings.Settings(
@@ -113,6 +122,8 @@ def run(
     settings.require_safe(wanted)
     settings.require_places(wanted)
     station = app.station()
+    if wanted.measure is not None:
+        matching.Match.parse(wanted.measure).require_groups(station)
     station.unlock()  # nobody is asked for a passphrase later
     lines = Lines(app)
     with tracing(trace) as opened:
@@ -227,7 +238,11 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         name = shown(node["name"]) or "no name"
         console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}", markup=False)
     for one in found.get("measurements", ()):
-        console.print(f"measurement {one['id']}: {one['state']}", markup=False)
+        what = f" of {one['match']}" if one.get("match") else ""
+        console.print(f"measurement {one['id']}{what}: {one['state']}", markup=False)
+        for node in one["nodes"] if what else ():
+            why = f": {node['why']}" if node["why"] else ""
+            console.print(f"  {node['uuid']} {node['state']}{why}", markup=False)
     for one in found.get("sinks", ()):
         why = one["error"] or one["detail"]
         told = f"{one['state']}, {one['dropped']} dropped{f': {why}' if why else ''}"
@@ -245,6 +260,28 @@ def _link(link: dict[str, Any]) -> str:
     problem = f": {link['problem']['message']}" if link["problem"] else ""
     others = f", {link['strangers']} not on the whitelist" if link["strangers"] else ""
     return f"{link['place']}: {link['state']}, {link['nodes']} nodes{others}{problem}"
+
+
+@command(
+    "teds-provision ncap measure all",
+    "teds-provision ncap measure type:magnetic-angular-position-sensor --rate 100",
+    "teds-provision ncap measure 'group:arm,angle >= 360 deg' --frozen",
+    name="measure",
+)
+@click.argument("expression", metavar="EXPR")
+@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="At most so many samples a second.")
+@click.option("--frozen", is_flag=True, help="Only the nodes that match now, as one group array; none joins or leaves.")
+@click.option("--to", "files", multiple=True, metavar="NAME", help="Record to NAME.mcap, .jsonl, .csv; repeatable.")
+@pass_app
+def measure(app: App, expression: str, rate: float | None, frozen: bool, files: Sequence[str]) -> None:
+    """Measure every authentic node that comes and matches.
+
+    The running base station does it. EXPR is all, a group, or type:PROFILE, name:GLOB, group:NAME and bounds such as
+    'angle >= 360 deg', joined by commas; all must hold. It is kept until it is deleted on the page or through the API.
+    """
+    with client.connect(home=app.home) as station:
+        made = station.measure(match=expression, rate=rate, frozen=frozen, sinks=files)
+    app.emit({**made}, f"Measuring {expression} (measurement {made['id']}).")
 
 
 @command("teds-provision ncap detection transparent", name="detection")
@@ -329,5 +366,5 @@ def remove(app: App, name: str) -> None:
 for one in (add, list_tokens, remove):
     token.add_command(one)
 
-for one in (run, status, detection, open_page, token):
+for one in (run, status, measure, detection, open_page, token):
     ncap.add_command(one)

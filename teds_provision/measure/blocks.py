@@ -55,6 +55,7 @@ class ChannelFacts:
     quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
     vector: tuple[int, ...] = ()  # channels of the vector group that it is in, axis by axis; empty where in none
 
+    chosen: tuple[tuple[int, str], ...] | None = None  # names of its topics by channel (0: the node's part), if newer
     siblings: tuple[tuple[int, str], ...] = ()  # number and name of every channel of the datasheet, for topics
 
     @property
@@ -102,7 +103,9 @@ class Block:
 
 @dataclass(frozen=True)
 class GroupRows:
-    """Rows of a group on one grid of times: the "synchronized data" of all its channels.
+    """Rows of a group, or of one node, on one grid of times: the "synchronized data" of all its channels.
+
+    ``group`` is the name of the group, or the node's UUID where :attr:`StationFacts.each_node` says so.
 
     ``value`` (n × c) holds each channel's last value that is not newer than the row, ``age`` how much older it is;
     both NaN after two periods without a value.
@@ -157,6 +160,7 @@ class StationFacts:
     ``names`` maps (uuid, channel) to the topic that the user chose, channel 0 to the node's part of it;
     ``frame_ids`` maps a uuid to a frame. ``scalar_rate`` limits topics of one value (Hz), 0 leaves them out.
     ``nodes`` maps a uuid to the node's name, of every node that this station knows: topics are unique among them all.
+    ``each_node``: nodes come and go, and each has an array topic of its own in place of the group's.
     ``instance`` tells the measurements of one station apart, which may run side by side; "" where there is one alone.
     """
 
@@ -170,6 +174,7 @@ class StationFacts:
     scalar_rate: float = 10.0
     test_pattern: bool = False
     nodes: Mapping[str, str] = field(default_factory=dict)
+    each_node: bool = False
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from teds_provision.errors import (
     Bug,
     LinkFailure,
     NodeRefused,
+    NoRoom,
     NotAuthentic,
     PolicyRefused,
     TedsProvisionError,
@@ -35,7 +37,7 @@ from teds_provision.measure.running.patience import Patience
 from teds_provision.measure.running.streams import NodeStreams, added
 from teds_provision.measure.sightings import Sighting
 from teds_provision.measure.topic_actuators import TopicActuators
-from teds_provision.measure.trusting import Standing, Trusted, claim, open_trusted
+from teds_provision.measure.trusting import LEASE_EACH, LONGEST_LEASE, Standing, Trusted, claim, open_trusted
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
@@ -85,8 +87,9 @@ class NodeKeeper:
         self._lost_at = 0.0
         self._proven = True  # whether what failed last did so in a session
         self._patience = Patience(None)
-        self._sighting: Sighting | None = None  # where it was last
+        self.sighting: Sighting | None = None  # where it was last
         self._halved = 0
+        self._lease, self._claimed = request.lease, [0]
         self._driven: TopicActuators | None = None
         self._told = ""
         self._why = ""  # why it was asked to end, for its last report
@@ -101,7 +104,7 @@ class NodeKeeper:
             self._thread.join()
             self._stop.clear()
             self.done.clear()
-            self._why = ""
+            self._why, self.error = "", None
             self._thread = self._new_thread()
         self._thread.start()
 
@@ -140,6 +143,13 @@ class NodeKeeper:
                 if error is None or self._stop.is_set():
                     break
                 self.error = error
+                if self._request.newcomers:
+                    final = isinstance(error, (NotAuthentic, PolicyRefused, BadData))
+                    if isinstance(error, NoRoom):
+                        self._say("waiting", why="no room on the bus")
+                    else:
+                        self._say("refused" if final else "lost", error)
+                    return
                 if patience.gives_up(error, proven=self._proven, elsewhere=self._is_elsewhere):
                     self._say("refused", error)
                     return
@@ -164,8 +174,8 @@ class NodeKeeper:
 
     def _wait(self, pause: float, began: float) -> None:
         """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
-        if self._sighting is not None:
-            self._buses.sightings.on_announce(self._sighting, self._anew.set)
+        if self.sighting is not None:
+            self._buses.sightings.on_announce(self.sighting, self._anew.set)
         self._anew.wait(pause)
         self._buses.sightings.let_announce(self.uuid)  # from here on it is looked for
         self._stop.wait(max(0.0, began + AT_ONCE - time.monotonic()))
@@ -186,13 +196,15 @@ class NodeKeeper:
     def _once(self) -> None:
         seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._request.timeout, self._patience.left), 1))
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
-        self._sighting = sighting
+        self.sighting = sighting
         self.bus = self._buses.of(sighting)
         for other in self._buses.all():
             if other is not self.bus:
                 other.share.gone(self.uuid)
         try:
             self._in_session(self.bus, sighting)
+        except NoRoom:
+            raise
         except BaseException:
             self._lost_at = time.monotonic()
             self._buses.sightings.wrong(sighting)
@@ -265,8 +277,15 @@ class NodeKeeper:
         """Claim the sensors one by one, or the whole node at once where every sensor is measured."""
         sensors = [one for one in trusted.sheet.channels if not one.actuator]
         whole = bool(channels) and len(channels) == len(sensors)
-        for number in [0] if whole else [one.number for one in channels]:
-            claim(trusted, number, lease=self._request.lease)
+        self._claimed = [0] if whole else [one.number for one in channels]
+        self._lease = self._lease_now()
+        for number in self._claimed:
+            claim(trusted, number, lease=self._lease)
+
+    def _lease_now(self) -> int:
+        """The lease grows with the bus, and with it the pause between two Clocks, so that many nodes do not fill it."""
+        nodes = self.bus.share.nodes if self.bus is not None else 0
+        return min(LONGEST_LEASE, max(self._request.lease, math.ceil(LEASE_EACH * nodes)))
 
     def _take_up(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> TopicActuators:
         return TopicActuators(
@@ -315,6 +334,7 @@ class NodeKeeper:
             test_pattern=self._request.test_pattern,
             start=start,
             slower=2**self._halved,
+            at_most=self._request.newcomers,
         )
 
     def _keep(self, bus: Bus, trusted: Trusted, standing: Standing) -> None:
@@ -328,15 +348,16 @@ class NodeKeeper:
 
     def _watch(self, bus: Bus, trusted: Trusted, standing: Standing, rest: Rest | None) -> None:
         told = time.monotonic()
-        every = self._request.lease / 3
         lied = False
         while not self._stop.is_set():
             self._anew.wait(LOOK)
             standing.require()
             now = time.monotonic()
-            if self._doubted(now) or now - told >= every:
+            if self._doubted(now) or now - told >= self._lease / 3:
                 with self.turn:
                     self.streams.tell_time(trusted)
+                    if self._lease_now() > self._lease:
+                        self._claim_longer(trusted)
                 told = now
             elif rest is not None:
                 with self.turn:
@@ -351,6 +372,11 @@ class NodeKeeper:
                 raise LinkFailure(
                     f"No message of the node came for {silent:.1f} s.", hint="Check its power and the bus."
                 )
+
+    def _claim_longer(self, trusted: Trusted) -> None:
+        self._lease = self._lease_now()
+        for number in self._claimed:
+            claim(trusted, number, lease=self._lease)
 
     def _heard_announce(self) -> None:
         self._announced = self._announced or time.monotonic()

@@ -163,6 +163,9 @@ class Lookout(Asking):
         self._sightings.announced(self.port.place, announce)
         if self._sightings.awaits(announce):
             return SOON if self._believes(announce) else math.inf
+        if self._sightings.is_welcome(announce) and self._believes(announce):
+            self._ask_one(announce.address, PATIENCE)  # it alone: everybody's answers would cost the others' data
+            return math.inf
         if self._poll and announce.address not in self._announcers:
             self._announcers.append(announce.address)
         return math.inf
@@ -215,6 +218,10 @@ class Lookout(Asking):
                 self._saw(address, identity)
         for uuid, addresses in settled.twice.items():
             self._sightings.note(twice_text(uuid, addresses))
+
+    def ask(self, address: int, seconds: float) -> None:
+        """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkFailure."""
+        self._ask_one(address, seconds)
 
     def _ask_one(self, address: int, seconds: float) -> None:
         try:

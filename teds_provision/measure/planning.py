@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadData, NoRoom, PolicyRefused
 from teds_provision.protocol.operation.budget import BLE_OVERHEAD, MOST_LOAD, bus_load, frames, share
 from teds_provision.protocol.operation.datagram import MOST_OCTETS
 from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_STREAM_CHANNELS, SOON, Kind
@@ -85,10 +85,25 @@ class BusShare:
             self.lock.notify_all()
             self.lock.wait_for(lambda: self.expected <= self.wanted.keys(), SAYING)
 
-    def expect(self, uuids: Iterable[bytes]) -> None:
-        """More nodes are to come."""
+    def expect(self, uuids: Iterable[bytes], load: float | None = None) -> None:
+        """More nodes are to come; ``load`` is what each would take of an empty bus, where that is known."""
         with self.lock:
             self.expected.update(uuids)
+            if load is not None:
+                self.wanted.update(dict.fromkeys(uuids, load))
+            self.lock.notify_all()
+
+    @property
+    def room(self) -> float:
+        """Share of the bus that is free for data now."""
+        with self.lock:
+            return max(0.0, MOST_LOAD - self.time.taken - sum(self.taken.values()))
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes this process measures here, or is about to."""
+        with self.lock:
+            return len(self.expected | self.taken.keys())
 
     def gone(self, uuid: bytes) -> None:
         """A node that ended for good, or is on another bus, wants nothing any more."""
@@ -131,9 +146,14 @@ def plan_node(
     test_pattern: bool = False,
     start: int = SOON,
     slower: float = 1.0,
+    at_most: bool = False,
 ) -> Plans:
-    """Streams over these channels of one node; ``rate`` in Hz for all of them, ``slower`` multiplies every period."""
-    groups = _groups(channels, rate, kind)
+    """Streams over these channels of one node; ``rate`` in Hz for all of them, ``slower`` multiplies every period.
+
+    ``at_most``: a channel whose datasheet gives fewer samples than ``rate`` is measured at the datasheet's rate, where
+    an asked rate is refused otherwise.
+    """
+    groups = _groups(channels, rate, kind, at_most=at_most)
     factor = slower
     for _ in range(200):
         paced = [(round(period * factor), how, members) for period, how, members in groups]
@@ -144,7 +164,7 @@ def plan_node(
             break
         factor *= max(1.02, load / MOST_LOAD)
     else:
-        raise PolicyRefused("The bus has no room for another node's data.", hint="Measure fewer nodes, or more slowly.")
+        raise NoRoom("The bus has no room for another node's data.", hint="Measure fewer nodes, or more slowly.")
     slowed = _slowed(_fastest(groups), _fastest(paced), rate, by_bus=factor > slower)
     streams = tuple(replace(plan, subscribe=replace(plan.subscribe, gap=gap)) for plan in plans)
     return Plans(streams, load - bus.taken, slowed)
@@ -160,7 +180,7 @@ def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> st
         return ""
     possible = f"{1e9 / fastest:.6g}"
     if rate is not None:
-        raise PolicyRefused(
+        raise NoRoom(
             f"{rate:g} Hz does not fit the bus ({MOST_LOAD:.0%} of it for data).",
             hint=f"The fastest is --rate {possible}",
         )
@@ -192,13 +212,13 @@ _Paced = dict[tuple[int, Kind], list[Channel]]  # channels by period (ns) and ki
 _Group = tuple[int, Kind, list[Channel]]
 
 
-def _groups(channels: Sequence[Channel], rate: float | None, kind: Kind | None) -> list[_Group]:
+def _groups(channels: Sequence[Channel], rate: float | None, kind: Kind | None, *, at_most: bool) -> list[_Group]:
     """Channels by period and kind, at most 16 each; all at the slowest period where that makes too many streams."""
     paced: _Paced = {}
     for one in channels:
         event = one.kind == ChannelKind.EVENT_SENSOR
         how = Kind.EVENT if event else Kind.FREE if kind == Kind.FREE else Kind.PERIODIC
-        paced.setdefault((period_of(one, rate), how), []).append(one)
+        paced.setdefault((period_of(one, rate, at_most=at_most), how), []).append(one)
     groups = _cut(paced)
     if len(groups) > LAST_STREAM + 1:
         groups = _cut(_at_the_slowest(paced))
@@ -230,12 +250,14 @@ def _cut(paced: _Paced) -> list[_Group]:
     return groups
 
 
-def period_of(channel: Channel, rate: float | None) -> int:
+def period_of(channel: Channel, rate: float | None, *, at_most: bool = False) -> int:
     """Nanoseconds between samples: of the rate, never below the datasheet's SPeriod; whole microseconds if need be."""
     stated = round(channel.period * 1e9) if math.isfinite(channel.period) and channel.period > 0 else 0
     if rate is None:
         return min(stated or UNSTATED, LONGEST)
     period = round(1e9 / rate)
+    if at_most:
+        period = max(period, stated)
     if period < stated * (1 - 1e-6):
         raise PolicyRefused(
             f"Channel {channel.number} gives at most {1e9 / stated:g} samples a second.",

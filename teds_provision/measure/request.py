@@ -90,6 +90,7 @@ class MeasurementRequest:
     patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
     unsigned: bool = False  # whether raw values of a node are wanted whose datasheet nobody has signed
     require: Requirements | None = None
+    newcomers: bool = False  # nodes come and go: no room is kept for one that is away, and its first error ends it
     by: str = "measure"  # the command that a reading of the datasheet is put down to
 
 

@@ -70,6 +70,7 @@ class Measurement:
     began: Callable[[], None] = lambda: None
     lent: set[bytes] = field(default_factory=set)
     keepers: list[NodeKeeper] = field(default_factory=list, init=False)
+    ready: threading.Event = field(default_factory=threading.Event, init=False)  # nodes may join
 
     def run(self, stop: threading.Event, duration: float | None = None) -> Ended:
         """Measure until ``stop``, for ``duration`` seconds of data, or until no node is left.
@@ -79,7 +80,7 @@ class Measurement:
         self._host, self._lock = HostClock(), threading.Lock()
         self._setting = threading.Lock()  # of the clock: until it is free, no block goes on; taken after _lock
         self._known: dict[tuple[str, int], ChannelFacts] = {}
-        self._grid: Grid | None = None
+        self._grids: dict[str, Grid] = {}  # "": of all nodes together; else by UUID, each node's own
         self._for_grid: deque[Block] = deque()
         self._shown: dict[str, str] = {}  # what was told of each sink last, and since when one waits
         self._waits: dict[str, float] = {}
@@ -97,7 +98,7 @@ class Measurement:
         self.buses.expect(self.uuids)
         if self.request.require is not None:
             self.request.require.expect(self.uuids)
-        events = Events(self._block, self._describe, self._report)
+        events = self._events = Events(self._block, self._describe, self._report)
         self.keepers = [
             NodeKeeper(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
@@ -106,6 +107,7 @@ class Measurement:
             if keeper.uuid not in self.lent:
                 keeper.start()
         try:
+            self.ready.set()
             self._loop(stop, duration)
         finally:
             self._end()
@@ -154,11 +156,11 @@ class Measurement:
         return max(now + left, *first) + duration
 
     def _all_done(self) -> bool:
-        return not self.lent and all(keeper.done.is_set() for keeper in self.keepers)
+        return not self._open and not self.lent and all(keeper.done.is_set() for keeper in self.keepers)
 
     def _gave_up(self) -> bool:
         """Whether no node ever ran and each has had its time."""
-        return all(not one.ever_ran and isinstance(one.error, NoNode) for one in self.keepers)
+        return not self._open and all(not one.ever_ran and isinstance(one.error, NoNode) for one in self.keepers)
 
     def _look(self) -> None:
         for keeper in self.keepers:
@@ -185,15 +187,19 @@ class Measurement:
 
     def _rows(self) -> None:
         with self._lock:
-            rows = self._synchronized(self._grid) if self._grid is not None else None
-        if rows is not None:
+            found = self._synchronized()
+        for rows in found:
             for sink in self.sinks:
                 sink.write_group(rows)
 
-    def _synchronized(self, grid: Grid) -> GroupRows | None:
+    def _synchronized(self) -> list[GroupRows]:
         while self._for_grid:
-            grid.take(self._for_grid.popleft())
-        return grid.rows(self._host.now())
+            block = self._for_grid.popleft()
+            grid = self._grids.get(block.uuid if self._open else "")
+            if grid is not None:
+                grid.take(block)
+        now = self._host.now()
+        return [rows for grid in self._grids.values() if (rows := grid.rows(now)) is not None]
 
     def _follow_the_clock(self) -> None:
         """The system's clock was set: what is measured until now is handed on by the old one, the rest by the new one.
@@ -201,14 +207,13 @@ class Measurement:
         Without it a clock that was wrong when the daemon began would be wrong in every stamp until its end.
         """
         with self._lock, self._setting:
-            rows = self._synchronized(self._grid) if self._grid is not None else None
+            found = self._synchronized()
             news = ClockSet(by=self._host.set_anew(), time=self._host.now())
             for sink in self.sinks:
-                if rows is not None:
+                for rows in found:
                     sink.write_group(rows)
                 sink.clock_set(news)
-            if self._grid is not None:
-                self._grid = self._new_grid()
+            self._grids = {uuid: self._new_grid(uuid) for uuid in self._grids}
         self.watcher.note(news.words)
 
     @contextmanager
@@ -223,6 +228,30 @@ class Measurement:
             return
         with keeper.turn:
             yield keeper.trusted
+
+    @property
+    def _open(self) -> bool:
+        """Whether nodes come and go."""
+        return self.request.newcomers
+
+    def join(self, uuid: bytes) -> NodeKeeper:
+        """Take in a node that has come, or come back; nobody else notices. Its counts go on where they ended."""
+        keeper = self._keeper(uuid)
+        if keeper is None:
+            keeper = NodeKeeper(
+                self.station, self.buses, uuid, self.request, self._host, self._events, self._common_start
+            )
+            self.keepers = [*self.keepers, keeper]
+        if not self._ending:
+            keeper.start()
+        return keeper
+
+    def leave(self, uuid: bytes, why: str) -> None:
+        """End one node in order; its counts stay."""
+        keeper = self._keeper(uuid)
+        if keeper is not None and keeper.begun:
+            keeper.stop(why)
+            keeper.join(ENDING)
 
     def let_go(self, uuid: bytes, why: str, seconds: float) -> bool:
         """End one node in order for as long as somebody else works on it; False where that took longer."""
@@ -261,25 +290,42 @@ class Measurement:
                 block = replace(block, time=block.time + self._host.since(block.clock), clock=setting)
             for sink in self.sinks:
                 sink.write(block)
-            if self._grid is not None:
+            if self._grids:
                 self._for_grid.append(block)  # without _lock: the thread that hears must not wait while rows are made
         self.watcher.block(block)
 
+    def _with_names(self, facts: Sequence[ChannelFacts]) -> Sequence[ChannelFacts]:
+        """The facts of a node that joins, with the names of its topics as they are now: they may be newer than ours."""
+        uuids = {one.uuid for one in facts}
+        names = {(uuid.hex(), channel): name for (uuid, channel), name in self.station.measurements.names.items()}
+        own = {key: name for key, name in names.items() if key[0] in uuids}
+        others = {key: name for key, name in self.facts.names.items() if key[0] not in uuids}
+        if dict(self.facts.names) != others | own:
+            self.facts = replace(self.facts, names=others | own)
+        chosen = {uuid: tuple((number, name) for (key, number), name in own.items() if key == uuid) for uuid in uuids}
+        return [replace(one, chosen=chosen[one.uuid]) for one in facts]
+
     def _describe(self, facts: Sequence[ChannelFacts]) -> None:
+        if self._open:
+            facts = self._with_names(facts)
         with self._lock:
             before = dict(self._known)
             self._known.update((one.key, one) for one in facts)
             if self._known != before and any(sink.wants_rows for sink in self.sinks):
-                self._grid = self._new_grid()
+                for uuid in {one.uuid for one in facts} if self._open else {""}:
+                    self._grids[uuid] = self._new_grid(uuid)
         for sink in self.sinks:
             sink.describe(facts)
         self.watcher.facts(facts)
 
-    def _new_grid(self) -> Grid:
-        spans = [heard.receiver.plan.span for one in self.keepers for heard in list(one.streams.running.values())]
+    def _new_grid(self, uuid: str) -> Grid:
+        """Of one node, or of all of them ("")."""
+        keepers = [one for one in self.keepers if uuid in ("", one.uuid.hex())]
+        spans = [heard.receiver.plan.span for one in keepers for heard in list(one.streams.running.values())]
         patience = max(spans, default=0) / 1e9 + 2 * BEAT
-        sensors = [one for _, one in sorted(self._known.items()) if one.kind != "actuator"]
-        return Grid(self.facts.group or "all", sensors, patience=patience)
+        known = [one for _, one in sorted(self._known.items()) if one.kind != "actuator"]
+        sensors = [one for one in known if uuid in ("", one.uuid)]
+        return Grid(uuid or self.facts.group or "all", sensors, patience=patience)
 
     def _report(self, report: NodeReport) -> None:
         for sink in self.sinks:

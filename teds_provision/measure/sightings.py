@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from teds_provision.errors import LinkFailure, NoNode
@@ -66,6 +66,7 @@ class Sightings:
     _announced: dict[bytes, tuple[Place, Callable[[], None]]] = field(default_factory=dict)
     _missing: dict[bytes, int] = field(default_factory=dict)
     _unseen: set[bytes] = field(default_factory=set)  # those that somebody waited for, and that were not seen since
+    _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
     gone: int = 0  # how often a node that had been seen, or was never looked for, became missing
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
@@ -114,6 +115,19 @@ class Sightings:
         """Whether somebody waits for the node that this says it is."""
         with self._turn:
             return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
+
+    def welcome(self, uuids: Iterable[bytes]) -> None:
+        """Nodes that are to be asked at once when they announce themselves: whoever waits for them, waits for none."""
+        self._welcome = frozenset(map(uuid_crc, uuids))
+
+    def is_welcome(self, announce: Announce) -> bool:
+        """Whether this says that it is such a node."""
+        return announce.crc in self._welcome
+
+    def seen_at(self, uuid: bytes) -> Sighting | None:
+        """Where a node was seen last; None where it was not, or turned out not to be."""
+        with self._turn:
+            return max(self._seen.get(uuid, {}).values(), key=lambda one: one.at, default=None)
 
     def missing(self) -> bool:
         """Whether somebody waits for a node."""

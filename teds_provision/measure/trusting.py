@@ -61,7 +61,8 @@ def _known(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-LEASE = 10  # seconds that a claim holds without a word of this station
+LEASE, LONGEST_LEASE = 10, 60  # seconds that a claim holds without a word of this station
+LEASE_EACH = 0.2  # seconds of lease for each node of the bus, so that asking all for their clocks stays below a tenth
 DEAD_MAN = 1000  # milliseconds without a set point after which an actuator is safe
 
 

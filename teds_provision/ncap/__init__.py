@@ -7,6 +7,7 @@ module                what it does
 ``settings``          what it was started with
 ``daemon``            begins and ends all of its parts, in order
 ``measuring``         what it measures, across restarts
+``newcomers``         who joins and leaves one that measures whoever comes
 ``sinks``, ``names``  where values go, and under which topics
 ``live``              values and events to many clients, none of which holds up another
 ``nodes/``            the nodes on its links, and what is done with them

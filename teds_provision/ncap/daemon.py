@@ -96,6 +96,8 @@ class Daemon:
         if self.virtuals.all():
             self._start_virtuals()
         self.measuring.start()
+        if self.settings.measure is not None:
+            self.measuring.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
         try:
             yield
         finally:
@@ -158,6 +160,7 @@ class Daemon:
         return next((watch.port for watch in self.watches if watch.place == place), None)
 
     def _saw(self, sighting: Sighting) -> None:
+        self.measuring.saw(sighting.uuid.hex())
         for watch in self.watches:
             if watch.port is sighting.port:
                 watch.saw(sighting)

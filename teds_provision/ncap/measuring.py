@@ -10,12 +10,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
-from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import Frozen, NodeBusy, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport, StationFacts
 from teds_provision.measure.buses import Buses
+from teds_provision.measure.matching import Match, why_not_measured
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
@@ -23,6 +24,7 @@ from teds_provision.measure.running.job import Job
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
 from teds_provision.ncap.live import Live
+from teds_provision.ncap.newcomers import Newcomers
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import as_problem
 from teds_provision.ncap.nodes.roster import Roster
@@ -46,7 +48,8 @@ class Running:
     """One measurement that runs, or tries to."""
 
     kept: Measurement
-    uuids: tuple[str, ...]
+    uuids: tuple[str, ...]  # of one that takes in whoever comes: those that are in
+    newcomers: Newcomers | None = None
     job: Job | None = None
     state: str = "starting"
     why: str = ""
@@ -99,6 +102,24 @@ class Measuring:
         for kept in self._station.measurements.due():
             self._begin(kept)
 
+    def match(self, expression: str, *, rate: float | None = None, frozen: bool = False) -> None:
+        """Measure whoever comes and is meant, for the life of this process (``ncap run --measure``).
+
+        Raises UsageFailure, NotFound for an expression that says nothing, or names a group that is not there.
+        """
+        Match.parse(expression).require_groups(self._station)
+        same = (expression, rate, frozen)
+        if any((one.match, one.rate, one.frozen) == same for one in self._station.measurements.due()):
+            return  # it is kept already
+        self._begin(Measurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
+
+    def saw(self, uuid: str) -> None:
+        """A node answered on a bus; called before anybody else looks at it."""
+        with self._guard:
+            every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
+        for newcomers in every:
+            newcomers.saw(uuid)
+
     def stop(self) -> None:
         """End all of them in order; what is kept stays kept."""
         with self._guard:
@@ -115,6 +136,8 @@ class Measuring:
         *,
         group: str | None = None,
         uuids: Sequence[str] = (),
+        match: str | None = None,
+        frozen: bool = False,
         channels: Sequence[int] = (),
         rate: float | None = None,
         kind: Any = None,
@@ -129,8 +152,16 @@ class Measuring:
         Raises UsageFailure (no node, a sink that cannot be named so), NotFound (the group), NodeBusy (one of the nodes
         is measured already).
         """
-        if (group is None) == (not uuids):
-            raise UsageFailure("A measurement needs either a group or nodes.", hint='Give "group" or "uuids".')
+        if sum((group is not None, bool(uuids), match is not None)) != 1:
+            raise UsageFailure(
+                "A measurement needs a group, nodes, or an expression.", hint='Give "group", "uuids" or "match".'
+            )
+        if match is not None:
+            Match.parse(match).require_groups(self._station)
+            if trigger and not frozen:
+                raise UsageFailure(
+                    "Nodes that come one by one cannot begin together.", hint="Leave the trigger out, or freeze it."
+                )
         kept = Measurement(
             "",
             group=group,
@@ -140,12 +171,14 @@ class Measuring:
             kind=kind,
             trigger=trigger,
             sinks=tuple(self._sinks.whole(spec) for spec in sinks),
-            actuators=actuators,
+            actuators=actuators and match is None,  # actuators are never claimed for whoever comes
+            match=match,
+            frozen=frozen,
             dead_man=self._dead_man if dead_man is None else dead_man,
             scalar_rate=scalar_rate,
         )
         nodes = self._station.measurements.nodes_of(kept)
-        if not nodes:
+        if not nodes and match is None:
             raise UsageFailure(f"Group {group!r} is empty.", hint="Add a node to it first.")
         for uuid in nodes:
             other = self.of(uuid.hex())
@@ -158,7 +191,9 @@ class Measuring:
             self._sinks.open(spec)
         with self._station.durable("measure"):
             kept = self._station.measurements.keep(kept)
-            self._station.audit("measure", None, "begun", id=kept.id, group=group, nodes=[one.hex() for one in nodes])
+            self._station.audit(
+                "measure", None, "begun", id=kept.id, group=group or match, nodes=[one.hex() for one in nodes]
+            )
         return self._json(self._begin(kept))
 
     def _require_plan(self, uuid: bytes, kept: Measurement) -> None:
@@ -239,9 +274,16 @@ class Measuring:
         in order within :data:`LETTING_GO` seconds; then it is measured on.
         """
         with self._lending:
-            job = self._job_of(loan.uuid)
-            if job is None or loan.ended:
+            if loan.ended:
                 return False
+            job = self._job_of(loan.uuid)
+            if job is None:  # and nobody begins to meanwhile
+                self._loans.setdefault(loan.uuid, []).append(loan)
+                return False
+            if job.kept.frozen:
+                raise Frozen(
+                    f"Node {loan.uuid} is in a frozen measurement ({job.kept.id}).", hint="End the measurement first."
+                )
             self._loans.setdefault(loan.uuid, []).append(loan)
             if job.let_go(bytes.fromhex(loan.uuid), loan.why, LETTING_GO):
                 return True
@@ -264,6 +306,9 @@ class Measuring:
             job = self._job_of(loan.uuid)
             if job is not None:
                 job.take_back(bytes.fromhex(loan.uuid))
+                return
+        if self._roster.seen(loan.uuid).present:
+            self.saw(loan.uuid)
 
     def sheet(self, uuid: str) -> Image | None:
         """The datasheet of a node that is measured: the one that its session verified, and that nobody may change."""
@@ -298,6 +343,8 @@ class Measuring:
         return {
             "id": kept.id,
             "group": kept.group,
+            "match": kept.match,
+            "frozen": kept.frozen,
             "uuids": list(one.uuids),
             "channels": list(kept.channels),
             "rate": kept.rate,
@@ -309,7 +356,10 @@ class Measuring:
             "created": kept.created,
             "state": one.state,
             "why": one.why,
-            "nodes": [one.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""}) for uuid in one.uuids],
+            "nodes": [
+                one.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""})
+                for uuid in dict.fromkeys((*one.uuids, *(one.reports if one.newcomers is not None else ())))
+            ],
             "files": [str(file) for sink in (one.job.sinks if one.job is not None else ()) for file in sink.files],
         }
 
@@ -318,9 +368,11 @@ class Measuring:
     def _begin(self, kept: Measurement) -> Running:
         uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
         one = Running(kept, uuids)
+        comes = kept.match is not None and not kept.frozen
         with self._guard:
             self._running[kept.id] = one
-        one.thread = threading.Thread(target=self._run, args=(one,), name=f"begin {kept.id}", daemon=True)
+        work = self._run_open if comes else self._run
+        one.thread = threading.Thread(target=work, args=(one,), name=f"begin {kept.id}", daemon=True)
         one.thread.start()
         return one
 
@@ -328,21 +380,14 @@ class Measuring:
         """Take the nodes, then measure until it is stopped; a job ends of itself only when its time is over."""
         taken: list[str] = []
         try:
+            self._wait_for_members(one)
             for uuid in one.uuids:
                 self._take(one, uuid)
                 if one.stop.is_set():
                     return
                 taken.append(uuid)
                 self._roster.note(uuid, measurement=one.kept.id)
-            job = Job(
-                self._station,
-                one.kept,
-                more=lambda take: self._sinks.more(one.kept, take),
-                admits=self._admits if self._sinks.moves(one.kept) else None,
-                request=MeasurementRequest(patient=True, by="ncap"),
-                opened=self._sinks.open,
-            )
-            one.job = job
+            job = one.job = self._new_job(one)
             self._say(one, "starting")
             job.start(self._buses, self._watcher(one))
             while job.alive and not one.stop.wait(0.5):
@@ -355,6 +400,89 @@ class Measuring:
             for uuid in taken:
                 self._turns.give(uuid)
                 self._roster.note(uuid, "idle", measurement=None, report=None)
+
+    def _new_job(self, one: Running) -> Job:
+        return Job(
+            self._station,
+            one.kept,
+            more=lambda take: self._sinks.more(one.kept, take),
+            admits=self._admits if self._sinks.moves(one.kept) else None,
+            request=MeasurementRequest(patient=True, by="ncap"),
+            opened=self._sinks.open,
+        )
+
+    def _wait_for_members(self, one: Running) -> None:
+        """Who is meant by a frozen expression, as soon as somebody is: then they stay."""
+        if one.kept.match is None:
+            return
+        match = Match.parse(one.kept.match)
+        while not one.stop.is_set():
+            found = dict.fromkeys(uuid for uuid, *_ in self._station.keys.each_name())
+            meant = [
+                uuid
+                for uuid in found
+                if not why_not_measured(self._station, uuid)
+                and not match.why_not(self._station, uuid)
+                and self._station.nodes.datasheet(uuid) is not None
+                and self.of(uuid.hex()) is None
+            ]
+            if meant:
+                one.uuids = tuple(uuid.hex() for uuid in meant)
+                one.kept = replace(one.kept, match=None, uuids=tuple(meant), actuators=False)
+                return
+            self._say(one, "waiting", "no node that is known here is meant")
+            one.stop.wait(1.0)
+
+    def _run_open(self, one: Running) -> None:
+        """Measure whoever comes until it is stopped."""
+        assert one.kept.match is not None
+
+        def joined(uuid: str) -> None:
+            with self._guard:
+                one.uuids = (*one.uuids, uuid)
+            self._roster.note(uuid, measurement=one.kept.id)
+
+        def left(uuid: str) -> None:
+            with self._guard:
+                there = uuid in one.uuids
+                one.uuids = tuple(other for other in one.uuids if other != uuid)
+            if there:
+                self._roster.note(uuid, "idle", measurement=None, report=None)
+
+        def waiting(uuid: str, why: str) -> None:
+            one.reports[uuid] = {"uuid": uuid, "state": "waiting", "why": why}
+            self._live.event("measurement", state="waiting", id=one.kept.id, uuid=uuid, why=why)
+
+        try:
+            job = one.job = self._new_job(one)
+            newcomers = Newcomers(
+                self._station,
+                self._roster,
+                self._turns,
+                self._buses,
+                job,
+                Match.parse(one.kept.match),
+                elsewhere=lambda uuid: self.of(uuid) is not None or uuid in self._loans,
+                listed=lambda: self._station.measurements.detection == "whitelist",
+                joined=joined,
+                left=left,
+                waiting=waiting,
+                budget=BUDGET if any(sink.wants_rows for sink in job.sinks) else None,
+            )
+            one.newcomers = newcomers
+        except TedsProvisionError as error:
+            self._say(one, "failed", error.message)
+            return
+        self._say(one, "starting")
+        job.start(self._buses, self._watcher(one))
+        try:
+            while job.alive and not one.stop.is_set():
+                newcomers.work()
+                self._say(one, *_state_of_open(one, job))
+        finally:
+            job.stop()
+            newcomers.end()
+            self._say(one, "ended")
 
     def _take(self, one: Running, uuid: str) -> None:
         while not one.stop.is_set():
@@ -416,7 +544,7 @@ class Measuring:
         if changed:
             self._roster.refresh([said.uuid])
         self._roster.note(said.uuid, said.state if changed else None, **facts)
-        if changed and one.job is not None and not one.stop.is_set():
+        if changed and one.job is not None and not one.stop.is_set() and one.newcomers is None:
             self._say(one, *_state_of(one, one.job))
 
     def _tell_who_comes(self, one: Running, said: NodeReport, before: str | None) -> None:
@@ -430,6 +558,14 @@ class Measuring:
         else:
             return
         self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=said.why)
+
+
+def _state_of_open(one: Running, job: Job) -> tuple[str, str]:
+    if any(one.reports.get(uuid, {}).get("state") == "running" for uuid in one.uuids):
+        return "running", ""
+    if job.error is not None:
+        return "waiting", job.error.message
+    return "waiting", "no node that is meant is there"
 
 
 def _state_of(one: Running, job: Job) -> tuple[str, str]:

@@ -32,8 +32,9 @@ class Settings:
     ``http`` is (host, port) or None: then only the Unix socket of the home is served. ``sinks`` take what is measured,
     beside those of each measurement; ``brokers`` are URLs by the names under which a measurement may name them;
     ``record`` is a folder for a recording of each measurement. ``actuators``: whether
-    set points may come by topics of ROS. ``dead_man`` in ms holds for whatever is moved, where a measurement says no
-    other. ``trace`` is an open one: every frame of every link is written to it.
+    set points may come by topics of ROS. ``measure`` says whom to measure as they come, at ``rate`` in Hz
+    at most; ``frozen``: only those who are meant at the start. ``dead_man`` in ms holds for whatever is moved, where a
+    measurement says no other. ``trace`` is an open one: every frame of every link is written to it.
     """
 
     places: tuple[str, ...] = ()
@@ -48,6 +49,9 @@ class Settings:
     brokers: Mapping[str, str] = field(default_factory=dict)
     actuators: bool = True
     dead_man: int = DEAD_MAN
+    measure: str | None = None
+    rate: float | None = None
+    frozen: bool = False
     metrics: bool = False
     clause_12: bool = False
     trace: Trace | None = None

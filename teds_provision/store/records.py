@@ -257,6 +257,8 @@ class Measurement:
     until it is deleted, any other until it ends in order. ``ends`` is when (unix seconds), None for never.
     ``test_pattern`` and ``unsigned`` as the options of ``measure``; ``require`` is the text of its ``--require`` file,
     "" for none.
+    ``match`` is the expression of which nodes are taken in as they come (measure/matching.py), None for none;
+    ``frozen``: the nodes that are meant at its beginning stay, nobody joins and none is let go.
     """
 
     id: str
@@ -276,6 +278,8 @@ class Measurement:
     test_pattern: bool = False
     unsigned: bool = False
     require: str = ""
+    match: str | None = None
+    frozen: bool = False
 
 
 @dataclass(frozen=True)

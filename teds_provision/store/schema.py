@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 8
+SCHEMA_VERSION: Final = 9
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
@@ -137,6 +137,24 @@ _TABLES: Final = (
 _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     # what the profile said that a node's datasheet was made of
     8: ("ALTER TABLE nodes ADD COLUMN profile_digest TEXT",),
+    # measurements that take in whoever comes: what a row must name is another rule, so the table is made anew
+    9: (
+        "ALTER TABLE measurements RENAME TO measurements_before",
+        """CREATE TABLE measurements(
+        id TEXT PRIMARY KEY CHECK(id <> ''), group_name TEXT REFERENCES groups(name) ON DELETE CASCADE,
+        uuids TEXT NOT NULL, channels TEXT NOT NULL, rate REAL CHECK(rate > 0),
+        kind TEXT CHECK(kind IN ('periodic', 'event', 'free')), trigger INTEGER NOT NULL CHECK(trigger IN (0, 1)),
+        actuators INTEGER NOT NULL CHECK(actuators IN (0, 1)),
+        dead_man INTEGER NOT NULL CHECK(dead_man BETWEEN 20 AND 10000),
+        scalar_rate REAL NOT NULL CHECK(scalar_rate BETWEEN 0 AND 1000), sinks TEXT NOT NULL,
+        lasting INTEGER NOT NULL CHECK(lasting IN (0, 1)), ends REAL, created TEXT NOT NULL,
+        test_pattern INTEGER NOT NULL DEFAULT 0 CHECK(test_pattern IN (0, 1)),
+        unsigned INTEGER NOT NULL DEFAULT 0 CHECK(unsigned IN (0, 1)), require TEXT NOT NULL DEFAULT '',
+        match TEXT CHECK(match <> ''), frozen INTEGER NOT NULL DEFAULT 0 CHECK(frozen IN (0, 1)),
+        CHECK((group_name IS NOT NULL) + (uuids <> '[]') + (match IS NOT NULL) = 1)) STRICT, WITHOUT ROWID""",
+        "INSERT INTO measurements SELECT *, NULL, 0 FROM measurements_before",
+        "DROP TABLE measurements_before",
+    ),
 }
 
 

@@ -92,7 +92,7 @@ def test_whole_numbers_and_numbers_come_as_what_they_are() -> None:
         (bodies.NewGroup, {"name": "g", "uuids": ["a", 2]}, "'uuids[1]' must be of type string, not 2."),
         (bodies.NewMeasurement, {"group": "g", "rate": 0}, "'rate' must be between 0.001 and 1e+06, not 0."),
         (bodies.NewMeasurement, {"group": "g", "kind": "x"}, "'kind' must be one of periodic, event, free, not"),
-        (bodies.NewMeasurement, {}, 'A measurement needs either "group" or "uuids".'),
+        (bodies.NewMeasurement, {}, 'A measurement needs one of "group", "uuids" and "match".'),
         (bodies.SetPoint, {"hold": 1}, "to let it go."),
     ],
 )

@@ -298,14 +298,15 @@ def test_a_node_that_comes_later_is_published_under_its_own_name(service: Servic
 
 
 def test_groups_are_made_changed_and_deleted(asked: Client, hand: str) -> None:
-    made = asked.request("POST", "/groups", {"name": "all", "uuids": ["hand", "22" * 10]})
-    assert made["groups"] == [{"name": "all", "uuids": sorted([hand, "22" * 10]), "measuring": False}]
-    assert asked.request("PUT", "/groups/all", {"uuids": [hand]})["groups"][0]["uuids"] == [hand]
-    assert asked.node(hand)["groups"] == ["all"]
+    made = asked.request("POST", "/groups", {"name": "both", "uuids": ["hand", "22" * 10]})
+    assert made["groups"] == [{"name": "both", "uuids": sorted([hand, "22" * 10]), "measuring": False}]
+    assert asked.request("PUT", "/groups/both", {"uuids": [hand]})["groups"][0]["uuids"] == [hand]
+    assert asked.node(hand)["groups"] == ["both"]
     refused(asked, 422, "usage", "POST", "/groups", {"name": "abcd", "uuids": []})
+    refused(asked, 422, "usage", "POST", "/groups", {"name": "all", "uuids": [hand]})
     refused(asked, 404, "not-found", "PUT", "/groups/none", {"uuids": []})
-    assert asked.request("DELETE", "/groups/all")["groups"] == []
-    refused(asked, 404, "not-found", "DELETE", "/groups/all")
+    assert asked.request("DELETE", "/groups/both")["groups"] == []
+    refused(asked, 404, "not-found", "DELETE", "/groups/both")
 
 
 def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(

@@ -65,6 +65,7 @@ class Job:
         self.station, self.kept = station, kept
         self._moves = kept.actuators and admits is not None
         self.request = replace(request_of(kept, request or MeasurementRequest(patient=True)), actuators=self._moves)
+        self._each_node = self.request.newcomers
         self._more, self._admits, self._opened = more, admits, opened
         self._commands: Callable[[Command], None] = lambda _command: None
         self.sinks = self._new_sinks()
@@ -180,10 +181,11 @@ class Job:
         return replace(
             station_facts(self.station),
             group=self.kept.group or "",
-            instance=self.kept.group or (first and f"n{first}"),
+            instance=self.kept.group or (first and f"n{first}") or (self._each_node and self.kept.id) or "",
             started=time.time(),
             scalar_rate=self.kept.scalar_rate,
             test_pattern=self.request.test_pattern,
+            each_node=self._each_node,
         )
 
     def _new_sinks(self) -> list[Sink]:
@@ -204,6 +206,7 @@ def request_of(kept: Kept, more: MeasurementRequest) -> MeasurementRequest:
         rate=kept.rate,
         kind=None if kept.kind is None else Kind[kept.kind.upper()],
         trigger=kept.trigger,
+        newcomers=kept.match is not None and not kept.frozen,
         actuators=kept.actuators,
         dead_man=kept.dead_man,
         test_pattern=kept.test_pattern,

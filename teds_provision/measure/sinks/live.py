@@ -8,6 +8,7 @@ messages per second and says when that is more than what one process bears.
 |---|---|---|
 | ``/<station>/<group>`` | sensor_msgs/JointState (name, position = value) | each row of the grid |
 | ``/<station>/<group>/age`` | sensor_msgs/JointState (name, position = age in seconds) | each row |
+| ``/<station>/<node>/array`` and ``/age`` | the same of one node, where nodes come and go | each row of its grid |
 | ``/<station>/<node>/<channel>`` | by :mod:`meaning` | at the scalar rate |
 | ``/<station>/<node>/imu`` and the like | by :mod:`vectors` | at the scalar rate |
 | ``/<station>/<node>/teds`` | std_msgs/String, JSON, latched | when the facts are known |
@@ -177,9 +178,10 @@ class TopicSink(ThreadedSink):
 
     def _announce(self, facts: Sequence[ChannelFacts]) -> None:
         """Metadata, parameters and command topics of channels; again when a way to the consumers opened anew."""
-        array = self._topics.of_group(self._station.group)
-        for topic in () if self._station.test_pattern else (array, f"{array}/age"):
-            self._advertise(topic, JOINT_STATE)
+        whole = {one.uuid for one in facts} if self._station.each_node else {self._station.group}
+        for array in () if self._station.test_pattern else map(self._array_topic, sorted(whole)):
+            for topic in (array, f"{array}/age"):
+                self._advertise(topic, JOINT_STATE)
         by_node: dict[str, list[ChannelFacts]] = {one.uuid: [] for one in facts}
         for one in self._facts.values():
             if one.uuid in by_node:
@@ -246,15 +248,19 @@ class TopicSink(ThreadedSink):
     def _compound_topic(self, uuid: str, one: Compound) -> str:
         return self._topics.of_node(uuid, one.name) if one.name else self._topics.channel(uuid, one.parts[0][1])
 
+    def _array_topic(self, whole: str) -> str:
+        """Of a group, or of a node (its UUID) where each has its own."""
+        return self._topics.of_node(whole, "array") if self._station.each_node else self._topics.of_group(whole)
+
     def _rows(self, rows: GroupRows) -> None:
         if rows.test_pattern:
             return
-        topic = self._topics.of_group(rows.group)
+        topic = self._array_topic(rows.group)
         names = self._labels.get(rows.channels)
         if names is None:
             prefix = f"/{self._topics.station}/"
             names = [self._topics.channel(*key).removeprefix(prefix) for key in rows.channels]
-            self._labels = {rows.channels: names}
+            self._labels[rows.channels] = names
         last = self._arrays.get(rows.channels, -math.inf)
         for k, stamp in enumerate(rows.time.tolist()):
             if stamp - last < 1 / ROWS - 1e-6:

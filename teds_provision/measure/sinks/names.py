@@ -64,11 +64,20 @@ class Topics:
         for one in facts:
             if one.uuid not in self._known:
                 self._strangers[one.uuid] = slug(one.node)
+            if one.chosen is not None:
+                self._choose(one.uuid, one.chosen)
             channels = self._channels.setdefault(one.uuid, {})
             channels.update({one.number: one.name, **dict(one.siblings)})
             self._made.pop(one.uuid, None)
         if len(self._strangers) != strangers:
             self._name_nodes()
+
+    def _choose(self, uuid: str, chosen: Iterable[tuple[int, str]]) -> None:
+        """Names that somebody chose while the node was not measured; nobody else's change by it."""
+        self._chosen = {key: name for key, name in self._chosen.items() if key[0] != uuid}
+        self._chosen |= {(uuid, number): name.strip("/") for number, name in chosen}
+        self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
+        self._made.pop(uuid, None)
 
     def _name_nodes(self) -> None:
         taken = {name for (_, channel), name in self._chosen.items() if not channel} | _NOT_NODES
@@ -157,7 +166,7 @@ class Topics:
 
 _NOT_NODES: Final = frozenset({"all", "reports", "status", "unverified"})
 """Parts of topics of the station itself: no node is called so."""
-_NOT_CHANNELS: Final = re.compile(r"(teds|state|status|age|cmd|(stream|imu|magnetic_field|wrench)(_[0-9]+)?)")
+_NOT_CHANNELS: Final = re.compile(r"(array|teds|state|status|age|cmd|(stream|imu|magnetic_field|wrench)(_[0-9]+)?)")
 """Parts of topics that stand beside the channels of a node (live.py, vectors.py, mcap/recording.py, mqtt.py)."""
 _NOT_TOPICS: Final = frozenset(
     {"diagnostics", "diagnostics_agg", "rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "clock"}

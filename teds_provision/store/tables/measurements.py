@@ -69,10 +69,10 @@ class MeasurementTables:
         return self._database.read_one(_measurement, "SELECT * FROM measurements WHERE id = ?", (measurement_id,))
 
     def put_measurement(self, measurement: Measurement) -> None:
-        """Keep what the station measures from now on; raises BadData where it names both a group and nodes, or none."""
-        if (measurement.group is None) == (not measurement.uuids):
-            raise BadData("A measurement names a group, or nodes by UUID.")
+        """Keep what the station measures from now on; raises BadData where it names none, or two, of what it may."""
         one = measurement
+        if sum((one.group is not None, bool(one.uuids), one.match is not None)) != 1:
+            raise BadData("A measurement names a group, or nodes by UUID, or says which nodes match.")
         values = (
             one.id,
             one.group,
@@ -91,6 +91,8 @@ class MeasurementTables:
             int(one.test_pattern),
             int(one.unsigned),
             one.require,
+            one.match,
+            int(one.frozen),
         )
         self._database.execute(f"INSERT OR REPLACE INTO measurements VALUES({places(values)})", values)
 
@@ -136,4 +138,5 @@ def _measurement(*row: Any) -> Measurement:
         lasting=bool(one.lasting),
         test_pattern=bool(one.test_pattern),
         unsigned=bool(one.unsigned),
+        frozen=bool(one.frozen),
     )

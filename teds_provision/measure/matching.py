@@ -1,0 +1,140 @@
+"""Which nodes a measurement takes in as they come (``ncap run --measure EXPR``): by type, name, group, datasheet.
+
+EXPR is ``all``, or terms joined by ``,`` that must all hold: ``type:PROFILE``, ``name:GLOB``, ``group:NAME``, a bound
+of ``nodes --fits`` (``angle >= 360 deg``; all bounds together are one requirement); a bare word is a group. Who may be
+measured at all is no matter of the expression: a node must have a key here, and neither be banned nor given away.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+
+from teds_provision.errors import BadData, PolicyRefused, UsageFailure
+from teds_provision.measure.planning import BusTime, plan_node, sensors_of
+from teds_provision.measure.request import MeasurementRequest
+from teds_provision.station.groups import ALL
+from teds_provision.station.station import Station
+from teds_provision.teds.fits import Requirement, judge, met, parse_fits
+from teds_provision.teds.sheet import Sheet
+
+_BOUND = re.compile(r"[<>]")
+_KINDS = ("type", "name", "group")
+
+
+@dataclass(frozen=True)
+class Match:
+    """An expression, read: ``types`` by name, ``names`` as patterns, ``groups``, and what the datasheet must fit.
+
+    ``text`` is the expression as it was said.
+    """
+
+    text: str
+    types: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    fits: Requirement | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Match:
+        """Read an expression; raises UsageFailure with the term that is wrong."""
+        parts = [part.strip() for part in text.split(",")]
+        if parts == [ALL]:
+            return cls(ALL)
+        found: dict[str, list[str]] = {kind: [] for kind in _KINDS}
+        bounds = []
+        for part in parts:
+            kind, colon, value = part.partition(":")
+            if not part or part == ALL or (colon and kind in _KINDS and not value.strip()):
+                raise _wrong(part, text)
+            if colon and kind in _KINDS:
+                found[kind].append(value.strip())
+            elif _BOUND.search(part):
+                bounds.append(part)
+            elif colon:
+                raise _wrong(part, text)
+            else:
+                found["group"].append(part)
+        try:
+            fits = parse_fits(", ".join(bounds)) if bounds else None
+        except BadData as error:
+            raise UsageFailure(f"{text!r}: {error.message}", hint=error.hint) from error
+        return cls(text, tuple(found["type"]), tuple(found["name"]), tuple(found["group"]), fits)
+
+    def require_groups(self, station: Station) -> None:
+        """Raise NotFound where the expression names a group that is not there."""
+        for group in self.groups:
+            station.groups.get(group)
+
+    def why_not(self, station: Station, uuid: bytes) -> str:
+        """Why a node is not meant by this expression, in half a sentence; "" where it is."""
+        record = station.nodes.get(uuid)
+        profile, name = (record.profile or "", record.name or "") if record is not None else ("", "")
+        for kind in self.types:
+            if profile != kind:
+                return f"its type is {profile or 'not known'}, not {kind}"
+        for pattern in self.names:
+            if not fnmatchcase(name, pattern):
+                return f"its name {name!r} is not {pattern}"
+        for group in self.groups:
+            members = station.groups.find(group)
+            if members is None or uuid not in members.uuids:
+                return f"it is not in group {group}"
+        if self.fits is None:
+            return ""
+        image = station.nodes.datasheet(uuid)
+        judged = judge(self.fits, Sheet.of(image), datetime.now(UTC)) if image is not None else ()
+        if met(self.fits, judged):
+            return ""
+        return next((one.why.rstrip(".") for one in judged), "its datasheet is not known")
+
+
+def why_not_measured(station: Station, uuid: bytes) -> str:
+    """Why a node cannot be measured whatever is asked for; "" where it can, if its datasheet holds in the session."""
+    if not station.keys.held(uuid):
+        return "no key of it is held here"
+    if station.policy.tombstone(uuid) is not None:
+        return "its key was given away"
+    banned = station.policy.denied(uuid, None)
+    return f"it was revoked: {banned.why}" if banned is not None else ""
+
+
+@dataclass(frozen=True)
+class Load:
+    """What a node would take by the datasheet that is kept of it.
+
+    ``bus`` is the share of an empty one (None: not known), ``rate`` that of the fastest channel in Hz.
+    """
+
+    bus: float | None = None
+    channels: int = 0
+    rate: float = 0.0
+
+    def messages(self, scalar_rate: float) -> float:
+        """Messages a second on topics: each channel's, and two for each row of the node's array."""
+        return self.channels * min(scalar_rate, self.rate) + 2 * min(self.rate, 1000.0)
+
+
+def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: BusTime) -> Load:
+    """What a node would take; ``Load()`` where no datasheet of it is kept, or none that can be measured so."""
+    image = station.nodes.datasheet(uuid)
+    if image is None:
+        return Load()
+    sensors = [one for one in Sheet.of(image).channels if one.sample and not one.actuator]
+    try:
+        plans = plan_node(
+            sensors_of(sensors, (), request.kind), time, rate=request.rate, kind=request.kind, at_most=True
+        )
+    except (BadData, PolicyRefused):  # its session will say so
+        return Load()
+    rates = [1 / period for period in plans.periods().values() if period > 0]
+    return Load(plans.load, len(rates), max(rates, default=0.0))
+
+
+def _wrong(part: str, text: str) -> UsageFailure:
+    return UsageFailure(
+        f"{part!r} in {text!r} does not say which nodes to measure.",
+        hint="Use all, a group, type:PROFILE, name:GLOB, group:NAME or 'angle >= 360 deg', joined by commas.",
+    )

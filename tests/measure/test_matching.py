@@ -1,0 +1,68 @@
+"""Which nodes an expression means (`ncap run --measure EXPR`), and what joins under which names."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import NoRoom, UsageFailure
+from teds_provision.measure.blocks import ChannelFacts, StationFacts
+from teds_provision.measure.matching import Load, Match
+from teds_provision.measure.planning import BusShare, BusTime
+from teds_provision.measure.sinks.names import Topics
+
+
+def test_an_expression_is_terms_that_must_all_hold() -> None:
+    one = Match.parse("type:angle-sensor, name:arm-*,group:left,right, angle >= 360 deg, rate >= 1 kHz")
+    assert (one.types, one.names, one.groups) == (("angle-sensor",), ("arm-*",), ("left", "right"))
+    assert one.fits is not None
+    assert [term.text for term in one.fits.terms] == ["angle >= 360 deg", "rate >= 1 kHz"]
+    assert Match.parse("all") == Match("all")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "all,arm", "kind:x", "type:", "arm,,left", "angle >= much", "angle > 1 deg,mass < 1 kg"]
+)
+def test_what_says_no_nodes_is_refused_with_its_term(text: str) -> None:
+    with pytest.raises(UsageFailure) as refused:
+        Match.parse(text)
+    assert repr(text) in refused.value.message
+
+
+def test_a_name_that_was_chosen_while_a_node_was_away_is_its_own_alone() -> None:
+    """A node that joins a running measurement has its new topic, and nobody else's changes."""
+    topics = Topics(StationFacts("bench", nodes={"aa" * 10: "arm", "bb" * 10: "leg"}))
+    topics.learn([ChannelFacts("aa" * 10, "arm", 1, "angle"), ChannelFacts("bb" * 10, "leg", 1, "angle")])
+    assert topics.channel("bb" * 10, 1) == "/bench/leg/angle"
+    topics.learn([ChannelFacts("aa" * 10, "arm", 1, "angle", chosen=((1, "robot/elbow"),))])
+    assert (topics.channel("aa" * 10, 1), topics.channel("bb" * 10, 1)) == ("/robot/elbow", "/bench/leg/angle")
+    topics.learn([ChannelFacts("aa" * 10, "arm", 1, "angle", chosen=())])
+    assert topics.channel("aa" * 10, 1) == "/bench/arm/angle"
+
+
+def test_a_node_s_array_is_no_channel_s_topic() -> None:
+    topics = Topics(StationFacts("bench", nodes={"aa" * 10: "arm"}))
+    topics.learn([ChannelFacts("aa" * 10, "arm", 1, "array")])
+    assert topics.channel("aa" * 10, 1) != topics.of_node("aa" * 10, "array")
+
+
+def test_those_that_come_together_share_and_those_that_run_keep_what_they_have() -> None:
+    """What a newcomer wants is known from its datasheet, so nobody waits for it to say so."""
+    share = BusShare(BusTime())
+    first, second, third = (bytes([one]) * 10 for one in (1, 2, 3))
+    share.expect([first, second], 0.5)
+    assert share.others(first, sharing=True).taken == pytest.approx(0.3), "half of the room is the other one's"
+    share.taken[first] = share.taken[second] = 0.3
+    share.expect([third], 0.1)
+    assert share.room == 0.0
+    assert share.others(third, sharing=True).taken == pytest.approx(0.6)
+    share.gone(second)
+    del share.taken[second]
+    assert share.room == pytest.approx(0.3)
+    assert share.nodes == 2
+
+
+def test_a_node_costs_the_topics_its_values_and_two_messages_for_each_row() -> None:
+    assert Load(0.1, channels=3, rate=50.0).messages(10.0) == 3 * 10 + 2 * 50
+    assert Load(0.1, channels=1, rate=5.0).messages(10.0) == 5 + 10
+    assert issubclass(NoRoom, Exception)
+    assert NoRoom("x").exit_code == 6

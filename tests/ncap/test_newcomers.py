@@ -1,0 +1,330 @@
+"""`ncap run --measure`: every authentic node that comes is measured; it goes, comes back, is carried to another bus."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision import client
+from teds_provision.client import ApiError
+from tests.e2e.desk import ANGLE, Desk, Node
+from tests.ncap.service import Service, virtual
+from tests.pace import until
+from tests.places import free_bus
+
+pytestmark = pytest.mark.link
+
+
+class Lab:
+    """A station with two angle sensors on its bus, and a daemon that measures whoever comes."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk, self.service = desk, Service(desk, desk.station())
+        self.nodes = [self.provisioned(name) for name in ("left", "right")]
+
+    def provisioned(self, name: str) -> Node:
+        folder = self.desk.folder / name
+        words = ["--profile", ANGLE, "--name", name, "--uuid", self.desk.new_uuid().hex()]
+        node = Node(self.desk, folder, self.desk.start("--json", "node", "create", folder, *words).end().json["uuid"])
+        self.power(node)
+        calibration = self.desk.folder / "angle.csv"
+        calibration.write_text("# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n")
+        words = ["--profile", ANGLE, "--calibration", str(calibration), "--name", name, "--yes"]
+        done = self.service.station.ask("provision", node.uuid, *words, *self.desk.links.over("can"))
+        assert done["verdict"] == "authentic"
+        return node
+
+    def power(self, node: Node, bus: str | None = None) -> None:
+        if bus is None:
+            node.start("--source", "ramp:2", nfc=False, can=True)
+        else:
+            node.start("--source", "ramp:2", "--can", bus, nfc=False)
+
+    def start(self, *words: object) -> Service:
+        return self.service.start("--measure", "all", "--rate", 50, *words)
+
+    def told(self, uuid: str | None = None) -> list[dict[str, Any]]:
+        """Events of measurements that name a node."""
+        process = self.service.process
+        assert process is not None
+        while process.read(0.1):
+            pass
+        lines = [json.loads(line) for line in process.out[: process.out.rfind("\n") + 1].splitlines()]
+        every = [one for one in lines if one.get("event") == "measurement" and "uuid" in one]
+        return [one for one in every if uuid in (None, one["uuid"])]
+
+    def states(self, node: Node) -> list[str]:
+        return [one["state"] for one in self.told(node.uuid)]
+
+    def comes(self, node: Node, times: int = 1) -> None:
+        until(lambda: self.states(node).count("joined") == times and self.states(node)[-1] == "joined", node.uuid)
+
+    def report(self, node: Node) -> dict[str, Any]:
+        with self.service.client() as asked:
+            return dict(asked.node(node.uuid)["measuring"] or {})
+
+    def flows(self, node: Node) -> None:
+        def fresh() -> bool:
+            with self.service.client() as asked:
+                channels = asked.node(node.uuid)["channels"]
+                return bool(channels and channels[0]["last"] and channels[0]["last"]["age"] < 1)
+
+        until(fresh, f"no value of {node.uuid} comes")
+
+    def tidy(self) -> None:
+        running = self.service.process
+        if running is not None and running.process.poll() is None:
+            self.service.kill()
+        self.service.process = None
+        for node in self.nodes:
+            if node.process is None or node.process.process.poll() is not None:
+                self.power(node)
+
+
+@pytest.fixture(scope="module")
+def one_lab(tmp_path_factory: pytest.TempPathFactory, prepared: Path) -> Iterator[Lab]:
+    desk = Desk(tmp_path_factory.mktemp("newcomers"), prepared)
+    try:
+        yield Lab(desk)
+    finally:
+        desk.clear()
+
+
+@pytest.fixture
+def lab(one_lab: Lab) -> Iterator[Lab]:
+    yield one_lab
+    one_lab.tidy()
+
+
+def test_what_is_there_is_measured_and_what_goes_comes_back_and_costs_the_other_no_sample(lab: Lab) -> None:
+    left, right = lab.nodes
+    lab.start()
+    lab.comes(left)
+    lab.comes(right)
+    lab.flows(right)
+    right.kill()
+    until(lambda: lab.states(right)[-1] == "left")
+    assert lab.told(right.uuid)[-1]["why"]
+    lab.power(right)
+    lab.comes(right, 2)
+    lab.flows(right)
+    assert lab.states(left) == ["joined"]
+    report = lab.report(left)
+    assert (report["state"], report["lost"], report["late"], report["bad"]) == ("running", 0, 0, 0)
+    with lab.service.client() as asked:
+        [one] = asked.measurements()
+        assert (one["match"], one["rate"], sorted(one["uuids"])) == ("all", 50, sorted([left.uuid, right.uuid]))
+    lab.service.end()
+
+
+def test_a_node_that_is_carried_to_another_bus_of_the_station_goes_on(lab: Lab) -> None:
+    left, right = lab.nodes
+    other = free_bus()
+    lab.start("--can", other)
+    lab.comes(left)
+    lab.comes(right)
+    right.kill()
+    lab.power(right, other)
+    lab.comes(right, 2)
+    lab.flows(right)
+    with lab.service.client() as asked:
+        assert str(asked.node(right.uuid)["link"]).startswith(f"can:{other}")
+    right.kill()
+    lab.power(right)
+    lab.comes(right, 3)
+    assert lab.states(left) == ["joined"]
+    lab.service.end()
+
+
+def test_a_node_is_written_while_it_is_matched_and_nobody_else_notices(lab: Lab) -> None:
+    """With another datasheet it joins again; two writers at once take turns; recordings take it in."""
+    left, right = lab.nodes
+    folder = lab.desk.folder / "recorded"
+    lab.start("--record", folder)
+    lab.comes(left)
+    lab.comes(right)
+    calibration = lab.desk.folder / "half.csv"
+    calibration.write_text("# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,180\n")
+    words = ["--profile", ANGLE, "--calibration", calibration, "--yes", *lab.desk.links.over("can")]
+    first = lab.service.station.start("--json", "provision", right.uuid, *words)
+    assert lab.service.station.ask("provision", right.uuid, *words, code=0)["verdict"] == "authentic"
+    assert first.end().code == 0
+    until(lambda: lab.states(right)[-1] == "joined")
+    assert lab.states(right).count("left") in (1, 2), "one gap, or two where the writers came one after the other"
+    assert any(one["why"] == "let go for provision" for one in lab.told(right.uuid))
+    lab.flows(right)
+    assert lab.states(left) == ["joined"]
+    assert lab.report(left)["lost"] == 0
+    lab.service.end()
+    parts = sorted(folder.glob("run-*.csv"))
+    assert len(parts) >= 2, "CSV begins a new part for another datasheet"
+    channels = [line for part in parts for line in part.read_text().splitlines() if line.startswith("# channel:")]
+    assert len({json.loads(line.removeprefix("# channel: "))["fingerprint"] for line in channels}) == 3
+
+
+def test_a_node_that_goes_while_its_writer_has_it_joins_when_it_comes_back(lab: Lab) -> None:
+    left, right = lab.nodes
+    lab.start()
+    lab.comes(left)
+    lab.comes(right)
+    with client.connect(home=lab.service.station.home).released(right.uuid, "write") as had:
+        assert had is True
+        right.kill()
+    lab.power(right)
+    until(lambda: lab.states(right)[-1] == "joined")
+    lab.flows(right)
+    lab.service.end()
+
+
+def test_a_node_that_is_written_before_it_is_measured_joins_after_that(lab: Lab) -> None:
+    """Else it would be claimed as soon as its key is there, and its writer refused."""
+    left, right = lab.nodes
+    right.kill()
+    lab.start()
+    lab.comes(left)
+    with client.connect(home=lab.service.station.home).released(right.uuid, "provision") as had:
+        assert had is False
+        lab.power(right)
+        with lab.service.client() as asked:
+            until(lambda: asked.node(right.uuid)["present"])
+        assert lab.states(right) == []
+    lab.comes(right)
+    lab.service.end()
+
+
+def test_whom_a_person_revokes_leaves_and_the_others_stay(lab: Lab) -> None:
+    left, right = lab.nodes
+    third = lab.provisioned("third")
+    lab.nodes.append(third)
+    lab.start()
+    for node in (left, right, third):
+        lab.comes(node)
+    lab.service.station.ask("revoke", third.uuid, "--why", "stolen", "--yes")
+    until(lambda: lab.states(third)[-1] == "left")
+    assert "stolen" in lab.told(third.uuid)[-1]["why"]
+    assert (lab.states(left), lab.states(right)) == (["joined"], ["joined"])
+    with lab.service.client() as asked:
+        assert third.uuid not in asked.measurements()[0]["uuids"]
+    lab.service.end()
+    third.kill()
+    lab.nodes.remove(third)
+
+
+def test_a_name_stays_while_its_node_is_measured_and_a_node_that_left_may_have_another(lab: Lab) -> None:
+    left, right = lab.nodes
+    lab.start()
+    lab.comes(left)
+    lab.comes(right)
+    with lab.service.client() as asked:
+        with pytest.raises(ApiError) as frozen:
+            asked.request("PUT", "/names", {"uuid": right.uuid, "channel": 1, "name": "arm/turn"})
+        assert (frozen.value.status, frozen.value.exit_code) == (409, 6)
+        right.kill()
+        until(lambda: lab.states(right)[-1] == "left")
+        asked.request("PUT", "/names", {"uuid": right.uuid, "channel": 1, "name": "arm/turn"})
+        lab.power(right)
+        lab.comes(right, 2)
+        names = [name for node in asked.request("GET", "/names")["names"] for name in [node.get("topic")]]
+        assert "/arm/turn" in names
+        right.kill()
+        until(lambda: lab.states(right)[-1] == "left")
+        asked.request("PUT", "/names", {"uuid": right.uuid, "channel": 1, "name": None})
+    lab.service.end()
+
+
+def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> None:
+    """Who is added to its group joins, who is taken out leaves; it is kept over a restart, until it is deleted."""
+    left, right = lab.nodes
+    station = lab.service.station
+    station.ask("group", "create", "arm", left.uuid)
+    lab.service.start()
+    made = station.ask("ncap", "measure", "arm, name:l*", "--rate", 20)
+    assert (made["match"], made["frozen"]) == ("arm, name:l*", False)
+    lab.comes(left)
+    station.ask("group", "remove", "arm", left.uuid)
+    until(lambda: lab.states(left)[-1] == "left")
+    assert lab.told(left.uuid)[-1]["why"] == "it is not in group arm"
+    station.ask("group", "add", "arm", left.uuid, right.uuid)
+    lab.comes(left, 2)
+    assert lab.states(right) == [], "its name is another one"
+    lab.service.end()
+    lab.service.start()
+    lab.comes(left)
+    with lab.service.client() as asked:
+        [one] = asked.measurements()
+        asked.end_measurement(one["id"])
+        until(lambda: asked.node(left.uuid)["mode"] == "idle")
+        assert asked.measurements() == []
+    lab.service.end()
+    station.ask("group", "delete", "arm")
+
+
+def test_one_that_finds_no_room_on_the_bus_waits_until_another_one_leaves(lab: Lab) -> None:
+    """50 Hz of one node take half of a bus of 5 kbit/s: two do not fit, and the first is not slowed."""
+    left, right = lab.nodes
+    right.kill()
+    lab.service.desk.links = type(lab.desk.links)(lab.desk.links.nfc, f"{lab.desk.links.can}&bitrate=5000")
+    try:
+        lab.start()
+        lab.comes(left)
+        lab.power(right)
+        until(lambda: lab.states(right)[-1:] == ["waiting"])
+        assert lab.told(right.uuid)[-1]["why"] == "no room on the bus"
+        assert lab.told(left.uuid)[-1]["why"] == "", "nobody is slowed"
+        left.kill()
+        until(lambda: lab.states(right)[-1] == "joined")
+        lab.service.end()
+    finally:
+        lab.service.desk.links = type(lab.desk.links)(lab.desk.links.nfc, lab.desk.links.can.partition("&")[0])
+
+
+def test_frozen_measures_those_that_were_known_and_lets_none_go(lab: Lab) -> None:
+    left, right = lab.nodes
+    lab.start("--frozen")
+    lab.comes(left)
+    lab.comes(right)
+    with lab.service.client() as asked:
+        [one] = asked.measurements()
+        assert one["frozen"] is True
+        assert sorted(one["uuids"]) == sorted([left.uuid, right.uuid])
+    refused = lab.service.station.refuses("address", left.uuid, 77, *lab.desk.links.over("can"), code=6)
+    assert "frozen" in refused["message"]
+    assert lab.states(left) == ["joined"]
+    lab.service.end()
+
+
+def test_actuators_of_who_comes_are_never_claimed(desk: Desk) -> None:
+    service = Service(desk, desk.station()).start("--measure", "all")
+    uuid = virtual(service)
+    with service.client() as asked:
+        until(lambda: asked.node(uuid)["mode"] == "measuring")
+        place = next(link["place"] for link in asked.status()["links"] if link["virtual"])
+        bus = place.removeprefix("can:").partition("&source=")[0]
+        mode = service.station.ask("mode", uuid, "--via", "can", "--can", bus)
+    claimed = {one["channel"]: bool(one["claimant"]) for one in mode["channels"]}
+    assert claimed == {1: False, 2: True, 3: True}, mode
+    service.end()
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["--measure", "nosuch"], 3),
+        (["--measure", "kind:angle"], 2),
+        (["--measure", "type:"], 2),
+        (["--measure", "all,name:x"], 2),
+        (["--measure", "angle >="], 2),
+        (["--rate", "5"], 2),
+        (["--frozen"], 2),
+    ],
+)
+def test_what_says_no_nodes_is_refused_at_the_start(lab: Lab, words: list[str], code: int) -> None:
+    assert lab.service.station.refuses("ncap", "run", *words, code=code)["message"]
+
+
+def test_no_group_may_be_called_all(lab: Lab) -> None:
+    assert "all" in lab.service.station.refuses("group", "create", "all", lab.nodes[0].uuid, code=2)["message"]
