@@ -71,6 +71,17 @@ def test_from_an_empty_home_to_a_moving_plot(browser: Browser, fresh: Lab) -> No
         page.get_by_text("ago").first.wait_for()
 
 
+def test_everything_that_is_trusted_is_measured_by_one_button(browser: Browser, lab: Lab) -> None:
+    with opened(browser, lab, route="measure") as page:
+        page.get_by_role("button", name="Measure everything that is trusted").click()
+        card = page.locator(".group", has=page.get_by_role("heading", name="Everything that is trusted"))
+        card.get_by_text(re.compile(r"\d+ nodes? measured: .*hand")).wait_for()
+        assert [one["match"] for one in lab.measurements()] == ["all"]
+        card.get_by_role("button", name="Stop").click()
+        page.get_by_role("button", name="Measure everything that is trusted").wait_for()
+        assert lab.measurements() == []
+
+
 def test_a_rate_that_does_not_fit_is_refused_with_the_fastest(browser: Browser, lab: Lab) -> None:
     with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
         page.get_by_label("Rate, Hz").fill("5000")

@@ -27,7 +27,8 @@ class Groups {
     this.error = h("div", {});
     this.fresh = h("details", { class: "panel new" }, h("summary", {}, icon("plus"), "New group"), h("div", { class: "stack" }, field("Name", this.name, "Letters, digits and _; the topic gets this name."), this.members, h("div", { class: "row" }, this.make), this.error));
     this.others = h("ul", { class: "groups" });
-    this.element = h("section", { class: "side-wide", "aria-label": "Groups" }, h("h3", {}, "Groups"), this.none, this.list, this.fresh, this.others);
+    this.all = button("Measure everything that is trusted", { onclick: () => this.all.busy(() => this.everything()) }, "play");
+    this.element = h("section", { class: "side-wide", "aria-label": "Groups" }, h("div", { class: "row" }, this.all), h("h3", {}, "Groups"), this.none, this.list, this.fresh, this.others);
     this.off = on("groups measurements nodes status connection", () => this.paint());
     this.paint();
   }
@@ -45,6 +46,20 @@ class Groups {
       text(element.querySelector(".hint"), verdict(node)[2].toLowerCase());
     });
     if (this.make.getAttribute("aria-busy") !== "true") this.make.disabled = !may;
+    this.all.hidden = state.measurements.some((one) => one.match === "all");
+    if (this.all.getAttribute("aria-busy") !== "true") this.all.disabled = !may;
+  }
+
+  /** Every authentic node, now and when it comes, until its card here is stopped. */
+  async everything() {
+    this.error.replaceChildren();
+    try {
+      await post("measurements", { match: "all" });
+      say("Every trusted node is measured from now on, and when it comes.");
+      await refresh("measurements", "nodes");
+    } catch (error) {
+      toast("bad", error.message, error.hint);
+    }
   }
 
   async create() {
@@ -194,8 +209,16 @@ function loneCard(one) {
     }),
   );
   element.paint = (now, may) => {
-    text(name, membersOf(now).map((uuid) => nameOf(state.nodes.get(uuid) ?? { uuid })).join(", "));
-    fill(words, told(now, membersOf(now)[0]));
+    const members = membersOf(now);
+    const names = members.map((uuid) => nameOf(state.nodes.get(uuid) ?? { uuid })).join(", ");
+    if (now.match) {
+      const waiting = now.nodes.filter((node) => node.state === "waiting" && node.why);
+      text(name, now.match === "all" ? "Everything that is trusted" : now.match);
+      text(words, [`${count(members.length, "node")} measured${names ? `: ${names}` : ""}`, ...waiting.map((node) => `${nameOf(state.nodes.get(node.uuid) ?? node)} waits: ${node.why}`)].join(". "));
+    } else {
+      text(name, names);
+      fill(words, told(now, members[0]));
+    }
     if (stop.getAttribute("aria-busy") !== "true") stop.disabled = !may;
   };
   return element;
