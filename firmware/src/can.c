@@ -10,9 +10,8 @@
 #define FIRST_STATION 0xF1u
 #define LAST_STATION 0xF7u
 #define CR_NS TEDS_SECOND
-#define KEEP_NS (20u * TEDS_SECOND)
-#define EVERYONE_NS (50u * 1000000u)
-#define START_NS (500u * 1000000u)
+#define EVERYONE_NS (UINT64_C(50) * 1000000u)
+#define START_NS (UINT64_C(500) * 1000000u)
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
 #define A_MINUTE (60u * TEDS_SECOND >> UNIT_BITS)
 
@@ -121,49 +120,21 @@ static void left(teds_node *node, teds_line *line)
 
 /* -- requests ----------------------------------------------------------------------------------------------------------- */
 
-/* Identify, Prove, List, Query and Read outside Sealed are always run anew. */
-static bool always_anew(const uint8_t *frame, size_t length)
-{
-    if (length < 4) {
-        return false;
-    }
-    if (frame[2] == TEDS_CLASS_COMMON) {
-        return frame[3] == TEDS_QUERY || frame[3] == TEDS_READ;
-    }
-    return frame[2] == TEDS_CLASS_SECURITY &&
-           (frame[3] == TEDS_IDENTIFY || frame[3] == TEDS_PROVE || frame[3] == TEDS_LIST);
-}
-
 static void request(teds_node *node, teds_line *line, const uint8_t *body, size_t length, bool fd, uint64_t tick)
 {
-    const teds_part whole = {body, length};
-    const teds_arrival arrival = {TEDS_CAN, TEDS_NFC == 0 && teds_in_factory(node), fd, tick};
+    const teds_arrival arrival = {TEDS_CAN, !teds_has_nfc(node) && teds_in_factory(node), fd, tick};
     const uint8_t own = line->own;
-    uint64_t now = teds_now(node);
-    teds_stored_reply *place;
-    uint8_t digest[32];
+    teds_stored_reply *reply;
     if (is_sending(line)) { /* whoever asks again has not taken that answer up */
         left(node, line);
         if (!line->used || line->own != own) {
             return; /* the node has moved: nobody answers at the old address */
         }
     }
-    place = teds_reply_place(node, line->source);
-    teds_sha256_parts(node, &whole, 1, digest);
-    if (!place->stored || memcmp(digest, place->digest, 32) != 0 || now >= place->at + KEEP_NS ||
-        always_anew(body + 1, length - 1)) {
-        place->stored = false;
-        place->length = (uint16_t)(1 + teds_node_handle(node, line->source, &arrival, body + 1, length - 1,
-                                                        place->octets + 1));
-        place->octets[0] = body[0];
-        memcpy(place->digest, digest, 32);
-        place->used = true; /* its link may have ended by its own command */
-        place->stored = true;
-        place->link = line->source;
-        place->at = teds_now(node);
-    }
-    line->out_reply = (int8_t)(place - node->replies);
-    teds_isotp_begin(line, place->octets, place->length, fd);
+    reply = teds_answer(node, line->source, &arrival, body, 1, body + 1, length - 1);
+    reply->octets[0] = body[0];
+    line->out_reply = (int8_t)(reply - node->replies);
+    teds_isotp_begin(line, reply->octets, reply->length, fd);
 }
 
 /* A refusal in place of a flow control, as one frame; the stored reply stays. */

@@ -110,7 +110,7 @@ static void message(teds_node *node, teds_session *session)
 /* The length of a CAN FD frame that holds so many octets. */
 static size_t fd_length(size_t octets)
 {
-    teds_can_frame frame;
+    teds_can_frame frame = {0};
     if (octets <= 8) {
         return octets;
     }

@@ -175,6 +175,13 @@ int teds_store_state(teds_node *node, const teds_state *state);
 
 /* -- node.c -------------------------------------------------------------------------------------------------------- */
 teds_stored_reply *teds_reply_place(teds_node *node, teds_link link);
+/* Run a request, or take up the stored reply of an octet-equal one: the reply's place, octets from 1 on. */
+teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *transaction,
+                               size_t transaction_length, const uint8_t *frame, size_t length);
+static inline bool teds_has_nfc(const teds_node *node)
+{
+    return TEDS_NFC && node->config->nfc.present;
+}
 static inline bool teds_in_factory(const teds_node *node)
 {
     return (node->state.flags & TEDS_KEYED) == 0;
@@ -194,6 +201,31 @@ void teds_can_move(teds_node *node, uint8_t address);
 bool teds_can_sending(const teds_node *node);
 uint64_t teds_can_poll(teds_node *node, uint64_t now);
 uint8_t teds_default_address(const uint8_t uuid[10]);
+
+/* -- ndef.c, tnep.c, t4t.c ----------------------------------------------------------------------------------------- */
+#if TEDS_NFC
+#define TEDS_TIM_TYPE "teds-provision:tim"
+enum { TEDS_NDEF_WELL_KNOWN = 1, TEDS_NDEF_MIME = 2, TEDS_NDEF_EXTERNAL = 4, TEDS_NDEF_BEGINS = 0x80, TEDS_NDEF_ENDS = 0x40 };
+enum { TEDS_NFC_QUIET, TEDS_NFC_WRITTEN };
+/* What of a message the profile looks at; NULL: no such record. */
+typedef struct teds_ndef {
+    bool any, charges; /* the first record says how the reader charges */
+    const uint8_t *selection, *payload;
+    size_t selection_length, payload_length;
+} teds_ndef;
+bool teds_ndef_read(uint8_t *message, size_t length, teds_ndef *out);
+/* A record up to its payload; gives its octets. */
+size_t teds_ndef_head(uint8_t *at, uint8_t marks, uint8_t tnf, const char *type, size_t type_length, size_t payload);
+void teds_nfc_start(teds_node *node);
+void teds_nfc_came(teds_node *node, size_t length);
+void teds_nfc_poll(teds_node *node);
+#endif
+
+/* -- ble.c ----------------------------------------------------------------------------------------------------------- */
+#if TEDS_BLE
+bool teds_ble_sends(const teds_node *node, int8_t place);
+void teds_ble_forget(teds_node *node, int8_t place);
+#endif
 
 /* -- operation.c, stream.c ----------------------------------------------------------------------------------------- */
 #if TEDS_OPERATION

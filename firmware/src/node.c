@@ -3,6 +3,7 @@
 
 #define ADDRESS_NS (10u * TEDS_SECOND)
 #define STRANGER_NS TEDS_SECOND
+#define KEEP_NS (20u * TEDS_SECOND)
 
 /* -- permission: the first question asked of a command --------------------------------------------------------------- */
 
@@ -373,7 +374,16 @@ static bool is_being_sent(const teds_node *node, int8_t place)
             return true;
         }
     }
+#if TEDS_NFC
+    if (node->nfc.answered && node->nfc.reply == place) {
+        return true;
+    }
+#endif
+#if TEDS_BLE
+    return teds_ble_sends(node, place);
+#else
     return false;
+#endif
 }
 
 /* A link's place: its own, a free one, the oldest of those whose link has no session; of these rather one that is not
@@ -408,10 +418,49 @@ teds_stored_reply *teds_reply_place(teds_node *node, teds_link link)
             line->out_state = TEDS_OUT_IDLE;
         }
     }
+#if TEDS_NFC
+    node->nfc.answered = node->nfc.answered && node->nfc.reply != (int8_t)(found - node->replies);
+#endif
+#if TEDS_BLE
+    teds_ble_forget(node, (int8_t)(found - node->replies));
+#endif
     found->used = true;
     found->stored = false;
     found->link = link;
     return found;
+}
+
+/* Identify, Prove, List, Query and Read outside Sealed are always run anew. */
+static bool always_anew(const uint8_t *frame, size_t length)
+{
+    if (length < 4) {
+        return false;
+    }
+    if (frame[2] == TEDS_CLASS_COMMON) {
+        return frame[3] == TEDS_QUERY || frame[3] == TEDS_READ;
+    }
+    return frame[2] == TEDS_CLASS_SECURITY &&
+           (frame[3] == TEDS_IDENTIFY || frame[3] == TEDS_PROVE || frame[3] == TEDS_LIST);
+}
+
+teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *transaction,
+                               size_t transaction_length, const uint8_t *frame, size_t length)
+{
+    const teds_part parts[] = {{transaction, transaction_length}, {frame, length < TEDS_MAX_MESSAGE ? length : TEDS_MAX_MESSAGE}};
+    teds_stored_reply *place = teds_reply_place(node, link);
+    uint8_t digest[32];
+    teds_sha256_parts(node, parts, 2, digest);
+    if (!place->stored || memcmp(digest, place->digest, 32) != 0 || teds_now(node) >= place->at + KEEP_NS ||
+        always_anew(frame, length)) {
+        place->stored = false;
+        place->length = (uint16_t)(1 + teds_node_handle(node, link, arrival, frame, length, place->octets + 1));
+        memcpy(place->digest, digest, 32);
+        place->used = true; /* its link may have ended by its own command */
+        place->stored = length <= TEDS_MAX_MESSAGE;
+        place->link = link;
+        place->at = teds_now(node);
+    }
+    return place;
 }
 
 /* -- the life of a node -------------------------------------------------------------------------------------------------- */
@@ -425,7 +474,8 @@ int teds_node_init(teds_node *node, const teds_config *config, const teds_port *
     node->port = port;
     node->can.rx_line = -1;
     if (port->unit == 0 || port->unit > 32 || (port->unit & (port->unit - 1)) != 0 ||
-        port->slot_octets < TEDS_STAGING + 256u || port->identity_octets < 192) {
+        port->slot_octets < TEDS_STAGING + 256u || port->identity_octets < 192 ||
+        (config->nfc.present && config->nfc.max_ndef != 0 && config->nfc.max_ndef < 160)) {
         return TEDS_E_USAGE;
     }
     failed = teds_store_load(node);
@@ -443,6 +493,9 @@ int teds_node_init(teds_node *node, const teds_config *config, const teds_port *
         return TEDS_E_USAGE;
     }
     teds_operation_start(node);
+#endif
+#if TEDS_NFC
+    teds_nfc_start(node);
 #endif
     return 0;
 }
@@ -496,6 +549,9 @@ uint64_t teds_node_poll(teds_node *node, uint64_t now)
     teds_sessions_expire(node, now);
 #if TEDS_OPERATION
     next = teds_operation_poll(node, now);
+#endif
+#if TEDS_NFC
+    teds_nfc_poll(node);
 #endif
     due = teds_can_poll(node, now);
     next = due < next ? due : next;

@@ -26,9 +26,13 @@ class CNode:
     ready: dict[str, Any] = field(default_factory=dict)
     process: Running | None = None
 
-    def start(self, *options: object, can: str | None = None, cwd: Path | None = None) -> CNode:
-        """Power on, and wait until it is on the bus."""
-        words: list[object] = ["--flash", self.flash, "--can", can or self.desk.links.can, "--uuid", self.uuid]
+    def start(self, *options: object, can: str | None = None, nfc: bool = False, cwd: Path | None = None) -> CNode:
+        """Power on, and wait until it is on the bus; with ``nfc`` it has an antenna and lies on the desk's reader."""
+        words: list[object] = ["--flash", self.flash, "--uuid", self.uuid]
+        if can != "":
+            words += ["--can", can or self.desk.links.can]
+        if nfc:
+            words += ["--nfc", self.desk.links.nfc]
         if self.channels:
             table = self.flash.with_suffix(".channels")
             table.write_text(self.channels)

@@ -161,4 +161,38 @@ CHANGES: Final[dict[str, Change]] = {
         "security_teds.c", "teds_put32(number, node->state.epoch);", "teds_put32(number, 0);"
     ),
     "FAULT_LEASE_0": Change("operation.c", "if (lease < 1 || ", "if ("),
+    # -- sessions, once more
+    "FAULT_NONCE_COUNTER_FIRST": Change("session.c", "memcpy(nonce + 9, payload, 4);", "memcpy(nonce, payload, 4);"),
+    "FAULT_REPLY_NONCE_COUNTER_FIRST": Change(
+        "session.c", "teds_put32(nonce + 9, counter);", "teds_put32(nonce, counter);"
+    ),
+    "FAULT_REPLY_COUNTER_LITTLE_ENDIAN": Change(
+        "session.c", "teds_put32(payload, counter);", "memcpy(payload, &counter, 4);"
+    ),
+    "FAULT_KEY_ID_LABEL_WITHOUT_00": Change("agree.c", 'LABEL("TEDS1 key id")', 'MAC_LABEL("TEDS1 key id")'),
+    "FAULT_OPEN_MAC_LABEL_WITH_00": Change("session.c", 'MAC_LABEL("station open")', 'LABEL("station open")'),
+    "FAULT_OPEN_TAG_LABEL_WITH_00": Change("session.c", 'MAC_LABEL("node open")', 'LABEL("node open")'),
+    "FAULT_OPEN_MAC_COUNTER_LITTLE_ENDIAN": Change(
+        "session.c", "teds_put64(counter, node->opens);", "memcpy(counter, &node->opens, 8);"
+    ),
+    "FAULT_OPEN_SALT_AND_IKM_SWAPPED": Change(
+        "session.c",
+        "teds_hkdf(node, node->state.key, 16, z, 32, info, 4, okm, 96)",
+        "teds_hkdf(node, z, 32, node->state.key, 16, info, 4, okm, 96)",
+    ),
+    "FAULT_PADDING_ZEROS": Change(
+        "session.c", "memset(payload + 4 + inner, (int)count, count);", "memset(payload + 4 + inner, 0, count);"
+    ),
+    "FAULT_EPOCH_LITTLE_ENDIAN": Change(
+        "agree.c",
+        "teds_put32(out + 16, node->state.epoch + 1);",
+        "const uint32_t next = node->state.epoch + 1;\n        memcpy(out + 16, &next, 4);",
+    ),
+    # -- permissions, once more
+    "FAULT_REQUEST_UNTAPPED": Change(
+        "node.c",
+        "    case TEDS_REQUEST:\n    case TEDS_CONFIRM:\n    case TEDS_SET_CAN_ADDRESS: return",
+        "    case TEDS_REQUEST: return 0;\n    case TEDS_CONFIRM:\n    case TEDS_SET_CAN_ADDRESS: return",
+    ),
+    "FAULT_RESET_LEAVES_REQUEST": Change("node.c", "    teds_pending_forget(node);\n    return 64;", "    return 64;"),
 }

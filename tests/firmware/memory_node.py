@@ -28,7 +28,11 @@ def _library(path: Path) -> Any:
     library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
     library.memory_steps.restype = ctypes.c_long
     library.memory_poll.restype = ctypes.c_uint64
-    library.memory_dead.restype = library.memory_misused.restype = ctypes.c_bool
+    library.memory_dead.restype = library.memory_misused.restype = library.memory_nfc_written.restype = ctypes.c_bool
+    library.memory_ble_advertises.restype = library.memory_ble_drops.restype = ctypes.c_bool
+    library.memory_in_session.restype = ctypes.c_bool
+    library.memory_ble_notify.restype = ctypes.c_size_t
+    library.memory_nfc_message.restype = library.memory_nfc_frame.restype = ctypes.c_size_t
     return library
 
 
@@ -200,6 +204,78 @@ class MemoryNode:
         """Do what is due; the tick at which something is due again."""
         self._now()
         return int(self._library.memory_poll(self._board))
+
+    # -- NFC ---------------------------------------------------------------------------------------------------------
+
+    def has_nfc(self, *, wt_int: int = 4, n_wait: int = 15, max_ndef: int = 4160) -> None:
+        """It has an antenna; before the start."""
+        self._library.memory_nfc(self._board, ctypes.c_uint8(wt_int), ctypes.c_uint8(n_wait), ctypes.c_uint16(max_ndef))
+
+    def nfc_field(self, present: bool) -> None:
+        """A reader activates its tag, or the field is gone."""
+        self._now()
+        self._library.memory_nfc_field(self._board, ctypes.c_bool(present))
+
+    def nfc_write(self, message: bytes) -> bytes:
+        """A reader writes a whole NDEF message; what the tag shows once it was served."""
+        self._now()
+        assert self._library.memory_nfc_written(self._board, message, ctypes.c_size_t(len(message)))
+        assert self.nfc_message() == b""
+        self.poll()
+        return self.nfc_message()
+
+    def nfc_message(self) -> bytes:
+        """What the tag shows now."""
+        out = ctypes.create_string_buffer(4162)
+        length = self._library.memory_nfc_message(self._board, out)
+        return out.raw[:length]
+
+    def nfc_frame(self, frame: bytes) -> bytes | None:
+        """One frame of a reader (RATS, an ISO-DEP block) to the tag's answer; None: silence."""
+        self._now()
+        out = ctypes.create_string_buffer(256)
+        length = self._library.memory_nfc_frame(self._board, frame, ctypes.c_size_t(len(frame)), out)
+        return out.raw[:length] or None
+
+    # -- BLE ---------------------------------------------------------------------------------------------------------
+
+    def ble_connected(self, connection: int, mtu: int) -> None:
+        """Somebody connects."""
+        self._now()
+        self._library.memory_ble_connected(self._board, ctypes.c_uint8(connection), ctypes.c_uint16(mtu))
+
+    def ble_mtu(self, connection: int, mtu: int) -> None:
+        """Both sides have agreed on another MTU."""
+        self._library.memory_ble_mtu(self._board, ctypes.c_uint8(connection), ctypes.c_uint16(mtu))
+
+    def ble_disconnected(self, connection: int) -> None:
+        """The connection is gone."""
+        self._now()
+        self._library.memory_ble_disconnected(self._board, ctypes.c_uint8(connection))
+
+    def ble_written(self, connection: int, value: bytes) -> list[bytes]:
+        """A station writes a piece of a command; the notifications that follow."""
+        self._now()
+        self._library.memory_ble_written(self._board, ctypes.c_uint8(connection), value, ctypes.c_size_t(len(value)))
+        out, notified = ctypes.create_string_buffer(512), []
+        while length := self._library.memory_ble_notify(self._board, ctypes.c_uint8(connection), out):
+            notified.append(out.raw[:length])
+        self.poll()
+        return notified
+
+    def ble_advertises(self) -> bool:
+        """Whether it is to be found now."""
+        self._now()
+        return bool(self._library.memory_ble_advertises(self._board))
+
+    def ble_drops(self, connection: int) -> bool:
+        """Whether it wants to be rid of a connection."""
+        self._now()
+        return bool(self._library.memory_ble_drops(self._board, ctypes.c_uint8(connection)))
+
+    def in_session(self, link: int) -> bool:
+        """Whether a session is open on this link."""
+        return bool(self._library.memory_in_session(self._board, ctypes.c_uint8(link)))
 
     # -- CAN ---------------------------------------------------------------------------------------------------------
 

@@ -43,7 +43,7 @@ def test_it_compiles_without_a_warning_for_clang_too() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("left_out", ["-DTEDS_OPERATION=0", "-DTEDS_CAN_FD=0", "-DTEDS_NFC=1"])
+@pytest.mark.parametrize("left_out", ["-DTEDS_OPERATION=0", "-DTEDS_CAN_FD=0", "-DTEDS_NFC=1", "-DTEDS_BLE=1"])
 def test_it_compiles_with_parts_left_out(left_out: str) -> None:
     builds.need("make", "gcc")
     words = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror", "-fsyntax-only"]

@@ -23,7 +23,8 @@ from tests.firmware.memory_node import MemoryNode
 
 pytestmark = pytest.mark.system
 
-FLAGS = ["-std=c99", "-O0", "-fPIC", "-w", "-DTEDS_MAX_MESSAGE=2048", "-DTEDS_STAGING=16388"]
+SIZES = ["-DTEDS_MAX_MESSAGE=2048", "-DTEDS_STAGING=16388", "-DTEDS_NFC=1", "-DTEDS_MAX_NDEF=4160", "-DTEDS_BLE=1"]
+FLAGS = ["-std=c99", "-O0", "-fPIC", "-w", *SIZES]
 
 
 @pytest.fixture

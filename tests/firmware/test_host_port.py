@@ -19,6 +19,11 @@ from tests.pace import until
 
 pytestmark = pytest.mark.system
 
+OF_A_BUS = {
+    "can-flow-control", "can-busy", "can-form", "keyed-untapped", "confirm-other-link", "confirm-beside",
+    "two-sessions", "stranger-ends-nothing", "repetition-everyone", "repetition-two", "staging-shared",
+}  # fmt: skip
+"""What a tag alone cannot show: no second station can ask."""
 OF_OTHER_LINKS = {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "operate-lease"}
 """What a node with a bus alone cannot show; Operate wants a Channel TEDS that fits, which a factory node has not."""
 
@@ -32,6 +37,29 @@ def test_it_keeps_every_rule_of_the_profile(desk: Desk, station: Station, node: 
     assert not wrong
     skipped = {rule["rule"] for rule in checked["checks"] if rule["result"] == "skipped"}
     assert skipped == {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "operate-lease"}
+
+
+def test_its_tag_keeps_every_rule_of_the_profile(desk: Desk, station: Station, node: CNode) -> None:
+    node.start(can="", nfc=True)
+    assert node.ready["links"] == ["nfc"]
+    checked = station.ask("node", "check", "--factory", "--yes", *desk.links.over("nfc"))
+    assert [rule for rule in checked["checks"] if rule["result"] == "failed"] == []
+    skipped = {rule["rule"] for rule in checked["checks"] if rule["result"] == "skipped"}
+    assert skipped == OF_A_BUS | {"nfc-wtx", "operate-lease"}
+
+
+def test_a_node_that_was_tapped_is_written_over_the_bus(desk: Desk, station: Station, node: CNode) -> None:
+    """With an antenna it is not keyed without a tap; and a tap that is pulled leaves all that is on the bus."""
+    node.start(nfc=True)
+    over = desk.links.over("can")
+    assert "tap" in station.refuses("provision", "-p", ANGLE, "--yes", *over, code=6)["hint"].lower()
+    assert station.provision("nfc", "--profile", ANGLE)["verdict"] == "authentic"
+    assert station.ask("verify", node.uuid, *over)["verdict"] == "authentic"
+    assert station.ask("agree", node.uuid, "--rotate", *over)["epoch"] == 2
+    node.kill()
+    node.start(nfc=True)
+    for via in ("nfc", "can"):
+        assert station.ask("verify", node.uuid, *desk.links.over(via))["verdict"] == "authentic"
 
 
 def test_it_is_provisioned_verified_rotated_and_reset(desk: Desk, station: Station, node: CNode) -> None:

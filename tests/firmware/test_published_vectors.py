@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from teds_provision.protocol.flash import Flash
 from tests.firmware.memory_node import MemoryNode
 from tests.protocol import vector_node as vn
 from tests.protocol.vector_node import Entry
+from tests.vectors.scene import flash, key, named_key, octets
 
 pytestmark = pytest.mark.system
 
@@ -54,3 +57,30 @@ def test_the_node_in_c_answers_as_published(document: Entry, entry: Entry) -> No
     ended: Flash = vn.flash_of(document, entry["end"])
     assert replay.node.blocks() == {**ended.blocks, (0, 128): ended.security_teds()}
     replay.node.close()
+
+
+@vn.cases("nfc_pieces")
+def test_its_tag_shows_what_was_published(document: Entry, entry: Entry) -> None:
+    counts = {"n": itertools.count(), "o": itertools.count()}
+
+    def draw(kind: str, size: int) -> bytes:
+        if kind == "i":
+            return key("node").secret()
+        if kind == "o":
+            return named_key(entry["name"], next(counts["o"]), "En").secret()
+        return (
+            octets(entry["name"], "c")[:8] if size == 8 else octets(entry["name"], next(counts["n"]), "nonceN")[:size]
+        )
+
+    node = MemoryNode(draw, lambda: 0.0, uuid=bytes.fromhex(document["uuid"]), max_message=2048, max_teds=16384)
+    node.has_nfc(wt_int=20, n_wait=15, max_ndef=entry["max_ndef"])
+    assert node.start() == 0
+    node.put(flash(entry["state"]))
+    node.nfc_field(True)
+    shown = node.nfc_message()
+    for step in entry["steps"]:
+        if step["by"] == "station":
+            shown = node.nfc_write(bytes.fromhex(step["message"]))
+        else:
+            assert shown.hex() == step["message"], step["note"]
+    node.close()

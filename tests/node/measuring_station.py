@@ -10,7 +10,7 @@ from pathlib import Path
 from teds_provision.errors import NodeRefused
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.links.can.shared import Ear
+from teds_provision.links.can.shared import Listener
 from teds_provision.links.ports import Link
 from teds_provision.node import described
 from teds_provision.node.flash_file import FlashFile
@@ -71,7 +71,7 @@ class MeasuringStation(SealedLine):
     def __init__(self, spec: str, uuid: bytes, address: int) -> None:
         self.port = CanPort(spec)
         self.address, self.fd = address, "fd=1" in spec
-        self.ear: Ear = self.port.listen(lambda frame: data_address(frame.identifier) is not None)
+        self.ear: Listener = self.port.listen(lambda frame: data_address(frame.identifier) is not None)
         super().__init__(self.port.link(address), uuid)
         self.clock = self.read_clock()
 

@@ -77,13 +77,33 @@
 #define TEDS_SHA256_OCTETS 112
 #endif
 
-/* 1: the node has NFC, so a tap is a tap. 0: its wired bus counts as tapped in factory state (security-teds.md, 2). */
+/* 1: with NFC (a Type 4 tag, TNEP); teds_config says whether this board has an antenna. 0: the wired bus counts as tapped
+ * in factory state (security-teds.md, 2). */
 #ifndef TEDS_NFC
 #define TEDS_NFC 0
 #endif
 
+/* The longest NDEF message. With 64 octets more than a command frame no command goes in pieces; RAM, so less will do. */
+#ifndef TEDS_MAX_NDEF
+#define TEDS_MAX_NDEF (TEDS_MAX_MESSAGE + 64)
+#endif
+
 #if TEDS_MAX_MESSAGE < 512 || TEDS_MAX_MESSAGE > 4094
 #error "TEDS_MAX_MESSAGE is 512 to 4094"
+#endif
+/* 1: Bluetooth LE, its framing. Connections at once: two or more, so that a stranger does not hold the only one. */
+#ifndef TEDS_BLE
+#define TEDS_BLE 0
+#endif
+#ifndef TEDS_BLE_CONNECTIONS
+#define TEDS_BLE_CONNECTIONS 2
+#endif
+
+#if TEDS_BLE_CONNECTIONS < 2 || TEDS_BLE_CONNECTIONS > 20
+#error "two to twenty connections"
+#endif
+#if TEDS_MAX_NDEF < 160 || TEDS_MAX_NDEF > 32000
+#error "TEDS_MAX_NDEF is 160 to 32000"
 #endif
 #if TEDS_DRIVE_OCTETS > 200
 #error "TEDS_DRIVE_OCTETS is at most 200"

@@ -22,6 +22,8 @@ enum {
 /* A link is the station's address: F1 to F7 on CAN, 1 on NFC, 2 and up on BLE. */
 typedef uint8_t teds_link;
 
+enum { TEDS_LINK_NFC = 1, TEDS_LINK_BLE = 2 };
+
 enum { TEDS_CAN = 1, TEDS_AT_NFC = 2, TEDS_AT_BLE = 3 };
 
 /* Where and when a command came. */
@@ -44,6 +46,13 @@ typedef struct teds_config {
     const teds_fixed *fixed;
     size_t fixed_count;
     bool quick_points; /* the chip's point arithmetic takes 5 ms at most */
+    struct {
+        bool present;      /* the board has an antenna: a tap is a tap, and its bus is never one */
+        uint8_t wt_int;    /* how soon a reader may look for an answer: 2^(wt_int / 4 - 1) ms; multiples of 4 */
+        uint8_t n_wait;    /* how often it may look again, at most 15 */
+        uint16_t max_ndef; /* longest NDEF message of this tag, 160 or more; 0: TEDS_MAX_NDEF */
+    } nfc;
+    const uint8_t *ble_address; /* static random, 6 octets as people write them, told at a tap; NULL: no BLE */
 } teds_config;
 
 typedef struct teds_can_frame {
@@ -204,6 +213,35 @@ typedef struct teds_can {
 #endif
 } teds_can;
 
+#if TEDS_NFC
+typedef struct teds_nfc {
+    bool selected, shows_initial, collects, answered;
+    uint8_t stage, opened, file_open;
+    int8_t reply; /* the stored reply that is read in pieces */
+    uint16_t transaction, total, held, answered_transaction, length, came;
+    uint64_t tick;
+    uint8_t shown[23]; /* the Identify that the initial message holds */
+    uint8_t request[TEDS_MAX_MESSAGE];
+    uint8_t file[2 + TEDS_MAX_NDEF]; /* NLEN, message */
+} teds_nfc;
+#endif
+
+#if TEDS_BLE
+typedef struct teds_ble_line {
+    bool used, holds, sends;
+    int8_t reply;
+    uint16_t mtu, transaction, total, held, sent_transaction, at;
+    uint64_t silent_since;
+    uint8_t request[TEDS_MAX_MESSAGE];
+} teds_ble_line;
+
+typedef struct teds_ble {
+    bool was_tapped;
+    uint64_t tapped_at;
+    teds_ble_line lines[TEDS_BLE_CONNECTIONS];
+} teds_ble;
+#endif
+
 /* What is small and asked for often stands first: an offset that fits into an instruction costs nothing. */
 typedef struct teds_node {
     const teds_port *port;
@@ -238,6 +276,12 @@ typedef struct teds_node {
     teds_events events;
 #endif
     teds_stored_reply replies[TEDS_REPLIES];
+#if TEDS_NFC
+    teds_nfc nfc;
+#endif
+#if TEDS_BLE
+    teds_ble ble;
+#endif
     uint8_t staging[TEDS_STAGING];
 } teds_node;
 
@@ -280,6 +324,51 @@ void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick);
 /* The next frame that may leave now; false: none. Ask when the controller is free for one: commands and replies go
  * before data, and what is still here can be taken back. */
 bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now);
+
+#if TEDS_NFC
+/* A reader has activated the tag, or its field is gone: the session over NFC goes with it. */
+void teds_nfc_field(teds_node *node, bool present);
+
+/* For chips that keep the NDEF message themselves: a reader has written a whole one (the chip shows an empty message
+ * from that moment on), and what the tag has to show now; look after each teds_node_poll. written: false where it is
+ * empty or too long. */
+bool teds_nfc_written(teds_node *node, const uint8_t *message, size_t length);
+const uint8_t *teds_nfc_message(const teds_node *node, size_t *length);
+
+/* For chips that hand over APDUs (ISO/IEC 7816-4): the response, with its status word. Commands that a reader wrote are
+ * run by teds_node_poll, so ask soon. */
+#define TEDS_T4T_OCTETS 258
+size_t teds_t4t_apdu(teds_node *node, const uint8_t *apdu, size_t length, uint8_t out[TEDS_T4T_OCTETS]);
+
+/* For chips that hand over frames: ISO-DEP. start takes a RATS and gives the ATS; it is an activation, too. block takes
+ * a block without its CRC and gives the answer's octets, 0: silence. */
+typedef struct teds_isodep {
+    bool receives;
+    uint8_t number, last;
+    uint16_t information, length, at, last_at, last_length;
+    uint8_t apdu[264];
+} teds_isodep;
+size_t teds_isodep_start(teds_node *node, teds_isodep *card, const uint8_t *rats, size_t length, uint8_t out[5]);
+size_t teds_isodep_block(teds_node *node, teds_isodep *card, const uint8_t *block, size_t length, uint8_t out[256]);
+#endif
+
+#if TEDS_BLE
+/* A connection (0 and up, below TEDS_BLE_CONNECTIONS) of the service d8570001-29b5-44d3-91d4-401ec8a7a4d4 began, has
+ * another ATT MTU, ended. */
+void teds_ble_connected(teds_node *node, uint8_t connection, uint16_t mtu);
+void teds_ble_mtu(teds_node *node, uint8_t connection, uint16_t mtu);
+void teds_ble_disconnected(teds_node *node, uint8_t connection);
+
+/* d8570002-… was written; then the notifications of d8570003-… that are due, one a call, until 0. */
+void teds_ble_written(teds_node *node, uint8_t connection, const uint8_t *value, size_t length);
+size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[512]);
+
+/* Whether to advertise now (for 60 s after a tap, and while it has a key), and whether to drop a connection (10 s without
+ * a session). Ask twice a second. tapped is called by teds_nfc_field. */
+void teds_ble_tapped(teds_node *node);
+bool teds_ble_advertises(const teds_node *node);
+bool teds_ble_drops(teds_node *node, uint8_t connection);
+#endif
 
 /* An event sensor has seen something at `tick`: the one function that an interrupt may call. `octets` is a data set.
  * Where the ring is full the event is lost. */

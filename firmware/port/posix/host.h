@@ -1,7 +1,9 @@
-/* The host port: a node as a program. One file of flash, one CAN bus over UDP multicast or socketcand. */
+/* The host port: a node as a program. One file of flash, one CAN bus over UDP multicast or socketcand, a
+ * simulated NFC reader. */
 #ifndef TEDS_HOST_H
 #define TEDS_HOST_H
 
+#include <netinet/in.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -9,7 +11,7 @@
 #include "teds/node.h"
 
 #define HOST_IDENTITY 256u
-#define HOST_SLOT 8192u
+#define HOST_SLOT 16384u
 #define HOST_UNIT 8u
 
 /* -- flash_file.c: flash in a file, as NOR flash behaves ------------------------------------------------------------ */
@@ -55,6 +57,21 @@ bool multicast_unpack(const uint8_t *datagram, size_t length, bool fd, teds_can_
 int socketcand_open(host_bus *bus, const char *channel, const char *host, const char *port);
 int socketcand_receive(host_bus *bus, teds_can_frame *frame);
 int socketcand_send(host_bus *bus, const teds_can_frame *frame);
+
+/* -- nfc_udp.c: a simulated NFC reader ---------------------------------------------------------------------------------- */
+
+typedef struct host_nfc {
+    int in; /* -1: none */
+    bool chosen, active;
+    uint8_t uid[5]; /* and its check octet */
+    struct sockaddr_in reader;
+    teds_isodep card;
+} host_nfc;
+
+/* Lie down on `path` (udp:localhost:PORT); 0, or -1 after words on stderr. */
+int host_nfc_open(host_nfc *nfc, const char *path, const uint8_t uid[3]);
+/* Answer one frame of the reader; false where none has come. */
+bool host_nfc_serve(host_nfc *nfc, teds_node *node);
 
 /* -- channels.c: fake hardware ------------------------------------------------------------------------------------------ */
 

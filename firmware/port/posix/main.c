@@ -23,6 +23,8 @@ typedef struct board {
     host_flash flash;
     host_channels channels;
     host_bus bus;
+    host_nfc nfc;
+    bool has_bus;
     uint64_t started, seed;
 } board;
 
@@ -150,14 +152,14 @@ static void fill_port(teds_port *port, board *own)
 /* -- options --------------------------------------------------------------------------------------------------------------- */
 
 typedef struct options {
-    const char *flash, *can, *uuid, *channels, *source, *cut, *seed;
+    const char *flash, *can, *nfc, *uuid, *channels, *source, *cut, *seed;
     bool fd;
 } options;
 
 static int usage(void)
 {
-    (void)fprintf(stderr, "teds-node --flash FILE --can SPEC [--fd] [--uuid HEX] [--channels FILE]\n"
-                          "          [--source noise|sine:S|ramp:S] [--cut N[:torn]] [--seed N]\n");
+    (void)fprintf(stderr, "teds-node --flash FILE [--can SPEC [--fd]] [--nfc udp:localhost:PORT] [--uuid HEX]\n"
+                          "          [--channels FILE] [--source noise|sine:S|ramp:S] [--cut N[:torn]] [--seed N]\n");
     return 2;
 }
 
@@ -166,7 +168,8 @@ static int read_options(int count, char **words, options *out)
     const struct {
         const char *name;
         const char **value;
-    } known[] = {{"--flash", &out->flash}, {"--can", &out->can},       {"--uuid", &out->uuid},
+    } known[] = {{"--flash", &out->flash}, {"--can", &out->can},       {"--nfc", &out->nfc},
+                 {"--uuid", &out->uuid},
                  {"--channels", &out->channels}, {"--source", &out->source}, {"--cut", &out->cut},
                  {"--seed", &out->seed}};
     for (int i = 1; i < count; i++) {
@@ -182,7 +185,7 @@ static int read_options(int count, char **words, options *out)
             return usage();
         }
     }
-    return out->flash != NULL && out->can != NULL ? 0 : usage();
+    return out->flash != NULL && (out->can != NULL || out->nfc != NULL) ? 0 : usage();
 }
 
 static int read_uuid(const char *text, uint8_t out[10])
@@ -207,7 +210,7 @@ static void print_hex(const uint8_t *octets, size_t length)
     }
 }
 
-static void say_ready(const teds_node *node, const teds_port *port, const char *source)
+static void say_ready(const teds_node *node, const teds_port *port, const options *given)
 {
     uint8_t identity[23], hash[32];
     teds_sha256 state;
@@ -219,7 +222,9 @@ static void say_ready(const teds_node *node, const teds_port *port, const char *
     print_hex(identity + 1, 10);
     (void)printf("\", \"fingerprint\": \"");
     print_hex(hash, 32);
-    (void)printf("\", \"links\": [\"can\"], \"source\": \"%s\", \"ready\": true}\n", source);
+    (void)printf("\", \"links\": [%s%s%s], \"source\": \"%s\", \"ready\": true}\n", given->nfc != NULL ? "\"nfc\"" : "",
+                 given->nfc != NULL && given->can != NULL ? ", " : "", given->can != NULL ? "\"can\"" : "",
+                 given->source);
     (void)fflush(stdout);
 }
 
@@ -227,21 +232,23 @@ static void say_ready(const teds_node *node, const teds_port *port, const char *
 
 static void wait_for(const board *own, uint64_t until)
 {
-    struct pollfd ready = {own->bus.in, POLLIN, 0};
+    struct pollfd ready[2] = {{own->has_bus ? own->bus.in : -1, POLLIN, 0}, {own->nfc.in, POLLIN, 0}};
     uint64_t now = port_now((void *)(uintptr_t)own);
     uint64_t wait = until <= now ? 0 : until - now;
     struct timespec time;
     wait = wait < 500000000u ? wait : 500000000u;
     time.tv_sec = 0;
     time.tv_nsec = (long)wait;
-    (void)ppoll(&ready, 1, &time, NULL);
+    (void)ppoll(ready, 2, &time, NULL);
 }
 
 static int run(board *own, teds_node *node)
 {
     teds_can_frame frame;
-    int came;
-    teds_can_start(node, port_now(own));
+    int came = 0;
+    if (own->has_bus) {
+        teds_can_start(node, port_now(own));
+    }
     while (!stopping) {
         uint64_t due;
         bool busy = false;
@@ -249,7 +256,11 @@ static int run(board *own, teds_node *node)
             by_hand = 0;
             (void)teds_node_reset_by_hand(node);
         }
-        while ((came = host_bus_receive(&own->bus, &frame)) == 1) {
+        while (own->nfc.in >= 0 && host_nfc_serve(&own->nfc, node)) {
+            (void)teds_node_poll(node, port_now(own));
+            busy = true;
+        }
+        while (own->has_bus && (came = host_bus_receive(&own->bus, &frame)) == 1) {
             teds_can_rx(node, &frame, port_now(own));
             busy = true;
             while (teds_can_tx(node, &frame, port_now(own))) {
@@ -261,7 +272,7 @@ static int run(board *own, teds_node *node)
             return 5;
         }
         due = teds_node_poll(node, port_now(own));
-        while (teds_can_tx(node, &frame, port_now(own))) {
+        while (own->has_bus && teds_can_tx(node, &frame, port_now(own))) {
             (void)host_bus_send(&own->bus, &frame);
             busy = true;
         }
@@ -284,6 +295,7 @@ int main(int count, char **words)
     static teds_port port;
     struct sigaction action;
     options given = {.source = "noise"};
+    uint8_t uid[3];
     int failed = read_options(count, words, &given);
     if (failed) {
         return failed;
@@ -308,6 +320,9 @@ int main(int count, char **words)
     }
 #endif
     config.quick_points = true;
+    config.nfc.present = given.nfc != NULL;
+    config.nfc.wt_int = 4;
+    config.nfc.n_wait = 15;
     if (given.uuid != NULL ? read_uuid(given.uuid, config.uuid) != 0 : port_random(&own, config.uuid, 10) != 0) {
         return usage();
     }
@@ -318,7 +333,10 @@ int main(int count, char **words)
                       given.flash);
         return 1;
     }
-    if (host_bus_open(&own.bus, given.can, given.fd) != 0) {
+    own.has_bus = given.can != NULL;
+    own.nfc.in = -1;
+    if ((own.has_bus && host_bus_open(&own.bus, given.can, given.fd) != 0) ||
+        (given.nfc != NULL && (port_random(&own, uid, sizeof uid) != 0 || host_nfc_open(&own.nfc, given.nfc, uid) != 0))) {
         return 5;
     }
     memset(&action, 0, sizeof action);
@@ -326,6 +344,6 @@ int main(int count, char **words)
     (void)sigaction(SIGTERM, &action, NULL);
     (void)sigaction(SIGINT, &action, NULL);
     (void)sigaction(SIGUSR1, &action, NULL);
-    say_ready(&node, &port, given.source);
+    say_ready(&node, &port, &given);
     return run(&own, &node);
 }

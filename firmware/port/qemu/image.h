@@ -1,6 +1,6 @@
-/* A bare Cortex-M under qemu: the start, the clock, the serial line. Two machines: mps2-an386 (Cortex-M4) and microbit
- * (Cortex-M0, the instructions of an M0+). With -icount shift=0 an instruction takes a nanosecond, so that the clock
- * counts instructions. */
+/* A bare Cortex-M under qemu: the start, the clock, the serial line. Machines: microbit (Cortex-M0, the instructions of
+ * an M0+), mps2-an386 (Cortex-M4) and mps2-an505 (Cortex-M33). With -icount shift=0 an instruction takes a nanosecond, so
+ * that the clock counts instructions. */
 #ifndef TEDS_IMAGE_H
 #define TEDS_IMAGE_H
 
@@ -9,8 +9,10 @@
 
 /* Ticks of SysTick since the start, and ns in one. */
 uint64_t image_ticks(void);
-#ifdef TEDS_MICROBIT
+#if defined(TEDS_MICROBIT)
 #define IMAGE_TICK_PICOSECONDS 62500u /* 16 MHz */
+#elif defined(TEDS_AN505)
+#define IMAGE_TICK_PICOSECONDS 50000u /* 20 MHz */
 #else
 #define IMAGE_TICK_PICOSECONDS 40000u /* 25 MHz */
 #endif

@@ -1,19 +1,12 @@
-/* A node under qemu, on a serial line that carries CAN frames. Packets are framed as SLIP does (RFC 1055):
- *
- *   in   00 id4 fd data…   a CAN frame            01 seed32 uuid10   power comes: randomness and identity
- *   out  00 id4 fd data…   a CAN frame            02                 on the bus
- *   in   03                how much stack         out 03 stack4 node4
- */
+/* A node under qemu: a whole port, on a serial line that carries CAN frames (serial.h). */
 #include "image.h"
 #include "octets.h"
+#include "serial.h"
 #include "teds_bearssl.h"
 #include "teds/node.h"
 
 #include <bearssl.h>
 
-#define UART(offset) (*(volatile uint32_t *)(uintptr_t)(0x40004000u + (offset)))
-#define END 0xC0u
-#define ESCAPE 0xDBu
 #define IDENTITY 256u
 #define SLOT 8192u
 
@@ -21,9 +14,6 @@ typedef struct board {
     teds_bearssl crypto; /* first: the port of BearSSL looks here */
     br_hmac_drbg_context dice;
     uint8_t flash[IDENTITY + 2 * SLOT];
-    uint8_t packet[80];
-    size_t held;
-    int escaped;
 } board;
 
 static board own;
@@ -31,63 +21,6 @@ static teds_node node;
 static teds_config config;
 static teds_port port;
 static const teds_channel channels[] = {{1, TEDS_SENSOR, 0, 2, 0, 100000}};
-
-/* -- the serial line ------------------------------------------------------------------------------------------------------ */
-
-static void put(uint8_t octet)
-{
-    while ((UART(4) & 1u) != 0) {
-    }
-    UART(0) = octet;
-}
-
-static void put_escaped(uint8_t octet)
-{
-    if (octet == END || octet == ESCAPE) {
-        put(ESCAPE);
-        octet = octet == END ? 0xDC : 0xDD;
-    }
-    put(octet);
-}
-
-static void send(uint8_t kind, const uint8_t *octets, size_t length)
-{
-    put(END);
-    put_escaped(kind);
-    for (size_t i = 0; i < length; i++) {
-        put_escaped(octets[i]);
-    }
-    put(END);
-}
-
-/* A whole packet in own.packet: its length, 0: none yet. */
-static size_t receive(void)
-{
-    while ((UART(4) & 2u) != 0) {
-        uint8_t octet = (uint8_t)UART(0);
-        if (octet == END) {
-            size_t length = own.held;
-            own.held = 0;
-            own.escaped = 0;
-            if (length > 0) {
-                return length;
-            }
-            continue;
-        }
-        if (octet == ESCAPE) {
-            own.escaped = 1;
-            continue;
-        }
-        if (own.escaped) {
-            octet = octet == 0xDC ? END : ESCAPE;
-            own.escaped = 0;
-        }
-        if (own.held < sizeof own.packet) {
-            own.packet[own.held++] = octet;
-        }
-    }
-    return 0;
-}
 
 /* -- the port --------------------------------------------------------------------------------------------------------------- */
 
@@ -138,10 +71,10 @@ static bool sample(void *user, uint8_t channel, uint64_t tick, uint8_t *out)
     return true;
 }
 
-static int start(void)
+static int start(const uint8_t seed[32], const uint8_t uuid[10])
 {
-    br_hmac_drbg_init(&own.dice, &br_sha256_vtable, own.packet + 1, 32);
-    memcpy(config.uuid, own.packet + 33, 10);
+    br_hmac_drbg_init(&own.dice, &br_sha256_vtable, seed, 32);
+    memcpy(config.uuid, uuid, 10);
     memset(own.flash, 0xFF, sizeof own.flash);
     own.crypto.random = draw;
     port.user = &own;
@@ -163,24 +96,24 @@ static int start(void)
     return teds_node_init(&node, &config, &port);
 }
 
-static void take(size_t length)
+static void take(const uint8_t *packet, size_t length)
 {
     teds_can_frame frame = {0};
     uint8_t told[8];
-    if (own.packet[0] == 1 && length == 43) {
-        if (start() == 0) {
+    if (packet[0] == SERIAL_POWER && length == 43) {
+        if (start(packet + 1, packet + 33) == 0) {
             teds_can_start(&node, now(NULL));
-            send(2, NULL, 0);
+            serial_send(SERIAL_READY, NULL, 0);
         }
-    } else if (own.packet[0] == 3) {
+    } else if (packet[0] == SERIAL_STACK) {
         teds_put32(told, image_stack_used());
         teds_put32(told + 4, sizeof node);
-        send(3, told, sizeof told);
-    } else if (own.packet[0] == 0 && length >= 6 && length - 6 <= sizeof frame.data) {
-        frame.identifier = teds_get32(own.packet + 1);
-        frame.fd = own.packet[5] != 0;
+        serial_send(SERIAL_STACK, told, sizeof told);
+    } else if (packet[0] == SERIAL_FRAME && length >= 6 && length - 6 <= sizeof frame.data) {
+        frame.identifier = teds_get32(packet + 1);
+        frame.fd = packet[5] != 0;
         frame.length = (uint8_t)(length - 6);
-        memcpy(frame.data, own.packet + 6, frame.length);
+        memcpy(frame.data, packet + 6, frame.length);
         teds_can_rx(&node, &frame, now(NULL));
     }
 }
@@ -188,14 +121,14 @@ static void take(size_t length)
 int main(void)
 {
     uint8_t packet[5 + 64];
+    const uint8_t *came;
     teds_can_frame frame;
-    UART(0x10) = 16;
-    UART(8) = 3;
+    serial_open();
     image_paint();
     for (;;) {
-        size_t length = receive();
+        size_t length = serial_receive(&came);
         if (length > 0) {
-            take(length);
+            take(came, length);
         }
         if (node.port == NULL) {
             continue;
@@ -205,7 +138,7 @@ int main(void)
             teds_put32(packet, frame.identifier);
             packet[4] = frame.fd;
             memcpy(packet + 5, frame.data, frame.length);
-            send(0, packet, 5u + frame.length);
+            serial_send(SERIAL_FRAME, packet, 5u + frame.length);
         }
         if (length == 0) {
             (void)teds_idle_work(&node);

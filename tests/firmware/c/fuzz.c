@@ -3,6 +3,7 @@
  * The first octet of an input says where it goes: CAN frames (length, then id and data), or whole commands. With
  * -DTEDS_FUZZ_ALONE it is a program that runs the files named to it, for machines without libFuzzer. */
 #include "memory.h"
+#include "octets.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -131,6 +132,7 @@ static memory_board *board(bool keyed)
     port->ccm_open = open_sealed;
     memory_channel(own, 1, TEDS_SENSOR, 0, 2, 1000);
     memory_channel(own, 2, TEDS_ACTUATOR, 0, 4, 1000);
+    memory_nfc(own, 4, 15, 200);
     if (memory_start(own) != 0 ||
         memory_put(own, keyed ? 1 : 0, 0x21, 1, 1, key, point, point, (const uint8_t *)"", 0) != 0) {
         abort();
@@ -190,6 +192,36 @@ static void commands(memory_board *own, const uint8_t *octets, size_t length)
     }
 }
 
+/* A reader: length (bit 7: a whole NDEF message, else a frame), then octets; what it writes gets its CRC mended. */
+static void taps(memory_board *own, const uint8_t *octets, size_t length)
+{
+    uint8_t out[256];
+    memory_nfc_field(own, true);
+    while (length >= 1) {
+        size_t octets_of_it = octets[0] & 127;
+        uint8_t *copy;
+        octets_of_it = octets_of_it + 1 <= length ? octets_of_it : length - 1;
+        copy = malloc(octets_of_it > 0 ? octets_of_it : 1);
+        if (copy == NULL) {
+            abort();
+        }
+        memcpy(copy, octets + 1, octets_of_it);
+        if (octets[0] >> 7 != 0) {
+            if (octets_of_it > 33 && copy[3] == 't') { /* a payload record: its CRC fits */
+                teds_put32(copy + 29, teds_crc32(teds_crc32(0, copy + 21, 8), copy + 33, octets_of_it - 33));
+            }
+            (void)memory_nfc_written(own, copy, octets_of_it);
+        } else if (memory_nfc_frame(own, copy, octets_of_it, out) > sizeof out) {
+            abort();
+        }
+        free(copy);
+        (void)memory_poll(own);
+        octets += 1 + octets_of_it;
+        length -= 1 + octets_of_it;
+    }
+    memory_nfc_field(own, false);
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length)
 {
     memory_board *own;
@@ -197,7 +229,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length)
         return 0;
     }
     own = board((octets[0] & 2) != 0);
-    if (octets[0] & 1) {
+    if (octets[0] & 4) {
+        taps(own, octets + 1, length - 1);
+    } else if (octets[0] & 1) {
         frames(own, octets + 1, length - 1);
     } else {
         commands(own, octets + 1, length - 1);

@@ -363,3 +363,81 @@ size_t memory_node_octets(void)
 {
     return sizeof(teds_node);
 }
+
+#if TEDS_NFC
+void memory_nfc(memory_board *board, uint8_t wt_int, uint8_t n_wait, uint16_t max_ndef)
+{
+    board->config.nfc.present = true;
+    board->config.nfc.wt_int = wt_int;
+    board->config.nfc.n_wait = n_wait;
+    board->config.nfc.max_ndef = max_ndef;
+}
+
+void memory_nfc_field(memory_board *board, bool present)
+{
+    teds_nfc_field(&board->node, present);
+}
+
+bool memory_nfc_written(memory_board *board, const uint8_t *message, size_t length)
+{
+    return teds_nfc_written(&board->node, message, length);
+}
+
+size_t memory_nfc_message(const memory_board *board, uint8_t *out)
+{
+    size_t length;
+    const uint8_t *message = teds_nfc_message(&board->node, &length);
+    memcpy(out, message, length);
+    return length;
+}
+
+size_t memory_nfc_frame(memory_board *board, const uint8_t *frame, size_t length, uint8_t out[256])
+{
+    if (length > 0 && frame[0] == 0xE0) {
+        return teds_isodep_start(&board->node, &board->card, frame, length, out);
+    }
+    return teds_isodep_block(&board->node, &board->card, frame, length, out);
+}
+#endif
+
+#if TEDS_BLE
+void memory_ble_connected(memory_board *board, uint8_t connection, uint16_t mtu)
+{
+    teds_ble_connected(&board->node, connection, mtu);
+}
+
+void memory_ble_mtu(memory_board *board, uint8_t connection, uint16_t mtu)
+{
+    teds_ble_mtu(&board->node, connection, mtu);
+}
+
+void memory_ble_disconnected(memory_board *board, uint8_t connection)
+{
+    teds_ble_disconnected(&board->node, connection);
+}
+
+void memory_ble_written(memory_board *board, uint8_t connection, const uint8_t *value, size_t length)
+{
+    teds_ble_written(&board->node, connection, value, length);
+}
+
+size_t memory_ble_notify(memory_board *board, uint8_t connection, uint8_t out[512])
+{
+    return teds_ble_notify(&board->node, connection, out);
+}
+
+bool memory_ble_advertises(const memory_board *board)
+{
+    return teds_ble_advertises(&board->node);
+}
+
+bool memory_ble_drops(memory_board *board, uint8_t connection)
+{
+    return teds_ble_drops(&board->node, connection);
+}
+
+bool memory_in_session(const memory_board *board, uint8_t link)
+{
+    return teds_session_on(&board->node, link) >= 0;
+}
+#endif

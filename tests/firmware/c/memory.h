@@ -26,6 +26,9 @@ typedef struct memory_board {
     uint8_t values[TEDS_CHANNELS][8];
     teds_fixed fixed[8];
     bool fails;
+#if TEDS_NFC
+    teds_isodep card;
+#endif
 } memory_board;
 
 memory_board *memory_new(const uint8_t uuid[10], uint8_t unit, uint8_t erased, memory_random random);
@@ -63,5 +66,24 @@ void memory_event(memory_board *board, uint8_t channel, uint64_t tick, const uin
 /* What an actuator does. */
 void memory_set_point(const memory_board *board, uint8_t channel, uint8_t *out);
 size_t memory_node_octets(void);
+#if TEDS_NFC
+/* Before the start: an antenna, and what the tag says of itself. */
+void memory_nfc(memory_board *board, uint8_t wt_int, uint8_t n_wait, uint16_t max_ndef);
+void memory_nfc_field(memory_board *board, bool present);
+bool memory_nfc_written(memory_board *board, const uint8_t *message, size_t length);
+size_t memory_nfc_message(const memory_board *board, uint8_t *out);
+/* A frame of the reader, RATS included; 0: silence. */
+size_t memory_nfc_frame(memory_board *board, const uint8_t *frame, size_t length, uint8_t out[256]);
+#endif
+#if TEDS_BLE
+void memory_ble_connected(memory_board *board, uint8_t connection, uint16_t mtu);
+void memory_ble_mtu(memory_board *board, uint8_t connection, uint16_t mtu);
+void memory_ble_disconnected(memory_board *board, uint8_t connection);
+void memory_ble_written(memory_board *board, uint8_t connection, const uint8_t *value, size_t length);
+size_t memory_ble_notify(memory_board *board, uint8_t connection, uint8_t out[512]);
+bool memory_ble_advertises(const memory_board *board);
+bool memory_ble_drops(memory_board *board, uint8_t connection);
+bool memory_in_session(const memory_board *board, uint8_t link);
+#endif
 
 #endif

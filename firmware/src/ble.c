@@ -1,0 +1,178 @@
+/* BLE (wire.md): commands and replies as frames `transaction 2, total 2, offset 2, piece` over two characteristics. The
+ * GATT server, its connections and advertising are the chip's stack; when to advertise and whom to drop is said here. */
+#include "inside.h"
+
+#if TEDS_BLE
+
+#define HEAD 6u
+#define LEAST_MTU 23u
+#define MOST_VALUE 512u
+#define STRANGER_NS (10u * TEDS_SECOND)
+#define TAPPED_NS (60u * TEDS_SECOND)
+
+static teds_ble_line *line_of(teds_node *node, uint8_t connection)
+{
+    return connection < TEDS_BLE_CONNECTIONS && node->ble.lines[connection].used ? &node->ble.lines[connection] : NULL;
+}
+
+static teds_link link_of(uint8_t connection)
+{
+    return (teds_link)(TEDS_LINK_BLE + connection);
+}
+
+void teds_ble_connected(teds_node *node, uint8_t connection, uint16_t mtu)
+{
+    teds_ble_line *line;
+    if (connection >= TEDS_BLE_CONNECTIONS) {
+        return;
+    }
+    line = &node->ble.lines[connection];
+    memset(line, 0, sizeof *line);
+    line->used = true;
+    line->mtu = mtu > LEAST_MTU ? mtu : LEAST_MTU;
+    line->silent_since = teds_now(node);
+}
+
+void teds_ble_mtu(teds_node *node, uint8_t connection, uint16_t mtu)
+{
+    teds_ble_line *line = line_of(node, connection);
+    if (line != NULL) {
+        line->mtu = mtu > LEAST_MTU ? mtu : LEAST_MTU;
+    }
+}
+
+void teds_ble_disconnected(teds_node *node, uint8_t connection)
+{
+    teds_ble_line *line = line_of(node, connection);
+    if (line != NULL) {
+        teds_wipe(line, sizeof *line);
+        teds_node_link_lost(node, link_of(connection));
+    }
+}
+
+static void request(teds_node *node, uint8_t connection, teds_ble_line *line)
+{
+    const teds_arrival arrival = {TEDS_AT_BLE, false, false, teds_now(node)};
+    uint8_t transaction[2];
+    teds_stored_reply *reply;
+    teds_put16(transaction, line->transaction);
+    reply = teds_answer(node, link_of(connection), &arrival, transaction, 2, line->request, line->total);
+    line->reply = (int8_t)(reply - node->replies);
+    line->sends = true;
+    line->at = 0;
+    line->sent_transaction = line->transaction;
+}
+
+/* Offset 0 begins anew; a frame that does not continue what is held drops it. Nothing is answered to either. */
+void teds_ble_written(teds_node *node, uint8_t connection, const uint8_t *value, size_t length)
+{
+    teds_ble_line *line = line_of(node, connection);
+    size_t octets = length - HEAD;
+    uint16_t transaction, total, offset;
+    if (line == NULL) {
+        return;
+    }
+    if (length < HEAD) {
+        line->holds = false;
+        return;
+    }
+    transaction = teds_get16(value);
+    total = teds_get16(value + 2);
+    offset = teds_get16(value + 4);
+    if (offset == 0) {
+        line->holds = true;
+        line->transaction = transaction;
+        line->total = total;
+        line->held = 0;
+    }
+    if (!line->holds || transaction != line->transaction || total != line->total || offset != line->held ||
+        offset + octets > total || (octets == 0 && total != 0)) {
+        line->holds = false;
+        return;
+    }
+    for (size_t i = 0; i < octets && offset + i < sizeof line->request; i++) {
+        line->request[offset + i] = value[HEAD + i]; /* what is longer than maxMessage gets 10, and not silence */
+    }
+    line->held = (uint16_t)(offset + octets);
+    if (line->held == total) {
+        line->holds = false;
+        request(node, connection, line);
+    }
+}
+
+size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[MOST_VALUE])
+{
+    teds_ble_line *line = line_of(node, connection);
+    const teds_stored_reply *reply;
+    size_t room, left;
+    if (line == NULL || !line->sends) {
+        return 0;
+    }
+    reply = &node->replies[line->reply];
+    room = (line->mtu - 3u < MOST_VALUE ? line->mtu - 3u : MOST_VALUE) - HEAD;
+    left = (size_t)(reply->length - 1 - line->at);
+    room = left < room ? left : room;
+    teds_put16(out, line->sent_transaction);
+    teds_put16(out + 2, (uint16_t)(reply->length - 1));
+    teds_put16(out + 4, line->at);
+    memcpy(out + HEAD, reply->octets + 1 + line->at, room);
+    line->at = (uint16_t)(line->at + room);
+    if (room == left) {
+        line->sends = false;
+        node->replies[line->reply].at = teds_now(node);
+        teds_node_reply_left(node, link_of(connection));
+    }
+    return HEAD + room;
+}
+
+void teds_ble_tapped(teds_node *node)
+{
+    node->ble.was_tapped = true;
+    node->ble.tapped_at = teds_now(node);
+}
+
+bool teds_ble_advertises(const teds_node *node)
+{
+    bool room = false;
+    for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
+        room = room || !node->ble.lines[i].used;
+    }
+    return room && (!teds_in_factory(node) ||
+                    (node->ble.was_tapped && teds_now(node) < node->ble.tapped_at + TAPPED_NS));
+}
+
+bool teds_ble_drops(teds_node *node, uint8_t connection)
+{
+    teds_ble_line *line = line_of(node, connection);
+    if (line == NULL) {
+        return false;
+    }
+    if (teds_session_on(node, link_of(connection)) >= 0) {
+        line->silent_since = teds_now(node);
+    }
+    return teds_now(node) >= line->silent_since + STRANGER_NS;
+}
+
+/* The place of a stored reply is read in pieces, and may not be taken by another link meanwhile. */
+bool teds_ble_sends(const teds_node *node, int8_t place)
+{
+    for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
+        if (node->ble.lines[i].used && node->ble.lines[i].sends && node->ble.lines[i].reply == place) {
+            return true;
+        }
+    }
+    return false;
+}
+
+void teds_ble_forget(teds_node *node, int8_t place)
+{
+    for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
+        if (node->ble.lines[i].reply == place) {
+            node->ble.lines[i].sends = false;
+        }
+    }
+}
+
+#else
+typedef int teds_ble_is_left_out;
+#endif

@@ -1,0 +1,334 @@
+/* NFC (wire.md): the node's half of TNEP 1.0 over an NDEF message, and the pieces of a request and its reply.
+ *
+ * One buffer is the NDEF file: the reader's message is read from it, the answer is put there. While a command runs it is
+ * empty, which says "need more time". */
+#include "inside.h"
+
+#if TEDS_NFC
+
+#define SERVICE "urn:nfc:xsn:teds-provision:tim"
+#define ID_TYPE "teds-provision:id"
+#define PIECE_HEAD 12u
+#define ANSWER 1u
+#define MORE 2u
+#define STATUS_OCTETS 6u
+enum { SUCCESS = 0x00, PROTOCOL_ERROR = 0x01, GARBLED = 0x80 };
+
+typedef struct piece {
+    uint8_t flags;
+    uint16_t transaction, total, offset;
+    const uint8_t *body;
+    size_t length;
+} piece;
+
+static size_t most(const teds_node *node)
+{
+    const uint16_t told = node->config->nfc.max_ndef;
+    return told != 0 && told < TEDS_MAX_NDEF ? told : TEDS_MAX_NDEF;
+}
+
+static void put(teds_node *node, size_t length)
+{
+    node->nfc.length = (uint16_t)length;
+    teds_put16(node->nfc.file, (uint16_t)length);
+}
+
+/* -- the initial message ---------------------------------------------------------------------------------------------- */
+
+/* WLCCAP and WLCSTAI of a board with a battery (NFC Forum WLC 2.0 as open sources read it); 0 without one. */
+static size_t charge(const teds_node *node, uint8_t *out)
+{
+    static const uint8_t waits[4] = {0x09, 0x1E, 0x03, 0x0A};
+    teds_power power = {0, 0xFF, 0, 0, 0};
+    size_t at;
+    if (node->port->power == NULL) {
+        return 0;
+    }
+    node->port->power(node->port->user, &power);
+    if ((power.flags & TEDS_POWER_BATTERY) == 0 || power.level == 0xFF) {
+        return 0;
+    }
+    at = teds_ndef_head(out, TEDS_NDEF_BEGINS, TEDS_NDEF_WELL_KNOWN, "WLCCAP", 6, 6);
+    out[at] = 0x20;
+    out[at + 1] = (uint8_t)(((power.flags & TEDS_POWER_FULL) != 0 ? 0x80 : 0) | 0x01);
+    memcpy(out + at + 2, waits, sizeof waits);
+    at += 6;
+    at += teds_ndef_head(out + at, 0, TEDS_NDEF_WELL_KNOWN, "WLCSTAI", 7, 2);
+    out[at] = 0x01;
+    out[at + 1] = power.level;
+    return at + 2;
+}
+
+/* Bluetooth LE out-of-band record (Core Specification Supplement, MIME type of Bluetooth SIG): which node to look for. */
+static size_t out_of_band(const teds_node *node, uint8_t *out)
+{
+    static const char type[] = "application/vnd.bluetooth.le.oob";
+    const uint8_t *address = node->config->ble_address;
+    size_t at = teds_ndef_head(out, TEDS_NDEF_ENDS, TEDS_NDEF_MIME, type, sizeof type - 1, 12);
+    out[at] = 0x08;
+    out[at + 1] = 0x1B;
+    for (size_t i = 0; i < 6; i++) {
+        out[at + 2 + i] = address[5 - i];
+    }
+    out[at + 8] = 1; /* random */
+    out[at + 9] = 0x02;
+    out[at + 10] = 0x1C;
+    out[at + 11] = 0x00; /* peripheral alone */
+    return at + 12;
+}
+
+static void show_initial(teds_node *node)
+{
+    const bool airs = TEDS_BLE && node->config->ble_address != NULL;
+    const size_t uri = sizeof SERVICE - 1;
+    uint8_t *out = node->nfc.file + 2;
+    size_t at = charge(node, out);
+    at += teds_ndef_head(out + at, at == 0 ? TEDS_NDEF_BEGINS : 0, TEDS_NDEF_WELL_KNOWN, "Tp", 2, 7 + uri);
+    out[at] = 0x10;
+    out[at + 1] = (uint8_t)uri;
+    memcpy(out + at + 2, SERVICE, uri);
+    at += 2 + uri;
+    out[at] = 0; /* single response */
+    out[at + 1] = node->config->nfc.wt_int;
+    out[at + 2] = node->config->nfc.n_wait;
+    teds_put16(out + at + 3, (uint16_t)most(node));
+    at += 5;
+    at += teds_ndef_head(out + at, airs ? 0 : TEDS_NDEF_ENDS, TEDS_NDEF_EXTERNAL, ID_TYPE, sizeof ID_TYPE - 1, 23);
+    teds_node_identify(node, out + at);
+    memcpy(node->nfc.shown, out + at, 23);
+    node->nfc.shows_initial = true;
+    at += 23;
+    at += airs ? out_of_band(node, out + at) : 0;
+    put(node, at);
+}
+
+/* -- pieces ----------------------------------------------------------------------------------------------------------- */
+
+static bool read_piece(const uint8_t *payload, size_t length, piece *out)
+{
+    uint32_t crc;
+    if (payload == NULL || length < PIECE_HEAD || payload[0] != 1) {
+        return false;
+    }
+    out->flags = payload[1];
+    out->transaction = teds_get16(payload + 2);
+    out->total = teds_get16(payload + 4);
+    out->offset = teds_get16(payload + 6);
+    out->body = payload + PIECE_HEAD;
+    out->length = length - PIECE_HEAD;
+    crc = teds_crc32(teds_crc32(0, payload, 8), out->body, out->length);
+    return crc == teds_get32(payload + 8) && (out->length == 0 || out->offset + out->length <= out->total);
+}
+
+static size_t put_status(uint8_t *out, uint8_t marks, uint8_t status)
+{
+    size_t at = teds_ndef_head(out, marks, TEDS_NDEF_WELL_KNOWN, "Te", 2, 1);
+    out[at] = status;
+    return at + 1;
+}
+
+static void say_status(teds_node *node, uint8_t status)
+{
+    put(node, put_status(node->nfc.file + 2, TEDS_NDEF_BEGINS | TEDS_NDEF_ENDS, status));
+}
+
+/* Te 00 and a piece, whose body is copied in. */
+static void say_piece(teds_node *node, const piece *own)
+{
+    uint8_t *out = node->nfc.file + 2, *payload;
+    size_t at = put_status(out, TEDS_NDEF_BEGINS, SUCCESS);
+    at += teds_ndef_head(out + at, TEDS_NDEF_ENDS, TEDS_NDEF_EXTERNAL, TEDS_TIM_TYPE, sizeof TEDS_TIM_TYPE - 1,
+                         PIECE_HEAD + own->length);
+    payload = out + at;
+    payload[0] = 1;
+    payload[1] = own->flags;
+    teds_put16(payload + 2, own->transaction);
+    teds_put16(payload + 4, own->total);
+    teds_put16(payload + 6, own->offset);
+    if (own->length > 0) {
+        memcpy(payload + PIECE_HEAD, own->body, own->length);
+    }
+    teds_put32(payload + 8, teds_crc32(teds_crc32(0, payload, 8), payload + PIECE_HEAD, own->length));
+    put(node, at + PIECE_HEAD + own->length);
+}
+
+static size_t room(const teds_node *node)
+{
+    size_t left = most(node) - STATUS_OCTETS - 3 - (sizeof TEDS_TIM_TYPE - 1);
+    if (left > 255) {
+        left = left - 3 > 255 ? left - 3 : 255; /* a payload length of 4 octets */
+    }
+    return left - PIECE_HEAD;
+}
+
+static void say_part(teds_node *node, uint16_t offset)
+{
+    const teds_stored_reply *reply = &node->replies[node->nfc.reply];
+    const uint16_t total = (uint16_t)(reply->length - 1);
+    piece own = {ANSWER, node->nfc.answered_transaction, total, offset < total ? offset : total, NULL, room(node)};
+    own.body = reply->octets + 1 + own.offset;
+    if (own.length > (size_t)(total - own.offset)) {
+        own.length = (size_t)(total - own.offset);
+    }
+    own.flags |= (uint8_t)(own.offset + own.length < total ? MORE : 0);
+    say_piece(node, &own);
+}
+
+static void say_held(teds_node *node, const piece *asked)
+{
+    const teds_nfc *nfc = &node->nfc;
+    const bool same = nfc->collects && nfc->transaction == asked->transaction && nfc->total == asked->total;
+    const piece own = {ANSWER, asked->transaction, asked->total, same ? nfc->held : 0, NULL, 0};
+    say_piece(node, &own);
+}
+
+static void collect(teds_node *node, const piece *came)
+{
+    teds_nfc *nfc = &node->nfc;
+    const teds_arrival arrival = {TEDS_AT_NFC, true, false, nfc->tick};
+    uint8_t transaction[2];
+    if (!nfc->collects || nfc->transaction != came->transaction || nfc->total != came->total) {
+        nfc->collects = true;
+        nfc->transaction = came->transaction;
+        nfc->total = came->total;
+        nfc->held = 0;
+    }
+    if (came->offset <= nfc->held) {
+        for (size_t i = 0; i < came->length && came->offset + i < sizeof nfc->request; i++) {
+            nfc->request[came->offset + i] = came->body[i]; /* what is longer than maxMessage is refused all the same */
+        }
+        nfc->held = (uint16_t)(came->offset + came->length);
+        nfc->answered = false;
+    }
+    if (nfc->held < nfc->total) {
+        say_held(node, came);
+        return;
+    }
+    if (!nfc->answered) {
+        teds_stored_reply *reply;
+        teds_put16(transaction, nfc->transaction);
+        reply = teds_answer(node, TEDS_LINK_NFC, &arrival, transaction, 2, nfc->request, nfc->total);
+        nfc->reply = (int8_t)(reply - node->replies);
+        nfc->answered = true;
+        nfc->answered_transaction = nfc->transaction;
+        teds_node_reply_left(node, TEDS_LINK_NFC);
+    }
+    say_part(node, 0);
+}
+
+/* -- the conversation --------------------------------------------------------------------------------------------------- */
+
+static void answer(teds_node *node, size_t length)
+{
+    teds_nfc *nfc = &node->nfc;
+    teds_ndef came;
+    piece own;
+    if (!teds_ndef_read(nfc->file + 2, length, &came)) {
+        say_status(node, GARBLED);
+        return;
+    }
+    if (came.selection != NULL) {
+        nfc->selected =
+            came.selection_length == sizeof SERVICE - 1 && memcmp(came.selection, SERVICE, sizeof SERVICE - 1) == 0;
+        if (nfc->selected) {
+            say_status(node, SUCCESS);
+        } else {
+            show_initial(node);
+        }
+        return;
+    }
+    if (!nfc->selected && came.charges) {
+        show_initial(node);
+        return;
+    }
+    if (came.payload == NULL || !nfc->selected) {
+        say_status(node, PROTOCOL_ERROR);
+        return;
+    }
+    if (!read_piece(came.payload, came.payload_length, &own) || (own.flags & ANSWER) != 0) {
+        say_status(node, GARBLED);
+    } else if (own.length > 0) {
+        collect(node, &own);
+    } else if (nfc->answered && nfc->answered_transaction == own.transaction) {
+        say_part(node, own.offset);
+    } else {
+        say_held(node, &own);
+    }
+}
+
+static void forget(teds_node *node)
+{
+    node->nfc.collects = false;
+    node->nfc.answered = false;
+    node->nfc.selected = false;
+    node->nfc.stage = TEDS_NFC_QUIET;
+    teds_wipe(node->nfc.request, sizeof node->nfc.request);
+}
+
+void teds_nfc_field(teds_node *node, bool present)
+{
+    if (present) {
+        node->nfc.selected = false;
+        node->nfc.stage = TEDS_NFC_QUIET;
+        node->nfc.opened = 0;
+#if TEDS_BLE
+        teds_ble_tapped(node);
+#endif
+        show_initial(node);
+    } else {
+        forget(node);
+        teds_node_link_lost(node, TEDS_LINK_NFC);
+    }
+}
+
+/* The message that stands in the file is whole: it is empty from here on, until the answer is there. */
+void teds_nfc_came(teds_node *node, size_t length)
+{
+    node->nfc.stage = TEDS_NFC_WRITTEN;
+    node->nfc.tick = teds_now(node);
+    node->nfc.came = (uint16_t)length;
+    node->nfc.shows_initial = false;
+    put(node, 0);
+}
+
+bool teds_nfc_written(teds_node *node, const uint8_t *message, size_t length)
+{
+    if (length == 0 || length > most(node)) {
+        return false;
+    }
+    memcpy(node->nfc.file + 2, message, length);
+    teds_nfc_came(node, length);
+    return true;
+}
+
+const uint8_t *teds_nfc_message(const teds_node *node, size_t *length)
+{
+    *length = node->nfc.length;
+    return node->nfc.file + 2;
+}
+
+void teds_nfc_poll(teds_node *node)
+{
+    if (!node->config->nfc.present) {
+        return;
+    }
+    if (node->nfc.stage == TEDS_NFC_WRITTEN) {
+        node->nfc.stage = TEDS_NFC_QUIET;
+        answer(node, node->nfc.came);
+    } else if (node->nfc.shows_initial) {
+        uint8_t identity[23];
+        teds_node_identify(node, identity);
+        if (memcmp(identity, node->nfc.shown, sizeof identity) != 0) {
+            show_initial(node);
+        }
+    }
+}
+
+void teds_nfc_start(teds_node *node)
+{
+    if (node->config->nfc.present) {
+        show_initial(node);
+    }
+}
+
+#endif

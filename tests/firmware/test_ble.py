@@ -1,0 +1,159 @@
+"""The C node in the air: its frames beside the reference's; commands of the station under the stand-in for bluetoothd.
+
+The GATT server and the radio are bumble's, as on a board they are the chip's: what is of the library is every frame.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from teds_provision.protocol.messages import ble
+from teds_provision.protocol.messages.frames import Command, Function, security_command
+from teds_provision.protocol.repetition import Repetition
+from tests.bench import make_station
+from tests.e2e.desk import ANGLE, Desk, Station
+from tests.firmware.test_beside_python import Twins
+from tests.links.ble.conftest import air  # noqa: F401 - a fixture
+from tests.links.ble.radio import Radio, needs_dbus
+from tests.links.ble.test_whole_runs import tapped_once
+
+pytestmark = pytest.mark.system
+SECONDS = 10**9
+
+
+class Line:
+    """One connection as the reference's peripheral has it."""
+
+    def __init__(self, twins: Twins, number: int, mtu: int) -> None:
+        self.twins, self.number, self.mtu = twins, number, mtu
+        self.assembly, self.repetition = ble.Assembly(0xFFFF), Repetition()
+        twins.c.ble_connected(number, mtu)
+
+    def write(self, value: bytes) -> list[bytes]:
+        """Both take a piece, and notify the same."""
+        received, due = self.assembly.take(value), []
+        if received is not None:
+            name = f"ble:{self.number + 2:x}"
+            reply = self.repetition.answer(
+                received.transaction,
+                received.message,
+                lambda frame: self.twins.py.handle(frame, link=name, tapped=False),
+                now=self.twins.now(),
+            )
+            due = list(ble.cut(received.transaction, reply, self.mtu))
+            self.repetition.left(self.twins.now())
+        assert self.twins.c.ble_written(self.number, value) == due, value.hex()
+        return due
+
+    def end(self) -> None:
+        """The connection is gone."""
+        self.twins.py.link_lost(f"ble:{self.number + 2:x}")
+        self.twins.c.ble_disconnected(self.number)
+
+
+def frames(dice: random.Random, transaction: int, mtu: int) -> list[bytes]:
+    """Pieces of a command, mostly in order."""
+    message = dice.choice(
+        (
+            lambda: security_command(Function.IDENTIFY).encode(),
+            lambda: security_command(Function.PROVE, dice.randbytes(32)).encode(),
+            lambda: security_command(Function.LIST).encode(),
+            lambda: Command(0, 1, 2, b"\x80" + bytes(4)).encode(),
+            lambda: Command(1, 1, 2, b"\x0c" + bytes(4)).encode(),
+            lambda: security_command(Function.RESET, bytes(32)).encode(),
+            lambda: dice.randbytes(dice.choice((0, 5, 300, 1024, 1025, 5000))),
+        )
+    )()
+    pieces = list(ble.cut(transaction, message, mtu))
+    what = dice.random()
+    if what < 0.08:
+        pieces.pop(dice.randrange(len(pieces)))
+    elif what < 0.16:
+        pieces.insert(dice.randrange(len(pieces) + 1), dice.choice(pieces))
+    elif what < 0.2:
+        pieces[-1] += b"more"
+    elif what < 0.24:
+        pieces.insert(1, pieces[0][:4] + len(pieces[0][6:]).to_bytes(2, "big"))
+    elif what < 0.28:
+        pieces.insert(dice.randrange(len(pieces) + 1), dice.randbytes(dice.randrange(10)))
+    return pieces
+
+
+@pytest.mark.parametrize("mtu", [23, 247, 517])
+def test_both_nodes_notify_the_same(mtu: int) -> None:
+    dice, twins = random.Random(mtu), Twins(mtu)
+    twins.memory.state = replace(twins.flash, blocks={(1, 12): dice.randbytes(900)})  # more than a value holds
+    twins.c.put(twins.flash)
+    twins.restart()
+    lines = {number: Line(twins, number, mtu) for number in (0, 1)}
+    notified, transaction = 0, 0
+    for _ in range(150):
+        twins.hardware.tick += dice.choice((MS_1, MS_1, SECONDS, 21 * SECONDS))
+        line = lines[dice.randrange(2)]
+        transaction += dice.random() < 0.8
+        for piece in frames(dice, transaction & 0xFFFF, mtu):
+            notified += len(line.write(piece))
+        if dice.random() < 0.05:
+            line.end()
+            lines[line.number] = Line(twins, line.number, mtu)
+    assert notified > 100
+    twins.c.close()
+
+
+MS_1 = 10**6
+
+
+def test_it_advertises_after_a_tap_and_drops_whoever_has_no_session() -> None:
+    twins = Twins(1)
+    node = twins.c
+    node.has_nfc()
+    assert node.start() == 0
+    assert not node.ble_advertises()
+    node.nfc_field(True)
+    assert node.ble_advertises()
+    twins.hardware.tick += 59 * SECONDS
+    for connection in (0, 1, 2):
+        assert node.ble_advertises()
+        node.ble_connected(connection, 23)
+    assert not node.ble_advertises()  # there is no room for another one
+    node.ble_disconnected(1)
+    assert node.ble_advertises()
+    twins.hardware.tick += SECONDS
+    assert not node.ble_advertises()  # a minute after the tap
+    twins.hardware.tick += 8 * SECONDS
+    assert not node.ble_drops(0)
+    twins.hardware.tick += SECONDS
+    assert node.ble_drops(0)
+    node.close()
+
+
+@needs_dbus
+@pytest.mark.link
+def test_it_is_checked_verified_and_written_over_the_air(
+    tmp_path_factory: pytest.TempPathFactory,
+    air: Callable[..., Radio],  # noqa: F811
+) -> None:
+    folder = tmp_path_factory.mktemp("c-air")
+    desk = Desk(folder, folder)
+    try:
+        station = make_station(folder / "home")
+        tapped_once(station, folder / "node")
+        station.close()
+        radio = air([folder / "node"], in_c=True)
+        bench = Station(desk, folder / "home")
+        done = bench.ask("node", "check", "--via", "ble")
+        assert done["failed"] == 0, [check for check in done["checks"] if check["result"] == "failed"]
+        passed = {check["rule"] for check in done["checks"] if check["result"] == "passed"}
+        assert {"repetition", "sealed-counter", "open-once"} <= passed
+        radio.do("manners", {"mtu": 23})
+        written = bench.ask("provision", "--profile", ANGLE, "--name", "by air", "--yes", "--via", "ble")
+        assert (written["verdict"], written["name"]) == ("authentic", "by air")
+        radio.do("manners", {"mtu": 517})
+        assert bench.ask("verify", done["uuid"], "--via", "ble")["verdict"] == "authentic"
+        assert radio.do("pieces", 0) > 20
+    finally:
+        desk.clear()

@@ -1,0 +1,226 @@
+"""The C node's tag beside the reference's: the same messages and frames of a reader, the same answers."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from teds_provision.links.nfc import message, tnep
+from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, Record
+from teds_provision.links.nfc.pieces import Piece, room
+from teds_provision.node.nfc.tags import ATS, IsoDepTag, NdefApplication, Type4Memory
+from teds_provision.node.nfc.tnep import TnepTag
+from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.protocol.messages.frames import Command, Function, security_command
+from tests.firmware.memory_node import MemoryNode
+from tests.firmware.test_beside_python import Twins
+from tests.protocol.desk import CREDENTIALS, NODE, UUID
+from tests.vectors.recipes_links import Mailbox, TagHandler
+
+pytestmark = pytest.mark.system
+
+IDENTIFY = security_command(Function.IDENTIFY).encode()
+
+
+class Taps:
+    """Both nodes on one reader. The reference's worker has answered when its mailbox shows something."""
+
+    def __init__(self, seed: int, max_ndef: int) -> None:
+        self.dice = random.Random(seed)
+        self.twins = Twins(seed)
+        self.twins.c.close()
+        self.c = self.twins.c = MemoryNode(
+            lambda kind, size: NODE.secret() if kind == "i" else self.twins._draw("c", kind, size),
+            self.twins.now,
+            uuid=UUID,
+        )
+        self.c.has_nfc(max_ndef=max_ndef)
+        self.twins.dice = {"py": random.Random(seed), "c": random.Random(seed)}
+        self.twins.restart()
+        self.max_ndef = max_ndef
+        self.mailbox = Mailbox(max_ndef)
+        self.tag = TnepTag(self.mailbox, TagHandler(self.twins.py), wt_int=4, n_wait=15)
+        self.tag.start()
+        self.transaction = 0
+        self.told = 0
+        self.activate()
+
+    def activate(self) -> None:
+        """The field goes, and comes again."""
+        for node in (self.tag.lost, lambda: self.c.nfc_field(False)):
+            node()
+        self.tag.activated()
+        self.c.nfc_field(True)
+        assert self.tag.ready(60)
+        shown = b""
+        while not self.mailbox.shown.empty():
+            shown = self.mailbox.shown.get()
+        assert self.c.nfc_message() == shown
+
+    def write(self, octets: bytes) -> bytes:
+        """A reader writes this; both show the same."""
+        if not 0 < len(octets) <= self.max_ndef:
+            return b""
+        mine = self.mailbox.write(octets)
+        assert self.c.nfc_write(octets).hex() == mine.hex(), octets.hex()
+        self.told += 1
+        return mine
+
+    def close(self) -> None:
+        self.tag.stop()
+        self.c.close()
+
+
+@pytest.fixture
+def taps() -> Iterator[Callable[[int, int], Taps]]:
+    made: list[Taps] = []
+
+    def make(seed: int, max_ndef: int) -> Taps:
+        made.append(Taps(seed, max_ndef))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def command(dice: random.Random) -> bytes:
+    """A command of a station, mostly sense."""
+    return dice.choice(
+        (
+            lambda: IDENTIFY,
+            lambda: security_command(Function.PROVE, dice.randbytes(32)).encode(),
+            lambda: security_command(Function.LIST).encode(),
+            lambda: Command(0, 1, 2, b"\x80" + dice.randrange(300).to_bytes(4, "big")).encode(),
+            lambda: StationAgreement(CREDENTIALS, UUID).request().encode(),
+            lambda: security_command(Function.RESET, bytes(32)).encode(),
+            lambda: dice.randbytes(dice.randrange(1, 40)),
+            lambda: dice.randbytes(dice.choice((1023, 1024, 1025, 3000))),
+        )
+    )()
+
+
+def chunked(octets: bytes, dice: random.Random) -> bytes:
+    """One record in chunks, as NDEF allows."""
+    out, at, first = b"", 0, True
+    while first or at < len(octets):
+        part = octets[at : at + dice.randrange(1, 200)]
+        at += len(part)
+        last = at >= len(octets)
+        head = (0x80 if first else 0) | (0x40 if last else 0x20) | 0x10 | (EXTERNAL if first else 6)
+        name = tnep.TIM_TYPE if first else b"" if dice.random() < 0.95 else b"x"
+        out += bytes((head, len(name), len(part))) + name + part
+        first = False
+    return out
+
+
+def talk(taps: Taps) -> None:
+    """One thing that a reader does."""
+    dice = taps.dice
+    what = dice.random()
+    if what < 0.08:
+        taps.activate()
+        if dice.random() < 0.5:  # what was asked before the field went is forgotten
+            taps.write(message.encode([tnep.select(tnep.SERVICE)]))
+            taps.write(message.encode([tnep.payload_record(Piece(taps.transaction, 23, 0, b"").encode())]))
+    if what < 0.25:
+        taps.write(
+            message.encode([tnep.select(dice.choice((tnep.SERVICE, tnep.SERVICE, b"", b"urn:nfc:sn:handover")))])
+        )
+        return
+    if what < 0.3:
+        taps.write(dice.randbytes(dice.randrange(1, 40)))
+        return
+    if dice.random() < 0.7:
+        taps.transaction = (taps.transaction + 1) % 65536
+    frame = command(dice)
+    size = dice.choice((room(taps.max_ndef), room(taps.max_ndef), dice.randrange(1, room(taps.max_ndef))))
+    size = max(size, len(frame) // 6)
+    at = 0
+    while at < len(frame):
+        body = frame[at : at + size]
+        more = at + len(body) < len(frame)
+        own = Piece(taps.transaction, len(frame), at, body, answer=dice.random() < 0.03, more=more)
+        payload = bytearray(own.encode())
+        if dice.random() < 0.03:
+            payload[dice.randrange(len(payload))] ^= 1
+        name = tnep.TIM_TYPE.upper() if dice.random() < 0.1 else tnep.TIM_TYPE
+        records = [Record(EXTERNAL, name, bytes(payload))]
+        if dice.random() < 0.1:
+            records.insert(dice.randrange(2), Record(WELL_KNOWN, b"T", dice.randbytes(dice.choice((0, 5, 300))), b"id"))
+        octets = chunked(bytes(payload), dice) if dice.random() < 0.1 else message.encode(records)
+        if dice.random() < 0.04:
+            octets = octets[: dice.randrange(len(octets))]
+        taps.write(octets)
+        if dice.random() < 0.1:
+            taps.write(octets)
+        at += len(body) if dice.random() < 0.95 else 0
+    for _ in range(dice.randrange(4)):
+        ask = Piece(taps.transaction, dice.choice((len(frame), 23, 168)), dice.randrange(200), b"")
+        taps.write(message.encode([tnep.payload_record(ask.encode())]))
+
+
+@pytest.mark.parametrize("max_ndef", [4160, 499, 284, 200])
+def test_both_tags_answer_a_random_reader_alike(taps: Callable[[int, int], Taps], max_ndef: int) -> None:
+    for seed in range(6):
+        reader = taps(seed, max_ndef)
+        for _ in range(100):
+            talk(reader)
+        assert reader.told > 60
+
+
+def reader_frame(dice: random.Random, number: int, length: int) -> bytes:
+    """One ISO-DEP block of a reader: mostly in order."""
+    apdu = dice.choice(
+        (
+            bytes.fromhex("00A4040007D276000085010100"),
+            bytes.fromhex("00A4000C02E103"),
+            bytes.fromhex("00A4000C02E104"),
+            bytes.fromhex("00A4000C02E105"),
+            bytes.fromhex("00B000000F"),
+            b"\x00\xb0" + dice.randrange(length + 3).to_bytes(2, "big") + bytes((dice.choice((0, 2, 15, 251)),)),
+            b"\x00\xd6\x00\x00\x02" + bytes(2),
+            b"\x00\xd6\x00\x00\x01\x01",
+            b"\x00\xd6" + dice.choice((2, 2, 100, 6000)).to_bytes(2, "big") + bytes((20,)) + dice.randbytes(20),
+            b"\x00\xd6\x00\x00\x02" + dice.choice((6, 20, 60000)).to_bytes(2, "big"),
+            dice.randbytes(dice.randrange(1, 12)),
+        )
+    )
+    what = dice.random()
+    if what < 0.75:
+        return bytes((0x02 | number,)) + apdu
+    if what < 0.85:
+        return bytes((0x12 | number,)) + apdu[: dice.randrange(len(apdu)) + 1]
+    if what < 0.95:
+        return bytes((dice.choice((0xA2, 0xB2)) | dice.randrange(2),))
+    return dice.choice((b"\xc2", b"\xf2\x01", bytes((dice.choice((0x00, 0x40, 0xD0, 0xFF)),)) + dice.randbytes(2)))
+
+
+@pytest.mark.parametrize("fsdi", [0, 2, 8])
+def test_both_tags_answer_a_readers_frames_alike(fsdi: int) -> None:
+    """ISO-DEP and the APDUs alone: what the message says is the C node's in both."""
+    dice = random.Random(fsdi)
+    for _ in range(40):
+        node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else b"\x01" * size, lambda: 0.0, uuid=UUID)
+        node.has_nfc(max_ndef=1000)
+        assert node.start() == 0
+        rats = bytes((0xE0, fsdi << 4))
+        memory = Type4Memory(1000)
+        card = IsoDepTag(rats, NdefApplication(memory, lambda seconds: True))
+        assert node.nfc_frame(rats) == ATS
+        memory.put(node.nfc_message())
+        number = 0
+        for _ in range(60):
+            frame = reader_frame(dice, number, len(node.nfc_message()))
+            came: list[bytes] = []
+            memory.written = came.append
+            mine, theirs = card.answer(frame), node.nfc_frame(frame)
+            assert (mine or b"").hex() == (theirs or b"").hex(), frame.hex()
+            if frame[0] & 0xE2 == 0x02:
+                number ^= 1
+            if came:
+                node.poll()
+                memory.put(node.nfc_message())
+        node.close()
