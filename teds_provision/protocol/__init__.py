@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         keys,
         messages,
         operation,
+        plant,
         repetition,
         session,
         tim,

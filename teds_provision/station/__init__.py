@@ -5,6 +5,18 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.station import groups, identity, label, node_keys, nodes, pins, policy, seals, station, summary
+    from teds_provision.station import (
+        groups,
+        identity,
+        label,
+        node_keys,
+        nodes,
+        pins,
+        plant,
+        policy,
+        seals,
+        station,
+        summary,
+    )
 else:
     __getattr__ = lazy(__name__)

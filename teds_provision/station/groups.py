@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from teds_provision.errors import Frozen, NotFound, UsageFailure
+from teds_provision.files import open_lock
+from teds_provision.station.plant import Plant
 from teds_provision.store import Store
 from teds_provision.store.records import Group
 
@@ -26,8 +28,8 @@ class Groups:
     The mark of that is a lock that the system takes away with the process, however that ends.
     """
 
-    def __init__(self, store: Store, home: Path) -> None:
-        self._store, self._home = store, home
+    def __init__(self, store: Store, home: Path, plant: Plant) -> None:
+        self._store, self._home, self._plant = store, home, plant
 
     def all(self) -> list[Group]:
         """Every group, by name."""
@@ -56,29 +58,41 @@ class Groups:
         if present is not None and set(present.uuids) != set(uuids):
             raise UsageFailure(f"There is a group {name!r} already.", hint=f"Add nodes to it: group add {name} UUID …")
         if present is None:
-            self._store.put_group(Group(name, tuple(dict.fromkeys(uuids))))
+            with self._store.together():
+                self._store.put_group(Group(name, tuple(dict.fromkeys(uuids))))
+                self._tell(name, uuids, member=True)
         return self.get(name)
 
     def add(self, name: str, uuids: Iterable[bytes]) -> Group:
         """Add nodes; raises NotFound, Frozen while it is measured."""
         self.get(name)
-        with self.frozen(name):
-            self._store.add_to_group(name, uuids)
+        with self.frozen(name), self._store.together():
+            there, added = self.get(name).uuids, list(dict.fromkeys(uuids))
+            self._store.add_to_group(name, added)
+            self._tell(name, [uuid for uuid in added if uuid not in there], member=True)
         return self.get(name)
 
     def remove(self, name: str, uuids: Iterable[bytes]) -> Group:
         """Take nodes out; raises NotFound, Frozen while it is measured."""
         self.get(name)
-        with self.frozen(name):
-            self._store.remove_from_group(name, uuids)
+        with self.frozen(name), self._store.together():
+            there, gone = self.get(name).uuids, list(dict.fromkeys(uuids))
+            self._store.remove_from_group(name, gone)
+            self._tell(name, [uuid for uuid in gone if uuid in there], member=False)
         return self.get(name)
 
     def delete(self, name: str) -> bool:
         """Delete a group; False where there is none. Raises Frozen while it is measured."""
         if self.find(name) is None:
             return False
-        with self.frozen(name):
+        with self.frozen(name), self._store.together():
+            self._tell(name, self.get(name).uuids, member=False)
             return self._store.remove_group(name)
+
+    def _tell(self, name: str, uuids: Iterable[bytes], *, member: bool) -> None:
+        """Tell the plant who came into a group, or left it."""
+        for uuid in uuids:
+            self._plant.tell("grouped", uuid, group=name, member=member)
 
     @contextmanager
     def frozen(self, name: str) -> Iterator[None]:
@@ -87,7 +101,7 @@ class Groups:
             name.encode()
         ).hexdigest()  # 64 characters of any script are more than a file name takes
         place = self._home / f"measuring-{digest}.lock"
-        descriptor = os.open(place, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = open_lock(place)
         try:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -130,6 +130,25 @@ class Measurements:
         """Chosen names by UUID and channel: channel 0 is the node's part, :data:`STATION` the station's part."""
         return self._store.topic_names()
 
+    @property
+    def frames(self) -> dict[tuple[bytes, int], str]:
+        """Chosen coordinate frames (``frame_id``) by UUID and channel: channel 0 is the whole node."""
+        return self._store.frames()
+
+    def set_frame(self, uuid: bytes, channel: int, frame: str | None) -> None:
+        """Give values of a channel (0: of the whole node) this frame; None: the profile's.
+
+        It counts from the next session on. Raises Frozen while the node is measured.
+        """
+        if self.is_running(uuid):
+            raise Frozen(
+                f"Node {uuid.hex()} is being measured: its frames stay as they are.", hint="End that measurement first."
+            )
+        if frame is None:
+            self._store.remove_frame(uuid, channel)
+        else:
+            self._store.put_frame(uuid, channel, frame)
+
     def rename(self, uuid: bytes, channel: int, name: str | None) -> None:
         """Publish a channel (0: the node's part) under this name from the next measurement on; None: as it was made.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import NoKeyring, UnknownMaster, VaultChanged, VaultFailure, WrongPassphrase
 from teds_provision.station.identity import Identity
+from teds_provision.station.plant import Plant
 from teds_provision.station.seals import Seals
 from teds_provision.store import Holder, KeyRecord, Marks, Store, pages, utc_now
 from teds_provision.store.records import KeySource
@@ -49,7 +50,9 @@ class NodeKeys:
         identity: Identity,
         seals: Seals,
         reopened: Callable[[], Vault],
+        plant: Plant,
     ) -> None:
+        self._plant = plant
         self._store = store
         self._vault = vault
         self._identity = identity
@@ -202,7 +205,14 @@ class NodeKeys:
 
     def remove(self, uuid: bytes) -> int:
         """Delete every key of a node; returns how many there were."""
-        return self._store.remove_keys(uuid)
+        with self._store.together():
+            self._tell_forgotten(uuid, self._store.keys(uuid))
+            return self._store.remove_keys(uuid)
+
+    def _tell_forgotten(self, uuid: bytes, gone: Sequence[KeyRecord]) -> None:
+        """Tell the plant that no key up to these epochs is left here."""
+        if gone and self._plant.joined is not None:
+            self._plant.tell("forgot", uuid, epoch=max(record.epoch for record in gone))
 
     def wrap_anew(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
         """Replace the wrapped form of every key by what ``rewrap`` gives, all or none; returns how many."""
@@ -210,7 +220,12 @@ class NodeKeys:
 
     def remove_key(self, uuid: bytes, key_id: str) -> bool:
         """Delete one key of a node; False if it is not held."""
-        return self._store.remove_key(uuid, key_id)
+        with self._store.together():
+            before = self._store.keys(uuid)
+            removed = self._store.remove_key(uuid, key_id)
+            if removed and len(before) == 1:
+                self._tell_forgotten(uuid, before)
+            return removed
 
     def correct_epoch(self, record: KeyRecord, epoch: int) -> KeyRecord:
         """Note the true epoch of a key whose epoch was hearsay, as a node told it in a session; the key stays.

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadData, StoreFailure
 from teds_provision.lazy import late
+from teds_provision.station.plant import Plant
 from teds_provision.station.seals import Seals
-from teds_provision.store import DatasheetRecord, Draft, Handed, Known, NodeRecord, Reading, Search, Shown, Store
+from teds_provision.store import (
+    DatasheetRecord,
+    Draft,
+    Handed,
+    Known,
+    NodeRecord,
+    Reading,
+    Search,
+    Shown,
+    Store,
+    pages,
+)
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 
@@ -23,7 +36,8 @@ else:  # TEDS: a list decodes none
 class Nodes:
     """The nodes of one station, by UUID."""
 
-    def __init__(self, store: Store, seals: Seals) -> None:
+    def __init__(self, store: Store, seals: Seals, plant: Plant) -> None:
+        self._plant = plant
         self._store = store
         self._seals = seals
 
@@ -65,6 +79,8 @@ class Nodes:
             changed = replace(before, **facts, point_mac=mac)  # type: ignore[arg-type]
             if present is None or changed != present or mac != present.point_mac:
                 self._store.replace_node(changed, present)
+            if changed.name != before.name:
+                self._plant.tell_name(uuid, changed.name)
         return changed
 
     def _seal(self, uuid: bytes, point: object, present: NodeRecord | None) -> bytes | None:
@@ -74,6 +90,19 @@ class Nodes:
         if present is not None and present.point == point and present.point_mac is not None:
             return present.point_mac
         return self._seals.point(uuid, point)
+
+    def met_at(self, uuid: bytes, place: str) -> None:
+        """A session with this node was opened at ``place`` (``LINK:WHERE``): there it is looked for next time.
+
+        A hint: nobody waits for the disk or fails because of it; what is forgotten is seen again in the next session.
+        """
+        if place and self._store.last_places([uuid]).get(uuid) != place:
+            with suppress(StoreFailure), self._store.transaction(later=True):
+                self._store.put_last_place(uuid, place)
+
+    def last_places(self, uuids: Sequence[bytes]) -> dict[bytes, str]:
+        """Where each of these nodes was met last, as ``LINK:WHERE``; without those that never were."""
+        return {uuid: place for page in pages(uuids) for uuid, place in self._store.last_places(page).items()}
 
     def resolve(self, text: str) -> bytes:
         """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFound, UsageFailure."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.node_keys import NodeKeys
+from teds_provision.station.plant import Plant
 from teds_provision.station.seals import Seals
 from teds_provision.store import NodeRecord, Shown, Store, WhitelistEntry
 
@@ -28,10 +29,11 @@ class Pins:
     With an open vault every row that is used has to carry this station's seal: StoreChanged otherwise.
     """
 
-    def __init__(self, store: Store, keys: NodeKeys, seals: Seals) -> None:
+    def __init__(self, store: Store, keys: NodeKeys, seals: Seals, plant: Plant) -> None:
         self._store = store
         self._keys = keys
         self._seals = seals
+        self._plant = plant
         self._recorded: dict[bytes, tuple[float, int]] = {}
 
     def pinned(self, uuid: bytes) -> str | None:
@@ -112,12 +114,28 @@ class Pins:
         """Add or replace entries of the whitelist (the vault opens); the caller has held keys against pinned ones."""
         self._seals.require()
         with self._store.together():
+            for entry in entries if self._plant.joined is not None else ():
+                self._tell(entry)
             self._store.put_whitelist_entries(self._seals.entry(entry) for entry in entries)
+
+    def _tell(self, entry: WhitelistEntry) -> None:
+        """Tell the plant of a pin of this station's own, where it is a new one."""
+        before = self._store.whitelisted(entry.uuid)
+        if entry.name != (before.name if before is not None else None):
+            self._plant.tell_name(entry.uuid, entry.name)
+        if entry.fingerprint is None or not is_whole(entry.fingerprint) or entry.assurance == "registry":
+            return
+        if before is None or (before.fingerprint, before.assurance) != (entry.fingerprint, entry.assurance):
+            self._plant.tell("pinned", entry.uuid, fingerprint=entry.fingerprint, assurance=entry.assurance)
 
     def remove(self, uuid: bytes) -> bool:
         """Take a node off the whitelist (the vault opens); False if it was not on it. A contact's key stays pinned."""
         self._seals.require()
-        return self._store.remove_whitelist(uuid)
+        with self._store.together():
+            entry = self._store.whitelisted(uuid) if self._plant.joined is not None else None
+            if entry is not None and is_whole(entry.fingerprint) and entry.assurance != "registry":
+                self._plant.tell("unpinned", uuid)
+            return self._store.remove_whitelist(uuid)
 
     # -- a board that was replaced under its UUID ------------------------------------------------------------------
 

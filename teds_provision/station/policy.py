@@ -12,20 +12,25 @@ from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.identity import Identity
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
+from teds_provision.station.plant import Plant, SignerRules
 from teds_provision.station.seals import Seals
 from teds_provision.store import Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.store.records import TrustRole
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys
+    from teds_provision.protocol.plant import event, signer
 else:  # cryptography: not for commands that only list
-    keys = late("teds_provision.protocol.keys")
+    keys, event = late("teds_provision.protocol.keys"), late("teds_provision.protocol.plant.event")
 
 
 class Policy:
     """What this station trusts and refuses."""
 
-    def __init__(self, store: Store, identity: Identity, keys: NodeKeys, pins: Pins, seals: Seals) -> None:
+    def __init__(
+        self, store: Store, identity: Identity, keys: NodeKeys, pins: Pins, seals: Seals, plant: Plant
+    ) -> None:
+        self._plant = plant
         self._store = store
         self._identity = identity
         self._keys = keys
@@ -39,8 +44,35 @@ class Policy:
         return [record for record in self.listed() if role in (None, record.role) and self._seals.trusted(record)]
 
     def listed(self) -> list[TrustRecord]:
-        """Every station and CA that is listed as trusted, by name; also one that another program put there."""
-        return self._store.trusted()
+        """Every station and CA that is listed as trusted, by name; also one that another program put there.
+
+        For a key that the plant's roster names the roster alone decides: members are listed, whom it removed is not.
+        """
+        roster = self._plant.roster
+        if roster is None:
+            return self._store.trusted()
+        others = [one for one in self._store.trusted() if one.role == "ca" or one.fingerprint not in roster.by_key]
+        added = roster.created.strftime("%Y-%m-%dT%H:%M:%SZ")
+        members = [
+            TrustRecord(member.name, "station", member.point, member.fingerprint, added)
+            for member in roster.members
+            if member.point != self._identity.point
+        ]
+        return sorted([*others, *members], key=lambda one: one.name)
+
+    def in_roster(self, fingerprint: str) -> bool:
+        """Whether the plant's roster names this key, as a member or as one that left."""
+        roster = self._plant.roster
+        return roster is not None and fingerprint in roster.by_key
+
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.Signing | None:
+        """What roster and pages say of who signed a datasheet; None where they have no say, or there is no plant."""
+        rules = self._plant.signer_rules()
+        return None if rules is None else rules.signing(certifier, station_key, digest)
+
+    def signer_rules(self) -> SignerRules | None:
+        """The same for many datasheets at one moment."""
+        return self._plant.signer_rules()
 
     def trust(self, record: TrustRecord) -> None:
         """Trust a key under a name (the vault opens); PolicyRefused if the name stands for another key or role."""
@@ -79,8 +111,9 @@ class Policy:
         self._store.renew_ca(keys.fingerprint(ca))
 
     def trusted_stations(self) -> list[bytes]:
-        """Station keys that count here: its own, and those added."""
-        return [self._identity.point, *(record.point for record in self.trusted("station"))]
+        """Station keys whose datasheets count without a CA: its own, and those added that no roster decides about."""
+        others = (one.point for one in self.trusted("station") if not self.in_roster(one.fingerprint))
+        return [self._identity.point, *others]
 
     def station_points(self) -> dict[str, bytes]:
         """Keys of the other stations that count here, by fingerprint."""
@@ -111,14 +144,21 @@ class Policy:
             return False
         self._seals.require()
         with self._store.transaction():
-            statement = _digest(entry.statement)
-            self._store.put_lifted(statement, self._seals.note("lifted", statement))
+            hash = event.hash_of_statement(entry.statement)
+            for name in (_digest(entry.statement), hash):
+                self._store.put_lifted(name, self._seals.note("lifted", name))
+            self._plant.tell("lifted", of=hash)
             return self._store.remove_revocation(uuid)
+
+    def forgive(self, uuid: bytes) -> bool:
+        """Take a node off the deny list: stations lifted the ban. False if it was not on it."""
+        return self._store.remove_revocation(uuid)
 
     def was_lifted(self, statement: str) -> bool:
         """Whether a person has lifted the ban of this very statement here."""
-        lifted, name = self._store.lifted(), _digest(statement)
-        return name in lifted and self._seals.noted("lifted", name, lifted[name])
+        lifted = self._store.lifted()
+        names = (_digest(statement), event.hash_of_statement(statement)) if lifted else ()
+        return any(name in lifted and self._seals.noted("lifted", name, lifted[name]) for name in names)
 
     def denied(self, uuid: bytes, key: str | None) -> Revocation | None:
         """Why a node with this key (fingerprint, None: not known) is denied; a ban of another key is none."""

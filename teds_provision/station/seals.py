@@ -133,6 +133,22 @@ class Seals:
             if marks.ca is not None:
                 yield f"the CA of node {uuid.hex()}", marks.ca_mac, "ca", (uuid, marks.ca)
         yield from self._decisions()
+        yield from self._plant()
+
+    def _plant(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
+        """What this station keeps of its plant and believes without asking again who signed it."""
+        record, row = self._store.plant(), self._store.held_roster()
+        if record is not None:
+            yield "the registry that was joined", record.mac, "plant", (record.registry,)
+            if record.restored is not None:
+                yield "the note of a restored home", record.restored_mac, "restored", (record.restored,)
+        if row is not None:
+            yield f"roster {row.version}", row.mac, "roster", (row.hash,)
+        for digest, station, n, vouched, mac in self._store.all_digests():
+            said = f"{digest.hex()} {station} {n} {'vouched' if vouched else 'signed'}"
+            yield f"the digest {digest.hex()[:_DIGITS]} of a page", mac, "digest", (said,)
+        for hash, station, mac in self._store.all_liftings():
+            yield f"the lifting of ban {hash[:_DIGITS]} in a page", mac, "plant lifted", (f"{hash} {station}",)
 
     def _decisions(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
         for statement, mac in self._store.lifted().items():

@@ -11,6 +11,7 @@ part          what it knows
 ``groups``    which nodes are measured together
 ``measurements`` what is measured, also after a restart; detection; names
 ``handovers`` bundles that left and came
+``plant``     the registry that it joined, what it tells other stations there
 ``seals``     MACs over the rows that decide whom the station believes
 ============  ======================================================================
 
@@ -35,6 +36,7 @@ from teds_provision.station.measurements import Measurements
 from teds_provision.station.node_keys import NodeKey, NodeKeys
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
+from teds_provision.station.plant import Plant
 from teds_provision.station.policy import Policy
 from teds_provision.station.seals import Seals
 from teds_provision.store import AuditLog, Batch, Handover, KeyRecord, NodeTurn, Store, StoreLock
@@ -112,11 +114,12 @@ class Station:
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
         self.seals = Seals(store, self._opened, tell)
         self.identity = Identity(store, self._opened, self.seals)
-        self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened)
-        self.pins = Pins(store, self.keys, self.seals)
-        self.policy = Policy(store, self.identity, self.keys, self.pins, self.seals)
-        self.nodes = Nodes(store, self.seals)
-        self.groups = Groups(store, store.home)
+        self.plant = Plant(store, self._opened, self.identity, self.seals)
+        self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened, self.plant)
+        self.pins = Pins(store, self.keys, self.seals, self.plant)
+        self.policy = Policy(store, self.identity, self.keys, self.pins, self.seals, self.plant)
+        self.nodes = Nodes(store, self.seals, self.plant)
+        self.groups = Groups(store, store.home, self.plant)
         self.measurements = Measurements(store, self.groups, store.home)
         self.handovers = Handovers(store, self.keys, self.seals)
 
@@ -397,6 +400,7 @@ def rewrap(station: Station) -> Rewrapped:
 
     count = station.keys.wrap_anew(anew)
     station.seals.rewrap(vault)
+    station.plant.rewrap(vault)
     vault.retire_masters()
     with station.transaction():
         identity.end_rewrapping()

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         utc_now,
     )
     from teds_provision.store.store import Store
+    from teds_provision.store.tables.line import EvidenceRow, JobRow, LineTables, SignRequestRow, UnitRow
     from teds_provision.store.tables.nodes import Batch, pages
     from teds_provision.store.tables.overview import Known, Search
 else:
@@ -40,6 +41,7 @@ else:
             " Measurement NodeRecord Reading Revocation Shown Tombstone TrustRecord WhitelistEntry utc_now",
             "store": "Store",
             "tables.overview": "Known Search",
+            "tables.line": "EvidenceRow JobRow LineTables SignRequestRow UnitRow",
             "tables.nodes": "Batch pages",
         },
     )
@@ -52,13 +54,16 @@ __all__ = [
     "Choice",
     "DatasheetRecord",
     "Draft",
+    "EvidenceRow",
     "Facts",
     "Group",
     "Handed",
     "Handover",
     "Holder",
+    "JobRow",
     "KeyRecord",
     "Known",
+    "LineTables",
     "Marks",
     "Measurement",
     "NodeRecord",
@@ -67,10 +72,12 @@ __all__ = [
     "Revocation",
     "Search",
     "Shown",
+    "SignRequestRow",
     "Store",
     "StoreLock",
     "Tombstone",
     "TrustRecord",
+    "UnitRow",
     "WhitelistEntry",
     "is_failure",
     "pages",

@@ -77,6 +77,7 @@ FAILED = (
     "lost", "declined",
     "not-", "not ", "no-", "node-", "other-key", "address-conflict", "frozen", "garbled", "link", "store", "vault",
     "wrong-", "calibration-misfit", "usage", "bad-data", "bug",
+    "conflict", "fork", "newer-format", "office-refused", "registry", "roster-expired", "two-histories",
 )  # fmt: skip
 """How the outcome of an act begins that did not do what it should: words, and the codes of the errors that end one."""
 
@@ -131,6 +132,11 @@ class AuditLog:
         """Return the latest moment that an entry names, None for an empty log."""
         row = self._database.one("SELECT max(at) FROM audit")
         return str(row[0]) if row is not None and row[0] is not None else None
+
+    def newest(self) -> tuple[int, str]:
+        """Return number and hash (64 digits) of the newest entry; (0, the root) for an empty log."""
+        row = self._database.one("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
+        return (int(row[0]), bytes(row[1]).hex()) if row is not None else (0, self._root.hex())
 
     def before(self, choice: Choice, *, since: str | None = None, last: int | None = None) -> int:
         """Return the number of the entry before the first that is meant: seen ``since``, among the ``last`` of them.

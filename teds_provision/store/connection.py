@@ -132,7 +132,7 @@ class Connection:
                 return self._connection.execute(statement, values).fetchall()
             except (sqlite3.Error, OSError, UnicodeError) as error:
                 if not self._is_to_wait(error):
-                    raise self._told(error) from error
+                    raise self._failure(error) from error
             return self._wait_for(lambda: self._connection.execute(statement, values).fetchall())
 
     def add(self, statement: str, values: Sequence[Any] = ()) -> None:
@@ -155,7 +155,7 @@ class Connection:
                 return run()
             except (sqlite3.Error, OSError, UnicodeError) as error:
                 if not self._is_to_wait(error):
-                    raise self._told(error) from error
+                    raise self._failure(error) from error
             return self._wait_for(run)
 
     def _wait_for(self, run: Callable[[], _Given]) -> _Given:
@@ -168,7 +168,7 @@ class Connection:
                 return run()
             except (sqlite3.Error, OSError, UnicodeError) as error:
                 if not self._is_to_wait(error) or time.monotonic() >= until:
-                    raise self._told(error) from error
+                    raise self._failure(error) from error
 
     def _is_to_wait(self, error: Exception) -> bool:
         """Whether another process holds the file: inside a transaction nobody else does."""
@@ -324,9 +324,9 @@ class Connection:
         try:
             yield
         except (sqlite3.Error, OSError, UnicodeError) as error:
-            raise self._told(error) from error
+            raise self._failure(error) from error
 
-    def _told(self, error: Exception) -> TedsProvisionError:
+    def _failure(self, error: Exception) -> TedsProvisionError:
         """What is raised in place of an error of SQLite, of the system, or of a text."""
         if isinstance(error, UnicodeDecodeError):  # SQLite quotes what it found in a damaged file
             return self._damaged()

@@ -90,9 +90,15 @@ class StoreLock(_HeldFile):
     """
 
     def __init__(
-        self, home: Path, *, command: str, wait: float = 10.0, notice: Callable[[str], object] | None = None
+        self,
+        home: Path,
+        *,
+        command: str,
+        wait: float = 10.0,
+        notice: Callable[[str], object] | None = None,
+        file: str = FILE_NAME,
     ) -> None:
-        super().__init__(_beside(home, FILE_NAME))
+        super().__init__(_beside(home, file))
         self._command = command
         self._wait = wait
         self._notice = notice
@@ -163,6 +169,12 @@ class Mark(_HeldFile):
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.ftruncate(descriptor, 0)
 
+    def share(self) -> None:
+        """Go on holding it, beside others who share it; who wants it alone still finds it taken."""
+        assert self._descriptor is not None, "share() inside the with"
+        fcntl.flock(self._descriptor, fcntl.LOCK_SH)
+        self._shared = True
+
     @property
     def is_taken(self) -> bool:
         """Whether somebody holds it now, alone or shared."""
@@ -224,9 +236,27 @@ class NodeTurn(_HeldFile):
         super().__init__(_beside(home, TURNS_NAME))
         self._uuid, self._notice = uuid, notice
 
-    def _acquire(self, descriptor: int) -> None:
+    @property
+    def is_taken(self) -> bool:
+        """Whether somebody works on the node now; nothing is taken, and nobody waits."""
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+        except OSError:
+            return False  # nobody has ever worked on a node of this store
+        try:
+            said = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, self._asked())
+        except OSError:
+            return False
+        finally:
+            os.close(descriptor)
+        return bool(struct.unpack_from("h", said)[0] != fcntl.F_UNLCK)
+
+    def _asked(self) -> bytes:
         place = int.from_bytes(hashlib.sha256(self._uuid).digest()[:6], "big")
-        asked = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)  # struct flock
+        return struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)  # struct flock
+
+    def _acquire(self, descriptor: int) -> None:
+        asked = self._asked()
         until, told = time.monotonic() + _TURN_SECONDS, False
         while True:
             try:

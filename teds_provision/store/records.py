@@ -16,7 +16,7 @@ from teds_provision.teds.image import Image
 
 UUID_OCTETS = 10
 
-Assurance = Literal["tap", "bus", "uuid", "import"]
+Assurance = Literal["tap", "bus", "uuid", "import", "registry"]
 KeyState = Literal["pending", "active"]
 KeySource = Literal["agreement", "import"]
 DraftStage = Literal["built", "signed"]

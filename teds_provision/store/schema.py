@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 9
+SCHEMA_VERSION: Final = 12
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
@@ -154,6 +154,101 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         CHECK((group_name IS NOT NULL) + (uuids <> '[]') + (match IS NOT NULL) = 1)) STRICT, WITHOUT ROWID""",
         "INSERT INTO measurements SELECT *, NULL, 0 FROM measurements_before",
         "DROP TABLE measurements_before",
+    ),
+    # the plant: what its stations say (contract/plant.md); empty until `registry connect`
+    10: (
+        # -- what this station has to do with it; macs are seals
+        """CREATE TABLE plant(
+        one INTEGER PRIMARY KEY CHECK(one = 1), registry TEXT NOT NULL CHECK(length(registry) = 36),
+        joined TEXT NOT NULL, left TEXT, url TEXT, synced TEXT,
+        acknowledged INTEGER NOT NULL DEFAULT 0 CHECK(acknowledged >= 0),
+        restored TEXT, restored_mac BLOB CHECK(length(restored_mac) = 16), mac BLOB CHECK(length(mac) = 16)) STRICT""",
+        """CREATE TABLE rosters(
+        version INTEGER NOT NULL CHECK(version > 0), hash TEXT NOT NULL CHECK(length(hash) = 64),
+        octets BLOB NOT NULL, held INTEGER NOT NULL CHECK(held IN (0, 1)), at TEXT NOT NULL,
+        mac BLOB CHECK(length(mac) = 16), PRIMARY KEY(version, hash)) STRICT, WITHOUT ROWID""",
+        "CREATE UNIQUE INDEX one_roster ON rosters(held) WHERE held = 1",
+        """CREATE TABLE alarms(
+        code TEXT NOT NULL, about TEXT NOT NULL, n INTEGER NOT NULL, why TEXT NOT NULL, at TEXT NOT NULL,
+        seen INTEGER NOT NULL DEFAULT 0 CHECK(seen IN (0, 1)), PRIMARY KEY(code, about, n)) STRICT, WITHOUT ROWID""",
+        # -- what this station says: events that wait for a page, and the pages of everybody, its own among them
+        """CREATE TABLE outbox(
+        seq INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE CHECK(length(id) = 16),
+        event TEXT NOT NULL) STRICT""",
+        """CREATE TABLE chains(
+        chain INTEGER PRIMARY KEY, station TEXT NOT NULL UNIQUE CHECK(length(station) = 64),
+        counted INTEGER NOT NULL DEFAULT 0, counted_hash TEXT NOT NULL DEFAULT '',
+        folded INTEGER NOT NULL DEFAULT 0, folded_hash TEXT NOT NULL DEFAULT '',
+        accepted INTEGER, accepted_hash TEXT, waits TEXT) STRICT""",
+        """CREATE TABLE pages(
+        chain INTEGER NOT NULL REFERENCES chains(chain), n INTEGER NOT NULL CHECK(n > 0),
+        hash TEXT NOT NULL CHECK(length(hash) = 64), previous TEXT NOT NULL, created TEXT NOT NULL, home TEXT NOT NULL,
+        header BLOB NOT NULL, content BLOB NOT NULL, signature BLOB NOT NULL CHECK(length(signature) = 64),
+        at TEXT NOT NULL, PRIMARY KEY(chain, n, hash)) STRICT, WITHOUT ROWID""",
+        """CREATE TABLE heads(
+        chain INTEGER NOT NULL REFERENCES chains(chain), about TEXT NOT NULL CHECK(length(about) = 64),
+        n INTEGER NOT NULL, hash TEXT NOT NULL, PRIMARY KEY(chain, about)) STRICT, WITHOUT ROWID""",
+        # -- what follows: claims per node and station, digests and statements, and what is still to be judged anew
+        """CREATE TABLE event_ids(
+        chain INTEGER NOT NULL, id INTEGER NOT NULL, PRIMARY KEY(chain, id)) STRICT, WITHOUT ROWID""",
+        """CREATE TABLE claims(
+        uuid BLOB NOT NULL CHECK(length(uuid) = 10), chain INTEGER NOT NULL REFERENCES chains(chain),
+        claim TEXT NOT NULL, PRIMARY KEY(uuid, chain)) STRICT, WITHOUT ROWID""",
+        "CREATE INDEX claims_of_chain ON claims(chain)",
+        """CREATE TABLE digests(
+        digest BLOB NOT NULL CHECK(length(digest) = 32), chain INTEGER NOT NULL REFERENCES chains(chain),
+        n INTEGER NOT NULL, vouched INTEGER NOT NULL CHECK(vouched IN (0, 1)), mac BLOB CHECK(length(mac) = 16),
+        PRIMARY KEY(digest, chain, vouched)) STRICT, WITHOUT ROWID""",
+        """CREATE TABLE statements(
+        hash TEXT NOT NULL CHECK(length(hash) = 64), chain INTEGER NOT NULL REFERENCES chains(chain),
+        lifts INTEGER NOT NULL CHECK(lifts IN (0, 1)), counts INTEGER NOT NULL CHECK(counts IN (0, 1)),
+        uuid BLOB CHECK(length(uuid) = 10), statement TEXT NOT NULL,
+        mac BLOB CHECK(length(mac) = 16), PRIMARY KEY(hash, chain, lifts)) STRICT, WITHOUT ROWID""",
+        "CREATE INDEX statements_of_node ON statements(uuid) WHERE uuid IS NOT NULL",
+        """CREATE TABLE conflicts(
+        uuid BLOB NOT NULL CHECK(length(uuid) = 10), conflict TEXT NOT NULL, detail TEXT NOT NULL,
+        PRIMARY KEY(uuid, conflict)) STRICT, WITHOUT ROWID""",
+        "CREATE TABLE to_judge(uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10)) STRICT, WITHOUT ROWID",
+        # -- parcels, and for whom a copy was made
+        """CREATE TABLE parcels(
+        id TEXT NOT NULL, direction TEXT NOT NULL CHECK(direction IN ('out', 'in')),
+        peer TEXT NOT NULL CHECK(length(peer) = 64), kind TEXT NOT NULL, state TEXT NOT NULL, expires TEXT NOT NULL,
+        about TEXT NOT NULL, detail TEXT NOT NULL, created TEXT NOT NULL, document BLOB NOT NULL,
+        PRIMARY KEY(id, direction)) STRICT""",
+        """CREATE TABLE shared(
+        uuid BLOB NOT NULL CHECK(length(uuid) = 10), epoch INTEGER NOT NULL, receiver TEXT NOT NULL,
+        parcel TEXT NOT NULL, state TEXT NOT NULL, PRIMARY KEY(uuid, epoch, receiver)) STRICT, WITHOUT ROWID""",
+        "CREATE INDEX shared_in_parcel ON shared(parcel)",
+        # -- a line: jobs, their units, evidence, what an office was asked and answered
+        """CREATE TABLE jobs(
+        id TEXT PRIMARY KEY, hash TEXT NOT NULL CHECK(length(hash) = 64), octets BLOB NOT NULL, state TEXT NOT NULL,
+        at TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+        """CREATE TABLE units(
+        job TEXT NOT NULL, uuid BLOB NOT NULL CHECK(length(uuid) = 10), unit INTEGER NOT NULL CHECK(unit > 0),
+        at TEXT NOT NULL, attempts INTEGER NOT NULL, passed INTEGER NOT NULL, PRIMARY KEY(job, uuid),
+        UNIQUE(job, unit)) STRICT, WITHOUT ROWID""",
+        """CREATE TABLE evidence(
+        sha256 TEXT PRIMARY KEY CHECK(length(sha256) = 64), uuid BLOB NOT NULL CHECK(length(uuid) = 10), job TEXT,
+        unit INTEGER, attempt INTEGER NOT NULL, verdict TEXT NOT NULL, finished TEXT NOT NULL,
+        document BLOB NOT NULL) STRICT, WITHOUT ROWID""",
+        "CREATE INDEX evidence_of_node ON evidence(uuid)",
+        """CREATE TABLE sign_requests(
+        hash TEXT PRIMARY KEY CHECK(length(hash) = 64), direction TEXT NOT NULL CHECK(direction IN ('out', 'in')),
+        job TEXT NOT NULL, uuid BLOB NOT NULL CHECK(length(uuid) = 10), peer TEXT NOT NULL, request BLOB NOT NULL,
+        answer BLOB, sequence INTEGER, at TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+        "CREATE INDEX sign_requests_of_unit ON sign_requests(job, uuid)",
+    ),
+    11: (
+        # the bus or the air on which a session with a node was opened last: where it is looked for if nobody says
+        """CREATE TABLE last_places(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), place TEXT NOT NULL CHECK(place <> ''))
+        STRICT, WITHOUT ROWID""",
+    ),
+    12: (
+        # coordinate frames of channels (0: of the whole node), where somebody chose one
+        """CREATE TABLE frames(
+        uuid BLOB NOT NULL CHECK(length(uuid) = 10), channel INTEGER NOT NULL CHECK(channel BETWEEN 0 AND 255),
+        frame TEXT NOT NULL CHECK(frame <> ''), PRIMARY KEY(uuid, channel)) STRICT, WITHOUT ROWID""",
     ),
 }
 

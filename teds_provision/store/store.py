@@ -16,9 +16,12 @@ from teds_provision.store.tables.datasheets import DatasheetTables
 from teds_provision.store.tables.facts import FactTables
 from teds_provision.store.tables.handovers import HandoverTables
 from teds_provision.store.tables.keys import KeyTables
+from teds_provision.store.tables.line import LineTables
 from teds_provision.store.tables.measurements import MeasurementTables
 from teds_provision.store.tables.nodes import BulkTables, NodeTables
 from teds_provision.store.tables.overview import OverviewTables
+from teds_provision.store.tables.parcels import ParcelTables
+from teds_provision.store.tables.plant import PlantTables
 
 if TYPE_CHECKING:
     import sqlite3
@@ -27,7 +30,17 @@ _ID_OCTETS = 16
 
 
 class Store(
-    NodeTables, KeyTables, DatasheetTables, HandoverTables, BulkTables, FactTables, MeasurementTables, OverviewTables
+    NodeTables,
+    KeyTables,
+    DatasheetTables,
+    HandoverTables,
+    BulkTables,
+    FactTables,
+    MeasurementTables,
+    OverviewTables,
+    PlantTables,
+    LineTables,
+    ParcelTables,
 ):
     """Whitelist, nodes, wrapped keys, datasheets, drafts, trust, handovers, groups and the audit log of one station.
 

@@ -17,7 +17,7 @@ from teds_provision.store.database import open_copy
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))
 READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
 FULL = (
-    'cp -a "$0" "$0.kept" && mount -t tmpfs -o size=400k,mode=700 tmpfs "$0" && cp -a "$0.kept/." "$0" '
+    'cp -a "$0" "$0.kept" && mount -t tmpfs -o size=900k,mode=700 tmpfs "$0" && cp -a "$0.kept/." "$0" '
     '&& { head -c 10M /dev/zero > "$0/filler" 2>/dev/null || true; } && exec "$@"'
 )
 

@@ -250,7 +250,11 @@ class _SplitJws:
         """Take the next characters."""
         for number, part in enumerate(text.split(b".")):
             if number:
-                self._dot()
+                self._dots += 1
+                if self._dots == 2:
+                    self._digest = self._hash.digest()
+                    self._decode(self._reader.end)
+                self._hash.update(b".")
             self._part(part)
 
     def signed(self) -> tuple[bytes, bytes, bytes]:
@@ -269,13 +273,6 @@ class _SplitJws:
     def sha256(self) -> str:
         """Digest of the whole of it, in hex."""
         return self._hash.hexdigest()
-
-    def _dot(self) -> None:
-        self._dots += 1
-        if self._dots == 2:
-            self._digest = self._hash.digest()
-            self._decode(self._reader.end)
-        self._hash.update(b".")
 
     def _part(self, text: bytes) -> None:
         self._hash.update(text)

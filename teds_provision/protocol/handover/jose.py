@@ -247,7 +247,11 @@ def content_key_for(document: Mapping[str, Any], key: PrivateKey, *, cty: str) -
         if header.get("kid", own) != own:
             continue
         named = True
-        _check_header(header, cty)
+        _only(header, "alg", (KEY_ALGORITHM,), "key management algorithm")
+        _only(header, "enc", (CONTENT_ALGORITHM,), "content encryption")
+        _no_extensions(header)
+        if str(header.get("cty", "")).lower() != cty.lower():
+            raise BadData(f"The sealed content says that it is {_shown(header.get('cty'))}, not {cty}.")
         content_key = _content_key(header, entry, key)
         if content_key is not None:
             return content_key, _seal(document)
@@ -309,14 +313,6 @@ def _entries(document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     if "encrypted_key" in document or "header" in document:
         raise BadData("A JWE is in the General or in the Flattened form, not in both.")
     return iter([_mapping(entry, "A recipient") for entry in entries])
-
-
-def _check_header(header: Mapping[str, Any], cty: str) -> None:
-    _only(header, "alg", (KEY_ALGORITHM,), "key management algorithm")
-    _only(header, "enc", (CONTENT_ALGORITHM,), "content encryption")
-    _no_extensions(header)
-    if str(header.get("cty", "")).lower() != cty.lower():
-        raise BadData(f"The sealed content says that it is {_shown(header.get('cty'))}, not {cty}.")
 
 
 def _content_key(header: Mapping[str, Any], entry: Mapping[str, Any], key: PrivateKey) -> bytes | None:

@@ -125,8 +125,17 @@ def load_object(octets: bytes, what: str) -> dict[str, Any]:
 
     The caller has bounded the size. Raises BadData that names ``what``.
     """
-    with _told(what):
+    with _failing_as(what):
         value = _DECODER.decode(_decoded(octets))
+    if not isinstance(value, dict):
+        raise BadData(f"{what} is JSON, but not an object.")
+    return value
+
+
+def load_exact(octets: bytes, what: str) -> dict[str, Any]:
+    """:func:`load_object` in which no number has a fraction or an exponent: readers round those differently."""
+    with _failing_as(what):
+        value = _EXACT.decode(_decoded(octets))
     if not isinstance(value, dict):
         raise BadData(f"{what} is JSON, but not an object.")
     return value
@@ -138,7 +147,7 @@ def load_long(octets: bytearray, what: str, name: str, make: Callable[[object], 
     So neither the text nor the elements are ever all there beside what is made of them. ``octets`` is emptied as it is
     read. Whatever ``make`` raises comes out as it is.
     """
-    with _told(what):
+    with _failing_as(what):
         walk = _Walk(octets)
         if walk.next() == "{":
             return walk.members(name, make)
@@ -147,7 +156,7 @@ def load_long(octets: bytearray, what: str, name: str, make: Callable[[object], 
 
 
 @contextmanager
-def _told(what: str) -> Iterator[None]:
+def _failing_as(what: str) -> Iterator[None]:
     """Say what is wrong with a JSON text."""
     try:
         yield
@@ -270,7 +279,12 @@ def _refuse_constant(name: str) -> Any:
     raise ValueError(f"{name} is not JSON")
 
 
+def _refuse_fraction(number: str) -> Any:
+    raise ValueError(f"{number[:20]} is no whole number")
+
+
 _DECODER = json.JSONDecoder(object_pairs_hook=_unique, parse_constant=_refuse_constant)
+_EXACT = json.JSONDecoder(object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_float=_refuse_fraction)
 
 
 # Reading the members of a signed payload: each with its type, its range and its own complaint.

@@ -185,19 +185,15 @@ def _meaning(name: str, value: object) -> str:
     if name == "access_code":
         return name_of(value)
     if name == "error":
-        return _error(value)
+        number = value & 0x1FFF
+        known = ERRORS[number] if number < len(ERRORS) else f"unknown error {number}"
+        return known if value == 0 else f"{known} ({ERROR_SOURCES[value >> 13]})"
     if name == "channel":
         return {0: "the TIM itself", 0xFFFF: "every TransducerChannel"}.get(value, "")
     if name in FLAGS:
         names = FLAGS[name]
         return ", ".join(names[bit] if bit < len(names) else f"bit {bit}" for bit in range(32) if value >> bit & 1)
     return ENUMERATIONS.get(name, {}).get(value, "")
-
-
-def _error(value: int) -> str:
-    number = value & 0x1FFF
-    known = ERRORS[number] if number < len(ERRORS) else f"unknown error {number}"
-    return known if value == 0 else f"{known} ({ERROR_SOURCES[value >> 13]})"
 
 
 def write_plain(layout: str, values: Mapping[str, MessageValue | Blocks], *, of: str) -> bytes:

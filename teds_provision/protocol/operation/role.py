@@ -167,7 +167,7 @@ class OperationRole:
     def _operate(self, inner: Inner) -> bytes:
         number, session = inner.command.channel, inner.session
         channels = self._hardware.channels
-        sensors = self._sensors()
+        sensors = [channel for channel, facts in self._hardware.channels.items() if not facts.actuator]
         demand(number in channels or (number == 0 and bool(sensors)), Reason.UNKNOWN_COMMAND)
         acting = number != 0 and channels[number].actuator
         asked = Operate.decode(number, inner.command.payload, actuator=acting)
@@ -179,7 +179,10 @@ class OperationRole:
         demand(FIRST_LEASE <= asked.lease <= LAST_LEASE, Reason.OUT_OF_RANGE)
         if asked.dead_man is not None:
             demand(FIRST_DEAD_MAN <= asked.dead_man <= LAST_DEAD_MAN, Reason.OUT_OF_RANGE)
-        self._demand_free(number, session)
+        # an actuator is claimed once: by this session already (13), or by another (17)
+        held = self.claims.actuators.get(number)
+        if held is not None:
+            raise Refused(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
         low = self._hardware.power().flags & PowerFlag.TOO_LOW
         demand(not low and not any(map(self._hardware.fault, wanted)), Reason.FAULT)
         if asked.dead_man is not None:
@@ -187,15 +190,6 @@ class OperationRole:
         else:
             self.claims.claim_sensors(session, wanted, asked.lease)
         return b""
-
-    def _sensors(self) -> list[int]:
-        return [channel for channel, facts in self._hardware.channels.items() if not facts.actuator]
-
-    def _demand_free(self, actuator: int, session: NodeSession) -> None:
-        """An actuator is claimed once: by this session already (13), or by another (17)."""
-        held = self.claims.actuators.get(actuator)
-        if held is not None:
-            raise Refused(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
 
     def _idle(self, inner: Inner) -> bytes:
         number = inner.command.channel

@@ -129,7 +129,10 @@ class StreamRole:
         demand(port.kind != "nfc", Reason.DOES_NOT_FIT)
         demand(port.hears, Reason.WRONG_STATE)
         layout = self._layout(asked.channels, session)
-        self._check_kinds(asked)
+        kinds = [self._hardware.channels[channel].kind for channel in asked.channels]
+        demand(ChannelKind.ACTUATOR not in kinds, Reason.NOT_PERMITTED)
+        events = [kind is ChannelKind.EVENT_SENSOR for kind in kinds]
+        demand(all(events) if asked.kind == Kind.EVENT else not any(events), Reason.OUT_OF_RANGE)
         self._check_period(asked)
         length = asked.length(layout.octets)
         most = min(MOST_OCTETS, port.mtu - budget.BLE_OVERHEAD) if port.kind == "ble" else MOST_OCTETS
@@ -151,12 +154,6 @@ class StreamRole:
         stream = Stream(session, port, asked, layout, own.run, None if start == WAITS else start)
         self._streams.append(stream)
         return Subscribed(own.run, length, start).encode()
-
-    def _check_kinds(self, asked: Subscribe) -> None:
-        kinds = [self._hardware.channels[channel].kind for channel in asked.channels]
-        demand(ChannelKind.ACTUATOR not in kinds, Reason.NOT_PERMITTED)
-        events = [kind is ChannelKind.EVENT_SENSOR for kind in kinds]
-        demand(all(events) if asked.kind == Kind.EVENT else not any(events), Reason.OUT_OF_RANGE)
 
     def stop(self, payload: bytes, session: NodeSession) -> bytes:
         """Stop: the counter that the next message would have had."""
@@ -213,7 +210,9 @@ class StreamRole:
                 del own.armed[action]
                 own.mark = tick
                 if action == Action.START:
-                    self._start_waiting(session, tick + START_AFTER_MARK)
+                    for stream in self._streams:
+                        if stream.session is session and stream.start is None:
+                            stream.start = tick + START_AFTER_MARK
                 elif action == Action.STOP:
                     acting = [channel for channel in self._claims.of(session) if channel in self._claims.actuators]
                     self._claims.release(session, acting, stopped=True)
@@ -335,11 +334,6 @@ class StreamRole:
         shortest += [teds_period(self._teds(channel)) for channel in asked.channels]
         demand(max(1, *shortest) <= asked.period <= LONGEST_PERIOD, Reason.OUT_OF_RANGE)
         demand(self._hardware.keeps(asked.period), Reason.OUT_OF_RANGE)
-
-    def _start_waiting(self, session: NodeSession, start: int) -> None:
-        for stream in self._streams:
-            if stream.session is session and stream.start is None:
-                stream.start = start
 
     def _end(self, stream: Stream) -> None:
         self._missed += stream.missed

@@ -200,7 +200,11 @@ class Receiver:
         for octets, at in came:
             plain = opened(octets) if len(octets) == length else None
             if plain is None:
-                self._unread(octets)
+                # another length than was computed, or a tag that is not of this run
+                if len(octets) != self._length:
+                    self.counts.junk += 1
+                elif self._before is None or self._before.open(octets) is None:
+                    self.counts.bad += 1
                 continue
             counter = int.from_bytes(octets[:COUNTER_OCTETS], "big")
             if counter != self.last + 1 and not self._jumps(counter):
@@ -210,18 +214,15 @@ class Receiver:
             if message.flags & TEST_PATTERN != pattern:
                 self.counts.unasked += 1
             elif not dated:
-                self._hold(message, TickBounds(at + ahead.low, at + ahead.high))
+                # keep a message whose time is not known yet; the oldest goes where there are too many
+                if len(self._held) == MOST_HELD:
+                    self._held.popleft()
+                    self.counts.overflow += 1
+                self._held.append((message, TickBounds(at + ahead.low, at + ahead.high)))
             elif self._fresh(message.tick, at + ahead.low, at + ahead.high):
                 good.append(message)
         self.counts.good += len(good)
         return good
-
-    def _unread(self, octets: bytes) -> None:
-        """Another length than was computed, or a tag that is not of this run."""
-        if len(octets) != self._length:
-            self.counts.junk += 1
-        elif self._before is None or self._before.open(octets) is None:
-            self.counts.bad += 1
 
     def _jumps(self, counter: int) -> bool:
         """Whether a counter that does not follow on is a later one: what it leaves out was lost."""
@@ -236,13 +237,6 @@ class Receiver:
         if self._timed:
             return Message(counter, index, int.from_bytes(plain[1 : 1 + _TICK], "big"), plain[0], plain[1 + _TICK :])
         return Message(counter, index, index * self._period + (self.start or 0), plain[0], plain[1:])
-
-    def _hold(self, message: Message, now: TickBounds) -> None:
-        """Keep a message whose time is not known yet; the oldest goes where there are too many."""
-        if len(self._held) == MOST_HELD:
-            self._held.popleft()
-            self.counts.overflow += 1
-        self._held.append((message, now))
 
     def begin(self, start: int) -> list[Message]:
         """The first instant of a stream that waited is known (mark + 10 ms): gives the messages held, where fresh."""

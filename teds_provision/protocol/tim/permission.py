@@ -58,28 +58,22 @@ class Permission:
     def check(self, command: Command, origin: Origin) -> None:
         """Raise Refused where the command may not be run now, or is not known."""
         if command.command_class == SECURITY:
-            self._known_security(command)
+            # class 128 goes to channel 0; a function that nobody knows gets 1 in every state
+            if command.channel != 0 or command.function not in _FUNCTIONS:
+                raise Refused(Reason.UNKNOWN_COMMAND)
             if origin.session is None:
                 self._plain_security(Function(command.function), command.payload, origin)
             else:
-                self._offered(command)
+                # inside a session a node answers 1 to what it does not measure
+                if command.function in _PLAIN_ALONE:
+                    raise Refused(Reason.NOT_PERMITTED)
+                if command.function in _MEASURING and not self._measures(command):
+                    raise Refused(Reason.UNKNOWN_COMMAND)
         elif origin.session is None:
             self._plain(command)
         elif not self._measures(command) and not of_teds(command):
             raise Refused(Reason.UNKNOWN_COMMAND)
         self._change(command, origin)
-
-    def _known_security(self, command: Command) -> None:
-        """Class 128 goes to channel 0; a function that nobody knows gets 1 in every state."""
-        if command.channel != 0 or command.function not in _FUNCTIONS:
-            raise Refused(Reason.UNKNOWN_COMMAND)
-
-    def _offered(self, command: Command) -> None:
-        """Inside a session a node answers 1 to what it does not measure."""
-        if command.function in _PLAIN_ALONE:
-            raise Refused(Reason.NOT_PERMITTED)
-        if command.function in _MEASURING and not self._measures(command):
-            raise Refused(Reason.UNKNOWN_COMMAND)
 
     def _plain_security(self, function: Function, payload: bytes, origin: Origin) -> None:
         """The columns "factory" and "keyed or provisioned"."""

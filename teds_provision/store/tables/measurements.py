@@ -116,6 +116,19 @@ class MeasurementTables:
         """Forget a chosen name; False if there is none."""
         return self._database.change("DELETE FROM topics WHERE uuid = ? AND channel = ?", (uuid, channel)) > 0
 
+    def frames(self) -> dict[tuple[bytes, int], str]:
+        """Return every coordinate frame that somebody chose, by UUID and channel; channel 0 is the whole node."""
+        rows = self._database.execute("SELECT uuid, channel, frame FROM frames ORDER BY uuid, channel")
+        return {(bytes(uuid), int(channel)): str(frame) for uuid, channel, frame in rows}
+
+    def put_frame(self, uuid: bytes, channel: int, frame: str) -> None:
+        """Keep a chosen frame, in place of the one before."""
+        self._database.execute("INSERT OR REPLACE INTO frames VALUES(?, ?, ?)", (uuid, channel, frame))
+
+    def remove_frame(self, uuid: bytes, channel: int) -> bool:
+        """Forget a chosen frame; False if there is none."""
+        return self._database.change("DELETE FROM frames WHERE uuid = ? AND channel = ?", (uuid, channel)) > 0
+
     def detection(self) -> DetectionMode | None:
         """Return how nodes are detected, None where nobody has said."""
         row = self._database.one("SELECT mode FROM detection")

@@ -134,6 +134,15 @@ class NodeTables:
             values["sequence"] = max(record.sequence, known.sequence)
         self._database.execute(REPLACE_NODE, tuple(values.values()))
 
+    def last_places(self, uuids: Sequence[bytes]) -> dict[bytes, str]:
+        """Return where each of these nodes (a page of them) was met last, ``LINK:WHERE``; without those never met."""
+        statement = f"SELECT uuid, place FROM last_places WHERE uuid IN ({places(uuids)})"
+        return {bytes(uuid): str(place) for uuid, place in self._database.execute(statement, uuids)}
+
+    def put_last_place(self, uuid: bytes, place: str) -> None:
+        """Keep where a node was met last."""
+        self._database.execute("INSERT OR REPLACE INTO last_places VALUES(?, ?)", (uuid, place))
+
     def set_due(self, uuid: bytes, due: str | None) -> None:
         """Note the day (ISO 8601) on which the first calibration of a node ends, None where none does."""
         self._database.execute("UPDATE nodes SET due = ? WHERE uuid = ? AND due IS NOT ?", (due, uuid, due))

@@ -1,0 +1,32 @@
+"""A station among those of its owner: what it tells them, what it takes in, and what carries it."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.plant import (
+        asking,
+        evidence,
+        files,
+        folding,
+        jobs,
+        leaving,
+        line,
+        membership,
+        office,
+        owner,
+        parcels,
+        past,
+        post,
+        postgres,
+        reaching,
+        schema,
+        scram,
+        status,
+        sync,
+        verify_evidence,
+        yields,
+    )
+else:
+    __getattr__ = lazy(__name__)

@@ -1,0 +1,399 @@
+"""A line asks an office to sign: the request, how it travels, what comes back (contract/plant.md section 11)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+import uuid as uuids
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from pathlib import Path
+from typing import Final, Protocol
+
+from teds_provision.errors import (
+    BadData,
+    NotAuthentic,
+    NotFound,
+    PolicyRefused,
+    TedsProvisionError,
+    Unproven,
+    UsageFailure,
+)
+from teds_provision.files import SHARED, read_limited, write_whole
+from teds_provision.links import LinkSettings
+from teds_provision.plant import parcels, reaching
+from teds_provision.plant.files import FilesPost
+from teds_provision.plant.jobs import find_job, roster_of
+from teds_provision.plant.post import Parcel, Post
+from teds_provision.protocol import datasheet
+from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import CONTENT_TYPE
+from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, time_text
+from teds_provision.protocol.keys import fingerprint, prove_message, verify
+from teds_provision.protocol.messages.frames import Function, security_command
+from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, Kind, hash_of
+from teds_provision.protocol.plant.job import Job
+from teds_provision.protocol.plant.roster import Roster
+from teds_provision.protocol.plant.signing import (
+    NONCE_OCTETS,
+    Answer,
+    SignRequest,
+    challenge,
+    open_answer,
+    open_request,
+    seal_request,
+)
+from teds_provision.station.station import Station
+from teds_provision.steps.build import own_name
+from teds_provision.steps.commands import at_node
+from teds_provision.steps.read import read_identity
+from teds_provision.steps.sign import Signed
+from teds_provision.store import Draft, SignRequestRow
+from teds_provision.store.tables.parcels import ParcelKind
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import Reporter
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY, Image
+
+DAYS: Final = 7
+_LOOK_SECONDS: Final = 0.05
+_MOST_LOOK_SECONDS: Final = 1.0
+_SMALL: Final = 8 << 20
+_KINDS: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
+
+
+class Refused(PolicyRefused):
+    """The office signs nothing; its reason stands in the message."""
+
+    code = "office-refused"
+
+
+class NotAnswered(Unproven):
+    """The office did not answer in time; the request stays, and the same command carries on."""
+
+    code = "no-answer"
+
+
+# -- the post: documents of a line, each sealed for its receiver -------------------------------------------------------
+
+
+def post_of(station: Station, folder: Path | None) -> Post:
+    """What carries between the stations: the folder, or the registry that this station is connected to."""
+    post = FilesPost(folder) if folder is not None else reaching.post_of(station)
+    if post is None:
+        raise PolicyRefused("Nothing carries to other stations.", hint="Name a folder or stick: --files DIR")
+    return post
+
+
+def send(station: Station, post: Post, to: str, document: bytes, name: str) -> None:
+    """Seal a signed document for a member and hand it over; ``name`` (a UUID) makes the same one the same parcel.
+
+    Raises PolicyRefused (no member, no room), LinkFailure.
+    """
+    member = roster_of(station).member(to)
+    if member is None:
+        raise PolicyRefused(f"Station {to[:16]} is no member of the plant.", hint="See: registry status")
+    sealed = jose.encrypt(document, [member.point], cty=CONTENT_TYPE)
+    until = time_text(datetime.now(UTC) + timedelta(days=DAYS))
+    post.send(Parcel(name, to, sealed, until, station.identity.fingerprint))
+
+
+@dataclass(frozen=True)
+class Came:
+    """A document of a line that came for this station; ``drop`` throws its parcel away."""
+
+    document: bytes
+    drop: Callable[[], object]
+
+
+def received(station: Station, post: Post, kind: Kind) -> list[Came]:
+    """The documents of one kind for this station: those that a sync kept here, and those that lie there.
+
+    Anything else is left where it is.
+    """
+    key, own, tables = station.credentials().key, station.identity.fingerprint, station.plant.parcels
+    found = [
+        Came(document, partial(tables.drop_parcel, row.id, "in"))
+        for row, document in parcels.received(station, _KINDS[kind.typ])
+    ]
+    post.registry()  # looks anew
+    for parcel in post.parcels(own):
+        if not parcel.octets.startswith(b"{") or len(parcel.octets) > _SMALL:
+            continue
+        try:
+            document = jose.decrypt(parcel.octets, key, cty=CONTENT_TYPE, max_octets=_SMALL)
+            header = load_object(decode_base64url(document.partition(b".")[0], "The header"), "The header")
+        except (BadData, NotAuthentic, PolicyRefused):
+            continue
+        if header.get("typ") == kind.typ:
+            found.append(Came(document, partial(post.drop, parcel.id, own)))
+    return found
+
+
+def name_of(hash: str) -> str:
+    """The id of the parcel that carries the document of this H: a UUIDv4 made from it."""
+    return str(uuids.UUID(bytes=bytes.fromhex(hash)[:16], version=4))
+
+
+def receivers(station: Station, job: Job) -> list[str]:
+    """Fingerprints of everybody that a job is for, but this station."""
+    named = [*job.stations, *([job.office] if job.office is not None else [])]
+    return [one for one in dict.fromkeys(named) if one != station.identity.fingerprint]
+
+
+def send_job(station: Station, post: Post, job: Job) -> None:
+    """Send a job to everybody that it is for; the same again changes nothing."""
+    for one in receivers(station, job):
+        send(station, post, one, job.octets, name_of(hashlib.sha256(f"{job.hash}{one}".encode()).hexdigest()))
+
+
+# -- asking ------------------------------------------------------------------------------------------------------------
+
+
+class Office(Protocol):
+    """How requests reach an office, and answers come back."""
+
+    def ask(self, request: SignRequest) -> bytes | None:
+        """The answer to a request, None where none came in time; asked again it is the same request."""
+
+
+@dataclass
+class PostOffice:
+    """An office behind a registry or a folder; waits ``timeout`` seconds."""
+
+    station: Station
+    post: Post
+    timeout: float
+
+    def ask(self, request: SignRequest) -> bytes | None:
+        """Send the request and look for its answer."""
+        send(self.station, self.post, request.to, request.octets, name_of(request.hash))
+        until, pause = time.monotonic() + self.timeout, _LOOK_SECONDS
+        while True:
+            for come in received(self.station, self.post, SIGNED):
+                if _is_of(come.document, request.hash):
+                    come.drop()
+                    return come.document
+            if time.monotonic() >= until:
+                return None
+            time.sleep(pause)
+            pause = min(2 * pause, _MOST_LOOK_SECONDS)
+
+
+def _is_of(document: bytes, hash: str) -> bool:
+    """Whether an answer says that it is to this request; who signed it is looked at later."""
+    try:
+        told = load_object(decode_base64url(document.split(b".")[1], "The answer"), "The answer")
+    except (BadData, IndexError):
+        return False
+    return told.get("of") == hash
+
+
+@dataclass
+class FileOffice:
+    """No office at hand: the request is written to a file, and nothing comes back."""
+
+    path: Path
+
+    def ask(self, request: SignRequest) -> bytes | None:
+        """Write it down."""
+        write_whole(self.path, request.octets + b"\n", mode=SHARED)
+        return None
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What an office is to sign: the image without its Security TEDS, for which job, with which name, from what."""
+
+    job: str
+    office: str
+    image: Image
+    name: str | None
+    calibration: bytes | None
+    epoch: int
+    sequence: int
+
+
+def by_office(
+    station: Station, office: Office, node: Conversation, keys: NodeKeys, wanted: Wanted, on_node: bytes | None
+) -> Signed:
+    """Have the office sign. What it signed before, and what the node has, is not asked for again.
+
+    ``on_node``: the node's Security TEDS where its other TEDS are those of the image. A request that was asked before
+    for the very same datasheet is asked again as it is, so that no second one is made. Raises NotAnswered (5), Refused
+    (6), NotAuthentic (the answer is not the office's, or signs something else).
+    """
+    roster = roster_of(station)
+    if on_node is not None and _says_the_same(station, roster, keys, wanted, on_node):
+        return Signed(wanted.image.with_block(SECURITY, on_node), security.decode(on_node).sequence, reused=True)
+    earlier = _earlier(station, wanted)
+    if earlier is not None and earlier.answer is not None:
+        signed = _taken(station, roster, keys, wanted, earlier.request, earlier.answer)
+        if signed.sequence > wanted.sequence:
+            return Signed(signed.image, signed.sequence, reused=True)
+        earlier = None
+    if earlier is not None:
+        request = open_request(earlier.request, lambda kid: station.point)
+    else:
+        request = _asked(station, node, keys, wanted)
+    answer = office.ask(request)
+    if answer is None:
+        raise NotAnswered(
+            f"The office {roster.name_of(wanted.office)} has not answered yet.",
+            hint="The request is kept: the same command carries on, once the office has signed.",
+        )
+    signed = _taken(station, roster, keys, wanted, request.octets, answer)
+    row = SignRequestRow(
+        request.hash, "out", wanted.job, keys.uuid, wanted.office, request.octets, answer, signed.sequence
+    )
+    with station.durable("sign"):
+        station.plant.line.put_sign_request(row)
+        station.nodes.remember(keys.uuid, sequence=signed.sequence)
+        station.audit("sign", keys.uuid, "by office", sequence=signed.sequence, office=wanted.office)
+    return signed
+
+
+@dataclass(frozen=True)
+class SignBy:
+    """What ``sign --by`` is asked for: a node, the office by name, the job by id, the calibration; and what carries.
+
+    ``output``: the request is written there, and nobody is waited for.
+    """
+
+    node: str
+    by: str
+    job: str | None
+    calibration: Path | None
+    files: Path | None
+    output: Path | None
+
+
+def sign_by_office(station: Station, links: LinkSettings, order: SignBy, reporter: Reporter) -> Signed:
+    """Have an office sign the draft of the node that lies there, and keep it, signed, until it is written.
+
+    Raises UsageFailure (no job), NotFound (no draft), and what :func:`by_office` raises.
+    """
+    if order.job is None:
+        raise UsageFailure("An office signs for a job.", hint="Name it: --job ID; see: teds-provision job list")
+    job = find_job(station, order.job)
+    member = roster_of(station).named(order.by)
+    if member is None or member.fingerprint != job.office:
+        raise PolicyRefused(f"The job “{job.title}” does not name {order.by} as its office.")
+    uuid = station.nodes.resolve(order.node)
+    draft = station.nodes.draft(uuid)
+    if draft is None:
+        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
+    post = None if order.output is not None else post_of(station, order.files)
+    try:
+        office: Office | None = PostOffice(station, post, links.timeout) if post is not None else None
+        office = office or FileOffice(order.output or Path())
+        with at_node(station, links, uuid, reporter, unlock="always") as visit:
+            visit.session()
+            identity, image = read_identity(visit.node), Image(uuid, draft.image.unsigned_blocks())
+            keys = NodeKeys(uuid, visit.who.point, visit.who.key_signature)
+            octets = read_limited(order.calibration, 1 << 20, "calibration") if order.calibration is not None else None
+            name = own_name(station, image, draft.profile)
+            wanted = Wanted(job.id, job.office, image, name, octets, identity.epoch, identity.sequence)
+            signed = by_office(station, office, visit.node, keys, wanted, None)
+    finally:
+        if post is not None:
+            post.close()
+    with station.durable("sign"):
+        station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
+    return signed
+
+
+def _earlier(station: Station, wanted: Wanted) -> SignRequestRow | None:
+    """The newest request that was made for exactly this: epoch, name, blocks, and a sequence that still holds."""
+    for row in station.plant.line.sign_requests(wanted.job, wanted.image.uuid, "out"):
+        if row.peer != wanted.office:
+            continue
+        request = open_request(row.request, lambda kid: station.point)
+        same = (request.epoch, request.name, request.calibration) == (wanted.epoch, wanted.name, wanted.calibration)
+        if same and request.image.unsigned_blocks() == wanted.image.unsigned_blocks():
+            return row if row.answer is not None or request.sequence == wanted.sequence else None
+    return None
+
+
+def _asked(station: Station, node: Conversation, keys: NodeKeys, wanted: Wanted) -> SignRequest:
+    """A new request, which the board signed; kept before anybody sees it."""
+    nonce, key = os.urandom(NONCE_OCTETS), station.credentials().key
+    blocks = wanted.image.unsigned_blocks()
+    asked = challenge(nonce, key.point, keys.uuid, wanted.epoch, wanted.sequence, blocks)
+    proof = node.ask(security_command(Function.PROVE, asked), "to sign the request to the office")
+    if not verify(keys.key, prove_message(keys.uuid, asked), proof):
+        raise NotAuthentic("The node did not sign the request under the key that it shows.")
+    unsigned = SignRequest(
+        str(uuids.uuid4()),
+        wanted.office,
+        datetime.now(UTC).replace(microsecond=0),
+        wanted.job,
+        Image(keys.uuid, blocks),
+        wanted.epoch,
+        wanted.sequence,
+        wanted.name,
+        wanted.calibration,
+        keys.key,
+        keys.signature,
+        nonce,
+        proof,
+    )
+    octets = seal_request(unsigned, key)
+    with station.durable("sign"):
+        station.plant.line.put_sign_request(
+            SignRequestRow(hash_of(octets), "out", wanted.job, keys.uuid, wanted.office, octets)
+        )
+    return open_request(octets, lambda kid: station.point)
+
+
+def _taken(station: Station, roster: Roster, keys: NodeKeys, wanted: Wanted, request: bytes, octets: bytes) -> Signed:
+    """The image with what the office signed; raises Refused, NotAuthentic (not its word, or something else)."""
+    office = roster.point_of(wanted.office)
+    answer = open_answer(octets, lambda kid: office if kid == wanted.office else None)
+    if answer.of != hash_of(request):
+        raise NotAuthentic("The office answered another request.")
+    if answer.refused:
+        raise _refusal(roster, wanted, answer)
+    if not _says_the_same(station, roster, keys, wanted, answer.security, by=wanted.office):
+        raise NotAuthentic(
+            "What the office signed is not what it was asked for.", hint="Have the owner look at this office."
+        )
+    return Signed(wanted.image.with_block(SECURITY, answer.security), answer.sequence, reused=False)
+
+
+def _refusal(roster: Roster, wanted: Wanted, answer: Answer) -> TedsProvisionError:
+    hints = {
+        "job": "Ask whoever runs the office: signer run --job ID.",
+        "full": "Lay the board aside, or ask the keeper for another job.",
+        "differs": "Station and office need the same profile and version of the program.",
+        "sequence": "A person at the office has to look: signer once FILE --jump",
+    }
+    return Refused(
+        f"The office {roster.name_of(wanted.office)} does not sign ({answer.refused}): {answer.why}.",
+        hint=hints.get(answer.refused, ""),
+    )
+
+
+def _says_the_same(
+    station: Station, roster: Roster, keys: NodeKeys, wanted: Wanted, octets: bytes, *, by: str | None = None
+) -> bool:
+    """Whether a Security TEDS signs exactly this for this board and epoch, by a member with ``sign`` (or ``by``)."""
+    try:
+        shown = security.decode(octets)
+    except BadData:
+        return False
+    signer = fingerprint(shown.station_key) if shown.station_key is not None else ""
+    return (
+        shown.signed
+        and (shown.node_key, shown.node_key_signature) == (keys.key, keys.signature)
+        and roster.has(signer, "sign")
+        and by in (None, signer)
+        and shown.key_epoch == wanted.epoch
+        and shown.signed_blocks == datasheet.digests(wanted.image.blocks)
+        and datasheet.is_certified(station.identity.ca, shown.station_key, shown.station_key_signature)
+        and datasheet.signature_good(shown, octets, keys.uuid)
+    )

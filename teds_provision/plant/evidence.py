@@ -1,0 +1,83 @@
+"""Evidence made at a board: the station states the facts, the board signs them, the station signs the whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from teds_provision import __version__
+from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic, StoreFailure
+from teds_provision.files import SHARED, holds, write_whole
+from teds_provision.protocol.agreement import Credentials
+from teds_provision.protocol.keys import prove_message, verify
+from teds_provision.protocol.messages.frames import Function, security_command
+from teds_provision.protocol.plant.evidence import NONCE_OCTETS, Claim, seal
+from teds_provision.store import EvidenceRow, LineTables, utc_now
+from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.teds.codec import security
+
+TOOL = f"teds-provision {__version__}"
+
+
+def sign_evidence(node: Conversation, credentials: Credentials, claim: Claim, *, operator: str | None = None) -> bytes:
+    """Have the board sign the facts of ``claim``, and return the envelope that the station signed over both.
+
+    A board that passed must answer: raises NotAuthentic where its signature does not verify, LinkFailure. One whose
+    attempt failed may be gone; then the envelope holds the station's word alone.
+    """
+    nonce = os.urandom(NONCE_OCTETS)
+    proof = b""
+    if claim.facts.failure is None:
+        proof = prove_claim(node, claim, nonce)
+    else:
+        with suppress(LinkFailure, NodeRefused, NotAuthentic, SessionLost):
+            proof = prove_claim(node, claim, nonce)
+    return seal(
+        credentials.key,
+        credentials.station_signature,
+        claim,
+        nonce=nonce if proof else b"",
+        proof=proof,
+        finished=utc_now(),
+        operator=operator,
+    )
+
+
+def prove_claim(node: Conversation, claim: Claim, nonce: bytes) -> bytes:
+    """The board's signature over the facts (128.8); raises NotAuthentic where it is not that of field 101."""
+    asked = claim.challenge(nonce)
+    proof = node.ask(security_command(Function.PROVE, asked), "to sign the evidence")
+    if not verify(security.decode(claim.teds).node_key, prove_message(claim.uuid, asked), proof):
+        raise NotAuthentic("The node did not sign the evidence under the key that it shows.")
+    return proof
+
+
+def export(tables: LineTables, rows: Iterable[EvidenceRow], folder: Path, *, write: bool = True) -> dict[Path, bool]:
+    """Write documents as ``UUID.N.json``; returns every file, and whether it was not there before.
+
+    N counts all documents of a board that are kept here, whichever are chosen. Each file is written whole; raises
+    StoreFailure where one cannot be.
+    """
+    files: dict[Path, bool] = {}
+    numbers: dict[bytes, dict[str, int]] = {}
+    if write:
+        make_folder(folder)
+    for row in rows:
+        if row.uuid not in numbers:
+            ordered = sorted(tables.evidence(uuid=row.uuid), key=lambda one: (one.finished, one.attempt, one.sha256))
+            numbers = {row.uuid: {one.sha256: number for number, one in enumerate(ordered, 1)}}
+        path = folder / f"{row.uuid.hex()}.{numbers[row.uuid][row.sha256]}.json"
+        files[path] = not holds(path, row.document)
+        if files[path] and write:
+            write_whole(path, [row.document], mode=SHARED)
+    return files
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for results; raises StoreFailure."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreFailure(f"Cannot make the folder {folder}: {error.strerror}.") from error

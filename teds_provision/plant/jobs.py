@@ -1,0 +1,147 @@
+"""Jobs at a station: who may give one, which one an id means, and what stands in the way of working on it."""
+
+from __future__ import annotations
+
+import hashlib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.files import read_limited
+from teds_provision.plant import parcels
+from teds_provision.protocol.plant.document import JOB, is_form
+from teds_provision.protocol.plant.job import Job, open_job
+from teds_provision.protocol.plant.roster import Roster
+from teds_provision.station.station import Station
+from teds_provision.store import JobRow
+from teds_provision.teds.profile.load import default_folders, find_profile
+
+CLOSED: Final = "closed"
+_MAX_PROFILE_OCTETS: Final = 1 << 20
+
+
+def roster_of(station: Station) -> Roster:
+    """The roster that counts; raises PolicyRefused where none was joined, or it has expired."""
+    roster = station.plant.roster
+    if roster is None:
+        raise PolicyRefused(
+            "This station has joined no registry, and a job is a keeper's word.",
+            hint="Join one: teds-provision registry connect; or begin one: teds-provision registry create",
+        )
+    if now_of(roster) >= roster.expires:
+        raise PolicyRefused(
+            "The roster has expired: no job begins.", hint="Have it renewed: teds-provision registry renew"
+        )
+    return roster
+
+
+def now_of(roster: Roster) -> datetime:
+    """The time here, never before the roster was made: a clock that was put back opens no job again."""
+    return max(datetime.now(UTC), roster.created)
+
+
+def read_job(station: Station, octets: bytes) -> Job:
+    """Read a signed job. Raises PolicyRefused (not a keeper's, another registry's), NotAuthentic, BadData."""
+    roster = roster_of(station)
+    job = open_job(octets, roster.point_of)
+    if not roster.has(job.signer, "keeper"):
+        raise PolicyRefused(
+            f"{roster.name_of(job.signer)} signed this job and is not a keeper.", hint="Ask a keeper for a job."
+        )
+    if job.registry != roster.registry:
+        raise PolicyRefused("This job is of another registry.")
+    return job
+
+
+def take_job(station: Station, octets: bytes) -> Job:
+    """Read a job and keep it: its id means this document from now on. Raises PolicyRefused where it means another."""
+    job = read_job(station, octets)
+    with station.durable("job"):
+        station.plant.line.add_job(JobRow(job.id, job.hash, job.octets))
+        kept = station.plant.line.job(job.id)
+        if kept is None or kept.hash != job.hash:
+            raise PolicyRefused(
+                f"Another job is known here under the id {job.id}: two were signed under one id.",
+                hint="Ask the keeper for a job with an id of its own.",
+            )
+    return job
+
+
+def find_job(station: Station, text: str) -> Job:
+    """The job of a file, or one that is kept here, by its id or the first digits of it.
+
+    Raises NotFound, and what :func:`take_job` raises.
+    """
+    path = Path(text)
+    if path.is_file():
+        return take_job(station, read_limited(path, JOB.most, "job"))
+    return read_job(station, job_row(station, text).octets)
+
+
+def take_received(station: Station) -> None:
+    """Take the jobs that a sync brought; one that is no keeper's is thrown away, and told."""
+    for row, octets in parcels.received(station, "job"):
+        try:
+            take_job(station, octets)
+        except (BadData, NotAuthentic, PolicyRefused) as error:
+            station.notice(f"A job that came was not taken: {error.message}")
+        with station.durable("job"):
+            station.plant.parcels.drop_parcel(row.id, "in")
+
+
+def job_id(station: Station, text: str) -> str:
+    """The whole id of a job that is kept here, from its first digits; raises NotFound."""
+    return job_row(station, text).id
+
+
+def job_row(station: Station, text: str) -> JobRow:
+    """A job that is kept here, by its id or the first digits of it; raises NotFound."""
+    take_received(station)
+    if is_form("random_id", text.lower()):
+        rows = [row for row in [station.plant.line.job(text.lower())] if row is not None]
+    else:
+        rows = [row for row in station.plant.line.jobs() if len(text) >= 4 and row.id.startswith(text.lower())]
+    if len(rows) > 1:
+        raise NotFound(f"{len(rows)} jobs begin with {text}.", hint="Give more digits; see: teds-provision job list")
+    if not rows:
+        raise NotFound(f"There is no job {text}, and no file of that name.", hint="See: teds-provision job list")
+    return rows[0]
+
+
+def require_open(station: Station, job: Job, *, for_station: str | None = None) -> None:
+    """Raise PolicyRefused where a station may not work on the job now: too early, over, closed here, not for it.
+
+    ``for_station``: its fingerprint, this one's where None is named.
+    """
+    row = station.plant.line.job(job.id)
+    why = "it was closed here" if row is not None and row.state == CLOSED else None
+    why = why or job.why_not(now_of(roster_of(station)), for_station or station.identity.fingerprint)
+    if why is not None:
+        raise PolicyRefused(f"The job “{job.title}” cannot be worked on: {why}.", hint="Ask the keeper for a new job.")
+
+
+def close_job(station: Station, job: Job) -> None:
+    """Take no further board of a job here, and tell the others."""
+    with station.durable("job"):
+        row = station.plant.line.job(job.id)
+        if row is not None and row.state != CLOSED:
+            station.plant.line.set_job_state(job.id, CLOSED)
+            station.audit("job", None, CLOSED, job=job.id)
+            station.plant.tell("closed", None, job=job.id)
+
+
+def profile_file(station: Station, job: Job) -> Path:
+    """The file of the job's profile; raises NotFound, and PolicyRefused where it is not the one that the job names."""
+    path = find_profile(job.profile, default_folders(station.home))
+    if digest_of_file(path) != job.profile_sha256:
+        raise PolicyRefused(
+            f"The profile {job.profile} here is not the one of the job: {path} has another SHA-256.",
+            hint=f"Put the job's profile into {station.home / 'profiles'}.",
+        )
+    return path
+
+
+def digest_of_file(path: Path) -> str:
+    """SHA-256 of a small file, 64 hex digits; raises NotFound, BadData."""
+    return hashlib.sha256(read_limited(path, _MAX_PROFILE_OCTETS, "file")).hexdigest()

@@ -1,0 +1,177 @@
+"""A station left: whose keys it had, which are rotated now, and what no roster can heal (contract/plant.md section 7).
+
+Whoever had a key is taken from everybody's pages, its own beyond ``last`` too: what a thief says there counts for
+nothing else, but a key that he names he had.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from functools import lru_cache
+from typing import Final
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.plant.folding import views
+from teds_provision.protocol.handover.strict_json import load_exact
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.claim import Claim, Key
+from teds_provision.protocol.plant.roster import Removed, Roster, open_roster
+from teds_provision.station.station import Station
+from teds_provision.store import KeyRecord
+
+WHY: Final = "registry: "
+"""Begins the reason of a rotation that is due because somebody left."""
+OTHERS: Final = timedelta(hours=24)
+"""So long the station that made a key has to rotate it, before others do."""
+EVERY: Final = timedelta(hours=1)
+_PAGE: Final = 500
+_COMMAND: Final = "registry sync"
+
+
+@dataclass(frozen=True)
+class Review:
+    """What was found when it was looked last: ``of`` nodes whose key is held here; ``alone`` had only who left."""
+
+    at: str
+    removed: str
+    of: int
+    alone: int
+
+
+def review(station: Station, roster: Roster, now: datetime) -> Review | None:
+    """Mark for rotation what somebody who left has had; None where nobody left.
+
+    A look at every key costs seconds in a large plant, so it is done when the roster removes somebody else, and each
+    hour.
+    """
+    if not roster.removed:
+        return None
+    named = hashlib.sha256("".join(sorted(one.fingerprint for one in roster.removed)).encode()).hexdigest()
+    before = last(station)
+    if before is not None and before.removed == named and now - datetime.fromisoformat(before.at) < EVERY:
+        return before
+    ours = _first_removals(station)
+    beyond = _beyond(station, roster)
+    of = 0
+    for page in _pages(station):
+        keys = {key.uuid: key for key in station.keys.of_page(page) if key.state == "active"}
+        of += len(keys)
+        _mark(station, roster, keys, beyond, now, ours)
+    found = Review(now.isoformat(), named, of, _alone(station, roster))
+    with station.durable(_COMMAND):
+        station.plant.parcels.put_review(json.dumps(asdict(found)))
+    return found
+
+
+def last(station: Station) -> Review | None:
+    """What the last look found."""
+    text = station.plant.parcels.review()
+    return None if text is None else Review(**json.loads(text))
+
+
+def due(station: Station) -> int:
+    """How many nodes this station has to rotate because somebody left."""
+    return sum(why.startswith(WHY) for why in station.keys.rotations_due().values())
+
+
+def _pages(station: Station) -> Iterable[list[bytes]]:
+    page: list[bytes] = []
+    for uuid, _, _, state in station.keys.each_name():
+        if state == "active":
+            page.append(uuid)
+        if len(page) == _PAGE:
+            yield page
+            page = []
+    if page:
+        yield page
+
+
+def _mark(
+    station: Station,
+    roster: Roster,
+    keys: Mapping[bytes, KeyRecord],
+    beyond: Mapping[tuple[bytes, int, str], set[str]],
+    now: datetime,
+    ours: Mapping[str, datetime],
+) -> None:
+    """Mark those of a page of nodes whose key somebody had who left."""
+    claims = station.plant.tables.claims_of(list(keys))
+    marked = station.keys.due_of_page(list(keys))
+    wanted: dict[bytes, str] = {}
+    for uuid, key in keys.items():
+        if uuid in marked:
+            continue
+        said = {one: Claim.from_json(text) for one, text in claims.get(uuid, {}).items()}
+        had = beyond.get((uuid, key.epoch, key.key_id), set()) | {
+            holder.fingerprint for holder in station.keys.holders(uuid) if roster.removed_one(holder.fingerprint)
+        }
+        for one in roster.removed:
+            if one.fingerprint not in had and not _had(one, (key.epoch, key.key_id), said):
+                continue
+            forgot = said[one.fingerprint].forgot if one.fingerprint in said else -1
+            if one.why == "retired" and forgot >= key.epoch:
+                continue
+            if key.source == "agreement" or now - ours.get(one.fingerprint, now) >= OTHERS:
+                wanted[uuid] = f"{WHY}{one.name} ({one.why}) has had this key"
+    if wanted:
+        with station.durable(_COMMAND):
+            for uuid, why in wanted.items():
+                station.keys.demand_rotation(uuid, why)
+                station.audit("registry", uuid, "rotation due", why=why)
+
+
+def _had(one: Removed, key: Key, said: Mapping[str, Claim]) -> bool:
+    """Whether by anybody's claims of a node somebody who left has had this key of it."""
+    own = said.get(one.fingerprint)
+    if own is not None and key in ((own.agreed or ())[:2], own.took, *((e, k) for _, _, e, k, _ in own.gave)):
+        return True
+    return any((peer, e, k) == (one.fingerprint, *key) for claim in said.values() for _, peer, e, k, _ in claim.gave)
+
+
+def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], set[str]]:
+    """Keys (UUID, epoch, key id) that who left names on pages beyond its last one that counts."""
+    found: dict[tuple[bytes, int, str], set[str]] = {}
+    for one in roster.removed:
+        chain = station.plant.tables.chains().get(one.fingerprint)
+        if chain is None:
+            continue
+        for page in station.plant.tables.each_page(chain.chain, after=chain.counted[0]):
+            for value in load_exact(page.content, "A page").get("events", ()):
+                read = event.read(value)
+                if isinstance(read, event.Event) and read.uuid is not None and "key_id" in read.members:
+                    key = read.uuid, read.members["epoch"], read.members["key_id"]
+                    found.setdefault(key, set()).add(one.fingerprint)
+    return found
+
+
+def _first_removals(station: Station) -> dict[str, datetime]:
+    """Since when the removal of each station that left is known here."""
+    since: dict[str, datetime] = {}
+    for row in station.plant.tables.rosters():
+        for one in _removed_in(row.octets, station.ca):
+            at = datetime.fromisoformat(row.at)
+            since[one] = min(since.get(one, at), at)
+    return since
+
+
+@lru_cache(maxsize=64)
+def _removed_in(octets: bytes, ca: bytes) -> frozenset[str]:
+    try:
+        return frozenset(one.fingerprint for one in open_roster(octets, ca).removed)
+    except TedsProvisionError:  # kept as proof of two of one version
+        return frozenset()
+
+
+def _alone(station: Station, roster: Roster) -> int:
+    """Nodes whose key nobody has any more but who left: only a tap gives them to anybody."""
+    count, after = 0, b""
+    while page := station.plant.tables.claimed_nodes(after, _PAGE):
+        after = page[-1]
+        held = {key.uuid for key in station.keys.of_page(page) if key.state == "active"}
+        seen = views(station, roster, page)
+        count += sum(not seen[uuid].held and bool(seen[uuid].left) and uuid not in held for uuid in page)
+    return count

@@ -1,0 +1,419 @@
+"""One run of a line: what its job allows, a unit for each board, and proof at the end (contract/plant.md section 9)."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.errors import NotFound, OtherKey, PolicyRefused, TedsProvisionError
+from teds_provision.files import read_limited
+from teds_provision.plant.asking import Office, Wanted, by_office
+from teds_provision.plant.evidence import TOOL, make_folder, sign_evidence
+from teds_provision.plant.folding import heads_digest
+from teds_provision.plant.jobs import digest_of_file, profile_file, require_open
+from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.plant.evidence import Claim, Facts, blocks_of, read
+from teds_provision.protocol.plant.job import WORTH, Job
+from teds_provision.station.label import label_of, read_label, write_label
+from teds_provision.station.station import Station
+from teds_provision.steps.batch_sheet import Board
+from teds_provision.steps.board_type import WrongBoard
+from teds_provision.steps.build import BuildOrder, Prepared, Proposal, prepare
+from teds_provision.steps.identify import Identified
+from teds_provision.steps.provision import Provisioned
+from teds_provision.steps.read import Survey
+from teds_provision.steps.sign import Signed
+from teds_provision.store import EvidenceRow, UnitRow, WhitelistEntry, utc_now
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import StepResult
+from teds_provision.teds.codec import security
+
+_MAX_CALIBRATION: Final = 1 << 20
+_NO_CALIBRATION: Final = BuildOrder(drop_calibration=True)
+
+
+@dataclass
+class LineRun:
+    """What all boards of a run belong to: a job, or (``job`` None) nothing but the wish for evidence.
+
+    ``order``: what every board gets where there is no job. ``calibrations`` is a folder with a file ``UUID.*`` for each
+    board, or one file for a job whose rule is ``one``. Everything that can be refused before a tap is refused when this
+    is made: raises PolicyRefused, NotFound, BadData.
+    """
+
+    station: Station
+    job: Job | None
+    order_of_all: BuildOrder = field(default_factory=BuildOrder)
+    calibrations: Path | None = None
+    operator: str | None = None
+    office: Office | None = None
+    only_verify: bool = False
+    label_to: Path | None = None
+    """A folder for the labels of boards that passed, and what kind: DIR/x.svg or DIR/x.png."""
+    scans: Scans | None = None
+    _turn: threading.Lock = field(default_factory=threading.Lock)
+    _digests: dict[bytes, str] = field(default_factory=dict)
+    _told: dict[bytes, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.job is None:
+            return
+        self._require_open()
+        roster = self.station.plant.roster
+        if not self.only_verify and roster is not None and not roster.has(self._own, "line"):
+            raise PolicyRefused(
+                "This station keys no new boards: the roster does not give it the role line.",
+                hint="Have the owner give it: teds-provision registry role NAME line",
+            )
+        path = profile_file(self.station, self.job)
+        self.order_of_all = replace(_NO_CALIBRATION, profile=str(path))
+        if self.job.calibration.rule == "one" and not self.only_verify:
+            self._common_calibration()
+
+    @property
+    def _own(self) -> str:
+        return self.station.identity.fingerprint
+
+    def _require_open(self) -> None:
+        assert self.job is not None
+        require_open(self.station, self.job)
+
+    @property
+    def base(self) -> BuildOrder:
+        """What all boards get, as far as it is the same for all."""
+        return self.order_of_all
+
+    @property
+    def total(self) -> int:
+        """How many boards the job is for, 0 outside one."""
+        return self.job.total if self.job is not None else 0
+
+    @property
+    def passed(self) -> int:
+        """How many units have passed here, over all runs."""
+        return self.station.plant.line.count_units(self.job.id)[1] if self.job is not None else 0
+
+    def told(self, uuid: bytes) -> dict[str, Any]:
+        """What is told of a board beside its steps: job, unit, of how many, attempt, SHA-256 of its evidence."""
+        return self._told.get(uuid, {})
+
+    def is_listed(self, uuid: bytes) -> bool:
+        """Whether the job names this UUID."""
+        return self.job is not None and uuid in self.job.boards
+
+    def lists(self, who: Identified) -> bool:
+        """Whether the job names this very board: that is a keeper's word for it."""
+        return self.is_listed(who.uuid) and self.job is not None and self.job.boards[who.uuid] == who.fingerprint
+
+    # -- what a board gets -----------------------------------------------------------------------------------------
+
+    def order(self, who: Identified) -> Prepared:
+        """What this board gets; raises PolicyRefused (not in the job, its calibration), OtherKey."""
+        job = self.job
+        if self.scans is not None:
+            self.scans.require(who)
+        if job is None:
+            return prepare(self.station, self.order_of_all, who.uuid)
+        self._require_open()  # the last board of a long night may come after its end
+        if job.boards:
+            listed = job.boards.get(who.uuid)
+            if listed is None:
+                raise PolicyRefused(f"Board {who.uuid.hex()} is not in the list of the job.", hint="Lay it aside.")
+            if not same_key(listed, who.fingerprint):
+                raise OtherKey(
+                    f"Board {who.uuid.hex()} holds the key {who.fingerprint[:32]}; the job says {listed[:32]}.",
+                    hint="It may be another board under the same UUID. Lay it aside.",
+                )
+        path = None if self.only_verify else self._calibration_of(who.uuid)
+        if path is None:
+            return prepare(self.station, self.order_of_all, who.uuid)
+        digest = digest_of_file(path)
+        wanted = job.calibration.wants(who.uuid)
+        if wanted is not None and digest != wanted:
+            raise PolicyRefused(f"The calibration {path} is not the one that the job names for {who.uuid.hex()}.")
+        prepared = prepare(self.station, replace(self.order_of_all, calibration=path, drop_calibration=False), who.uuid)
+        if job.calibration.rule == "any":
+            self._require_fresh(path, prepared)
+        with self._turn:
+            self._digests[who.uuid] = digest
+        return prepared
+
+    def _calibration_of(self, uuid: bytes) -> Path | None:
+        assert self.job is not None
+        rule = self.job.calibration.rule
+        if rule == "none":
+            return None
+        if rule == "one":
+            return self._common_calibration()
+        folder = self.calibrations
+        if folder is None or not folder.is_dir():
+            raise NotFound("This job needs a calibration for each board.", hint="Name their folder: --calibrations DIR")
+        found = sorted(path for path in folder.glob(f"{uuid.hex()}.*") if path.is_file())
+        if len(found) != 1:
+            there = "no file" if not found else f"{len(found)} files"
+            raise NotFound(f"There is {there} {uuid.hex()}.* in {folder}.", hint="Put this board's calibration there.")
+        return found[0]
+
+    def _common_calibration(self) -> Path:
+        """The one file for all boards, found by its digest."""
+        assert self.job is not None
+        place = self.calibrations
+        files = [] if place is None else [place] if place.is_file() else sorted(place.glob("*"))
+        for path in files:
+            if path.is_file() and digest_of_file(path) == self.job.calibration.sha256:
+                return path
+        raise NotFound(
+            f"The calibration of the job (SHA-256 {self.job.calibration.sha256}) is not here.",
+            hint="Name its file or folder: --calibrations PATH",
+        )
+
+    def _require_fresh(self, path: Path, prepared: Prepared) -> None:
+        assert self.job is not None
+        days = self.job.calibration.max_age_days or 0
+        now = datetime.now(UTC)
+        for number, one in (prepared.calibrations or {}).items():
+            if one.date is None or not now - timedelta(days=days) <= one.date <= now + timedelta(days=1):
+                when = "has no date" if one.date is None else f"is of {one.date:%Y-%m-%d}"
+                raise PolicyRefused(
+                    f"The calibration {path} of channel {number} {when}; the job takes {days} days at most."
+                )
+
+    # -- units -----------------------------------------------------------------------------------------------------
+
+    def take(self, node: Conversation, who: Identified, prepared: Prepared, entry: WhitelistEntry | None) -> LineUnit:
+        """Take the board's unit, durably, or count a further attempt; raises PolicyRefused where none is left."""
+        job, begun = self.job, utc_now()
+        held = entry if entry is not None else who.whitelisted
+        assurance = "tap" if node.tapped else held.assurance if held is not None else "uuid"
+        if job is None:
+            attempt = self.station.plant.line.last_attempt(who.uuid) + 1
+            return LineUnit(self, prepared, None, attempt, assurance, begun)
+        if self.only_verify:
+            tables = self.station.plant.line
+            mine = sum(1 for _ in tables.evidence(uuid=who.uuid, job=job.id))
+            with self._turn:
+                self._told[who.uuid] = {"job": job.id, "attempt": mine + 1}
+            return LineUnit(self, prepared, tables.unit(job.id, who.uuid), mine + 1, assurance, begun)
+        if WORTH.get(assurance, 0) < WORTH[job.assurance]:
+            raise PolicyRefused(
+                f"The job asks for the assurance {job.assurance}; board {who.uuid.hex()} was met by {assurance}.",
+                hint="Tap it on the NFC reader." if job.assurance == "tap" else "Meet it on a wired bus, or tap it.",
+            )
+        with self.station.durable("job"):
+            row = self._row(job, who.uuid)
+            self.station.plant.line.put_unit(row)
+            self.station.audit("unit", who.uuid, "taken", job=job.id, unit=row.unit, attempt=row.attempts)
+        told = {"job": job.id, "unit": row.unit, "of": job.total, "attempt": row.attempts}
+        with self._turn:
+            self._told[who.uuid] = told
+        name = job.name_for(who.uuid, row.unit)
+        named = prepared if name is None else replace(prepared, order=replace(prepared.order, name=name))
+        return LineUnit(self, named, row, row.attempts, assurance, begun)
+
+    def _row(self, job: Job, uuid: bytes) -> UnitRow:
+        """The unit of this board with one more attempt; called in the transaction that keeps it."""
+        tables = self.station.plant.line
+        kept = tables.unit(job.id, uuid)
+        if kept is not None:
+            return replace(kept, attempts=kept.attempts + 1)
+        given, _, greatest = tables.count_units(job.id)
+        allotment = job.stations[self._own] if job.count is not None else len(job.boards)
+        if given >= allotment:
+            raise PolicyRefused(
+                f"All {allotment} units of the job “{job.title}” for this station are given: {uuid.hex()} is one "
+                "too many.",
+                hint="Lay it aside, or ask the keeper for another job.",
+            )
+        return UnitRow(job.id, uuid, greatest + 1, utc_now())
+
+    def keep(self, document: bytes, unit: LineUnit, *, passed: bool) -> None:
+        """Keep evidence, whole, and that the unit passed."""
+        evidence, digest = read(document), hashlib.sha256(document).hexdigest()
+        facts, tables = evidence.facts, self.station.plant.line
+        row = EvidenceRow(
+            digest,
+            evidence.uuid,
+            facts.job,
+            facts.unit,
+            facts.attempt,
+            evidence.verdict,
+            evidence.finished,
+            document,
+        )
+        with self.station.durable("evidence"):
+            tables.add_evidence(row)
+            self.note(evidence.uuid, unit, passed=passed)
+            self.station.audit("evidence", evidence.uuid, evidence.verdict, sha256=digest, attempt=facts.attempt)
+            verdict = evidence.verdict if facts.failure is None else f"{evidence.verdict}: {facts.failure}"
+            told = {"sha256": digest, "job": facts.job, "unit": facts.unit, "verdict": verdict}
+            self.station.plant.tell("evidence", evidence.uuid, **told)
+        with self._turn:
+            self._told.setdefault(evidence.uuid, {})["evidence"] = digest
+
+    def passed_board(self, uuid: bytes) -> None:
+        """Print its label, and wait for the next scan."""
+        if self.scans is not None:
+            self.scans.clear(uuid)
+        if self.label_to is not None:
+            make_folder(self.label_to.parent)
+            path = self.label_to.with_name(f"{uuid.hex()}{self.label_to.suffix}")
+            write_label(label_of(self.station, uuid), path)
+            with self._turn:
+                self._told.setdefault(uuid, {})["label"] = str(path)
+
+    def note(self, uuid: bytes, unit: LineUnit, *, passed: bool) -> None:
+        """Note the attempt at which the unit passed first; in the caller's transaction."""
+        row = None if self.only_verify else unit.row
+        kept = self.station.plant.line.unit(row.job, uuid) if row is not None else None
+        if kept is not None and passed and not kept.passed:
+            self.station.plant.line.put_unit(replace(kept, passed=unit.attempt))
+
+    def calibration_digest(self, uuid: bytes) -> str | None:
+        """SHA-256 of the calibration file that a board got, None for none."""
+        if self.job is None and self.order_of_all.calibration is not None:
+            return digest_of_file(self.order_of_all.calibration)
+        return self._digests.get(uuid)
+
+
+class Scans:
+    """Labels that a scanner types, one a line: the next board must be the one that was scanned last."""
+
+    def __init__(self, lines: Iterable[str], notice: Callable[[str], object] = lambda text: None) -> None:
+        self._lines, self._notice = lines, notice
+        self._expected: tuple[bytes, str | None] | None = None
+        self._turn = threading.Lock()
+
+    def listen(self) -> None:
+        """Take label after label until there are no more; for a thread of its own."""
+        for line in self._lines:
+            self.take(line)
+
+    def take(self, text: str) -> None:
+        """Take one label; what is none is told."""
+        found: tuple[bytes, str | None] | None = read_label(text)
+        digits = text.strip().lower()
+        if found is None and len(digits) == 20 and set(digits) <= set("0123456789abcdef"):
+            found = bytes.fromhex(digits), None
+        if found is None and digits:
+            self._notice(f"This is no label of a board: {digits[:40]}")
+        elif found is not None:
+            with self._turn:
+                self._expected = found
+            self._notice(f"Expecting board {found[0].hex()}.")
+
+    def require(self, who: Identified) -> None:
+        """Raise PolicyRefused where no label was scanned, WrongBoard where another board's was."""
+        with self._turn:
+            expected = self._expected
+        if expected is None:
+            raise PolicyRefused(f"Scan the label of board {who.uuid.hex()} first.", hint="Then tap it again.")
+        uuid, key = expected
+        if uuid != who.uuid or (key is not None and not same_key(key, who.fingerprint)):
+            raise WrongBoard(
+                f"The label that was scanned is of board {uuid.hex()}, and this is board {who.uuid.hex()}.",
+                hint="Take the board of that label, or scan this one's.",
+            )
+
+    def clear(self, uuid: bytes) -> None:
+        """Forget the scan of a board that is done: the next one needs its own."""
+        with self._turn:
+            if self._expected is not None and self._expected[0] == uuid:
+                self._expected = None
+
+
+@dataclass
+class LineUnit:
+    """One board of a run; see :class:`teds_provision.steps.provision.Unit`."""
+
+    run: LineRun
+    prepared: Prepared
+    row: UnitRow | None
+    attempt: int
+    assurance: str
+    begun: str
+
+    def sign(self, node: Conversation, keys: NodeKeys, proposal: Proposal, present: Survey) -> Signed | None:
+        """The datasheet signed by the job's office; None where this station signs."""
+        job, station = self.run.job, self.run.station
+        if job is None or job.office in (None, station.identity.fingerprint):
+            return None
+        if self.run.office is None:
+            raise PolicyRefused(
+                "An office signs for this job, and nothing is named that carries to it.",
+                hint="Name the folder or stick: --files DIR",
+            )
+        assert job.office is not None
+        path = self.prepared.order.calibration
+        wanted = Wanted(
+            job.id,
+            job.office,
+            proposal.image,
+            proposal.name,
+            read_limited(path, _MAX_CALIBRATION, "calibration") if path is not None else None,
+            present.identity.epoch,
+            present.identity.sequence,
+        )
+        intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()
+        return by_office(station, self.run.office, node, keys, wanted, present.image.security if intact else None)
+
+    def ended(self, node: Conversation, done: Provisioned) -> None:
+        """Have the board sign the facts, and keep the evidence; without one, note that the unit passed."""
+        failure = Board(done.who.uuid, 0.0, done).failure
+        teds = done.image.security
+        assert teds is not None, "what was verified has a Security TEDS"
+        if self._wanted:
+            steps = _told(done.steps)
+            if failure is not None:
+                steps = (*steps, ("verdict", failure.code, 0))
+            self._keep(node, done.who.uuid, teds, steps)
+        else:
+            with self.run.station.durable("job"):
+                self.run.note(done.who.uuid, self, passed=failure is None)
+        if failure is None:
+            self.run.passed_board(done.who.uuid)
+
+    def failed(
+        self, node: Conversation, who: Identified, steps: Sequence[StepResult], step: str, error: TedsProvisionError
+    ) -> None:
+        """Leave evidence of the failure, with the board's signature where it still answers."""
+        if self._wanted:
+            self._keep(node, who.uuid, who.security_teds, (*_told(steps), (step, error.code, 0)))
+
+    @property
+    def _wanted(self) -> bool:
+        return self.run.job is None or self.run.job.evidence
+
+    def _keep(self, node: Conversation, uuid: bytes, teds: bytes, steps: tuple[tuple[str, str, int], ...]) -> None:
+        station, shown = self.run.station, security.decode(teds)
+        job, row = self.run.job, station.nodes.get(uuid)
+        credentials = station.credentials(uuid)
+        facts = Facts(
+            station=fingerprint(credentials.key.point),
+            job=job.id if job is not None else None,
+            unit=self.row.unit if self.row is not None else None,
+            attempt=self.attempt,
+            profile=job.profile if job is not None else row.profile if row is not None else None,
+            profile_sha256=job.profile_sha256 if job is not None else None,
+            calibration_sha256=self.run.calibration_digest(uuid),
+            epoch=shown.key_epoch,
+            sequence=shown.sequence,
+            blocks=blocks_of(shown),
+            steps=steps,
+            assurance=self.assurance,
+            tool=TOOL,
+            begun=self.begun,
+            heads=heads_digest(station) if station.plant.joined is not None else None,
+        )
+        document = sign_evidence(node, credentials, Claim(uuid, teds, facts), operator=self.run.operator)
+        self.run.keep(document, self, passed=facts.failure is None)
+
+
+def _told(steps: Sequence[StepResult]) -> tuple[tuple[str, str, int], ...]:
+    return tuple((step.name, step.result, round(step.seconds * 1000)) for step in steps)

@@ -1,0 +1,163 @@
+"""What a station does to belong: ask, join, leave; what a keeper vouches for (contract/plant.md section 8)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+
+from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.plant import scram
+from teds_provision.plant.folding import now, recount, require_roster
+from teds_provision.plant.post import Post
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
+from teds_provision.protocol.plant.roster import Roster, open_roster
+from teds_provision.station.station import Station
+from teds_provision.steps.verify import Verified, remember, verify_image
+from teds_provision.store import utc_now
+from teds_provision.store.tables.plant import Chain
+from teds_provision.teds.codec import security
+
+FILES = "file:"
+
+
+def request(station: Station) -> bytes:
+    """Give this station's request to be a member, signed; the same again while name and certificate are the same."""
+    kept = station.plant.login()
+    secret = os.urandom(scram.SECRET_OCTETS) if kept is None else kept[0]
+    made = MemberRequest(
+        station.name, station.point, station.identity.signature, scram.verifier(secret), now().replace(microsecond=0)
+    )
+    if kept is not None and _same(kept[1], made):
+        return kept[1]
+    octets = made.sealed(station.vault.identity())
+    with station.transaction():
+        station.plant.keep_login(secret, octets)
+        station.audit("registry", None, "requested", fingerprint=station.fingerprint)
+    return octets
+
+
+def _same(octets: bytes, made: MemberRequest) -> bool:
+    there = open_request(octets)
+    return replace(there, created=made.created) == made
+
+
+def found_roster(station: Station, post: Post, octets: bytes | None) -> Roster:
+    """The best roster that names this station, of a file or of what carries; one that has expired is refused here.
+
+    Raises NotFound, PolicyRefused.
+    """
+    found = [] if octets is None else [open_roster(octets, station.ca)]
+    held = station.plant.roster
+    if held is not None:  # it belongs already, and changes what carries
+        found.append(held)
+    for one in post.rosters() if octets is None else ():
+        try:
+            found.append(open_roster(one, station.ca))
+        except TedsProvisionError:  # a post holds what anybody put there
+            continue
+    held = station.plant.roster
+    if octets is None and held is not None:
+        found.append(held)
+    mine = [roster for roster in found if roster.member(station.fingerprint) is not None]
+    if not mine:
+        raise NotFound(
+            f"No roster of this owner's CA names this station in {post.where}.",
+            hint="Give the owner a request: registry request --output FILE; there: registry add FILE --role …",
+        )
+    registries = {roster.registry for roster in mine}
+    if len(registries) > 1:
+        raise PolicyRefused(
+            f"Rosters of {len(registries)} registries lie in {post.where}.", hint="Say which: --roster FILE"
+        )
+    best = max(mine, key=lambda one: (one.version, one.hash))
+    if best.expires <= now():
+        raise PolicyRefused(
+            f"The roster of {best.name} expired on {best.expires:%Y-%m-%d}.",
+            hint="Have its owner renew it: registry renew",
+        )
+    return best
+
+
+def disconnect(station: Station) -> None:
+    """Take no part any more; what is held is kept."""
+    require_roster(station)
+    with station.transaction():
+        record = station.plant.joined
+        assert record is not None
+        station.plant.tables.put_plant(replace(record, left=utc_now(), url=None))
+        station.audit("registry", None, "left", registry=record.registry)
+
+
+def vouchable(station: Station, uuids: Sequence[bytes] | None) -> list[tuple[bytes, str, str]]:
+    """Datasheets that this store knows as authentic and that nobody here may sign any more or ever could.
+
+    Gives UUID, digest and the first digits of the signer's fingerprint. ``uuids`` None: of every node.
+    """
+    roster = require_roster(station)
+    judging = replace(remember(station), policy=replace(remember(station).policy, rules=None))
+    listed = [shown.uuid for shown in station.nodes.each_shown()] if uuids is None else list(uuids)
+    found = []
+    for uuid in listed:
+        image = station.nodes.datasheet(uuid)
+        octets = image.security if image is not None else None
+        if image is None or octets is None:
+            continue
+        try:
+            shown = security.decode(octets)
+        except BadData:
+            continue
+        if shown.station_key is None:
+            continue
+        signer = fingerprint(shown.station_key)
+        if roster.has(signer, "sign") or Verified(uuid, tuple(verify_image(judging, image))).verdict != "authentic":
+            continue
+        found.append((uuid, hashlib.sha256(octets).hexdigest(), signer[:16]))
+    return found
+
+
+def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
+    """Say as a keeper that these datasheets are good; returns how many were not said before."""
+    roster = require_roster(station)
+    if not roster.has(station.fingerprint, "keeper"):
+        raise PolicyRefused("Only a keeper vouches for datasheets.", hint="See: registry status")
+    fresh = 0
+    with station.transaction():
+        for uuid, digest, _ in found:
+            words = station.plant.tables.digest_words(bytes.fromhex(digest))
+            if any(vouched and who == station.fingerprint for who, _, vouched, _ in words):
+                continue
+            station.plant.tell("vouched", uuid, teds_sha256=digest)
+            fresh += 1
+    return fresh
+
+
+def accept(station: Station, of: str, hash: str | None, post: Post | None) -> tuple[int, str]:
+    """Take the branch of two histories that the registry shows, or the one that ``hash`` (16 digits or more) names.
+
+    Local: others decide for themselves, and a roster's ``last`` goes before it. Returns the page that was taken.
+    """
+    roster = require_roster(station)
+    tables = station.plant.tables
+    chain: Chain = tables.chain(of)
+    n = chain.counted[0] + 1
+    names = tables.page_names(chain.chain)
+    branches = sorted({hash for number, hash, _ in names if number == n})
+    wanted = [one for one in branches if hash is not None and one.startswith(hash.lower())]
+    if hash is None and post is not None and not post.everybody:
+        shown = {carried.n: carried for carried in post.pages(of, n - 1)}
+        wanted = [one for one in branches if n in shown and hash_of(shown[n].octets) == one]
+    if len(branches) < 2:
+        raise NotFound(f"{roster.name_of(of)} has one history here.", hint="See: teds-provision registry status")
+    if len(wanted) != 1:
+        listed = ", ".join(one[:16] for one in branches)
+        raise PolicyRefused(
+            f"Page {n} of {roster.name_of(of)} is here twice: {listed}.", hint="Name the one to take: --page HASH"
+        )
+    with station.transaction():
+        tables.put_chain(replace(chain, accepted=(n, wanted[0])))
+        recount(station, tables.chain(of), roster)
+        station.audit("registry", None, "accepted", station=of, n=n, hash=wanted[0])
+    return n, wanted[0]

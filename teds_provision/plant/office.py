@@ -1,0 +1,286 @@
+"""The office builds every datasheet itself and signs nothing that it did not make (contract/plant.md section 11)."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tomllib
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.plant.asking import name_of, received, send
+from teds_provision.plant.jobs import now_of, profile_file, read_job, require_open, roster_of
+from teds_provision.plant.post import Post
+from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.keys import fingerprint, node_key_good, prove_message, verify
+from teds_provision.protocol.plant.document import SIGN_REQUEST, hash_of
+from teds_provision.protocol.plant.job import Job
+from teds_provision.protocol.plant.roster import MOST_AHEAD
+from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answer, open_request, seal_answer
+from teds_provision.station.station import Station
+from teds_provision.steps.build import check_name, guard
+from teds_provision.steps.sign import sign
+from teds_provision.store import SignRequestRow, UnitRow, WhitelistEntry, utc_now
+from teds_provision.teds.calibration.files import read_calibrations
+from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.teds.profile.load import default_folders, load_profile
+from teds_provision.teds.profile.model import Profile
+
+MOST_ANSWERS: Final = 16
+"""So many datasheets are signed for one unit."""
+MOST_JUMP: Final = 65_535
+_MAX_CALIBRATION: Final = 1 << 20
+
+
+class _Refused(Exception):
+    """The office signs nothing: one word of the contract, and why."""
+
+    def __init__(self, word: str, why: str) -> None:
+        super().__init__(why)
+        self.word, self.why = word, why
+
+
+def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None, *, jump: bool = False) -> bytes | None:
+    """Answer a request, signed by this office; None for what gets no answer (nobody's, another's, no request).
+
+    ``jobs``: only these ids (None: every job that is kept here). ``jump``: a person takes any sequence. A datasheet,
+    its unit, its sequence and the ``signed`` event are durable before the answer is given; the same request (H) gets
+    the same answer again. Raises StoreFailure, VaultFailure and PolicyRefused (this station is no office now).
+    """
+    roster = roster_of(station)
+    if not roster.has(station.identity.fingerprint, "sign"):
+        raise PolicyRefused(
+            "This station signs no datasheets: the roster does not give it the role sign.",
+            hint="Have the owner give it: teds-provision registry role NAME sign",
+        )
+    try:
+        request = open_request(octets, roster.point_of)
+    except (BadData, NotAuthentic):
+        return None
+    if request.to != station.identity.fingerprint:
+        return None
+    if request.created > now_of(roster) + MOST_AHEAD:
+        return None
+    key = station.credentials().key
+    if not roster.has(request.signer, "line"):
+        return seal_answer(Answer(request.hash, refused="not-line", why="the sender has not the role line"), key)
+    kept = station.plant.line.sign_request(request.hash, "in")
+    if kept is not None and kept.answer is not None:
+        return kept.answer
+    try:
+        return _signed(station, request, jobs, jump=jump)
+    except _Refused as refused:
+        with station.durable("signer"):
+            told = {"by": request.signer, "job": request.job, "why": refused.why}
+            station.audit("sign-request", request.uuid, refused.word, **told)
+        return seal_answer(Answer(request.hash, refused=refused.word, why=refused.why[:1000]), key)
+
+
+def answer_all(
+    station: Station, post: Post, jobs: Collection[str] | None = None, *, stop: Callable[[], bool] = lambda: False
+) -> Iterator[Answered]:
+    """Answer every request that lies there, one after the other; each answer is on its way before its parcel goes."""
+    for come in received(station, post, SIGN_REQUEST):
+        if stop():
+            return
+        sealed = answer(station, come.document, jobs)
+        if sealed is not None:
+            request = open_request(come.document, roster_of(station).point_of)
+            if roster_of(station).member(request.signer) is not None:
+                send(station, post, request.signer, sealed, name_of(hash_of(sealed)))
+            told = open_answer(sealed, lambda kid: station.point)
+            yield Answered(request, told)
+        come.drop()
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A request and what was answered."""
+
+    request: SignRequest
+    answer: Answer
+
+
+def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None, *, jump: bool) -> bytes:
+    """The answer to a good request; raises _Refused. The order of the checks is the contract's."""
+    job = _job_of(station, request, jobs)
+    revoked = station.policy.revocation(request.uuid)
+    if revoked is not None:
+        raise _Refused("revoked", f"the node was revoked: {revoked.why}")
+    _require_its_key(station, job, request)
+    _require_proof(request)
+    _require_room(station, job, request)
+    known = station.nodes.get(request.uuid)
+    if not jump and request.sequence > (known.sequence if known is not None else 0) + MOST_JUMP:
+        raise _Refused("sequence", f"sequence {request.sequence} is more than {MOST_JUMP} above the one known here")
+    image = _built(station, job, request)
+    with station.durable("signer"):
+        meanwhile = station.plant.line.sign_request(request.hash, "in")
+        if meanwhile is not None and meanwhile.answer is not None:  # another `signer` was faster
+            return meanwhile.answer
+        row = _require_room(station, job, request)
+        station.plant.line.put_unit(row)
+        if station.pins.entry(request.uuid) is None:
+            station.pins.put(WhitelistEntry(request.uuid, fingerprint(request.point), assurance="uuid"))
+            station.nodes.remember(request.uuid, point=request.point)
+        signed = sign(
+            station,
+            NodeKeys(request.uuid, request.point, request.key_signature),
+            image,
+            epoch=request.epoch,
+            node_sequence=request.sequence,
+            profile=job.profile,
+        )
+        made = Answer(request.hash, signed.sequence, signed.image.blocks[SECURITY])
+        sealed = seal_answer(made, station.credentials().key)
+        station.plant.line.put_sign_request(
+            SignRequestRow(
+                request.hash, "in", job.id, request.uuid, request.signer, request.octets, sealed, signed.sequence
+            )
+        )
+        station.audit("sign-request", request.uuid, "signed", by=request.signer, job=job.id, unit=row.unit)
+    return sealed
+
+
+def _job_of(station: Station, request: SignRequest, jobs: Collection[str] | None) -> Job:
+    row = station.plant.line.job(request.job)
+    if row is None or (jobs is not None and request.job not in jobs):
+        raise _Refused("job", "this office does not work on that job")
+    try:
+        job = read_job(station, row.octets)
+        require_open(station, job, for_station=request.signer)
+    except TedsProvisionError as error:
+        raise _Refused("job", error.message) from error
+    if job.office != station.identity.fingerprint:
+        raise _Refused("job", "the job names another office")
+    if job.boards and request.uuid not in job.boards:
+        raise _Refused("job", "the board is not in the list of the job")
+    return job
+
+
+def _require_its_key(station: Station, job: Job, request: SignRequest) -> None:
+    own = fingerprint(request.point)
+    listed = job.boards.get(request.uuid)
+    entry = station.pins.entry(request.uuid)
+    pinned = entry.fingerprint if entry is not None else None
+    for known, where in ((listed, "the job lists"), (pinned, "this office knows")):
+        if known is not None and not same_key(known, own):
+            raise _Refused("other-key", f"{where} the board with another key")
+    try:
+        station.pins.check(request.uuid, request.point)
+    except PolicyRefused as error:
+        raise _Refused("other-key", error.message) from error
+
+
+def _require_proof(request: SignRequest) -> None:
+    if not node_key_good(request.uuid, request.point, request.key_signature):
+        raise _Refused("proof", "field 102 does not sign this key for this UUID")
+    if not verify(request.point, prove_message(request.uuid, request.challenge()), request.proof):
+        raise _Refused("proof", "the board did not sign this request")
+
+
+def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
+    """The unit that the board has or gets, with one more answer; raises _Refused where there is none."""
+    tables = station.plant.line
+    kept = tables.unit(job.id, request.uuid)
+    if kept is None:
+        given, _, greatest = tables.count_units(job.id)
+        if given >= job.total:
+            raise _Refused("full", f"all {job.total} units of the job are given")
+        return UnitRow(job.id, request.uuid, greatest + 1, utc_now())
+    answered = [row for row in tables.sign_requests(job.id, request.uuid, "in") if row.sequence is not None]
+    if len(answered) >= MOST_ANSWERS:
+        raise _Refused("full", f"the unit has {MOST_ANSWERS} answers already")
+    return replace(kept, attempts=len(answered) + 1)
+
+
+def _built(station: Station, job: Job, request: SignRequest) -> Image:
+    """The datasheet as this office makes it, with the read-only TEDS that the job lists; raises _Refused."""
+    try:
+        profile = _profile(station, job)
+        calibrations = _calibrations(job, request, profile)
+        check_name(request.name)
+        built = profile.build(request.uuid, calibration=calibrations, name=request.name)
+    except TedsProvisionError as error:
+        raise _Refused("differs", error.message) from error
+    sent = request.image.unsigned_blocks()
+    blocks = {**built.blocks, **{block: sent[block] for block in job.read_only if block in sent}}
+    image = Image(request.uuid, blocks)
+    try:
+        guard(station, image, None, None, calibrations, profile, record=False)
+    except PolicyRefused as error:
+        raise _Refused("guard", error.message) from error
+    _require_the_same(sent, blocks)
+    _require_name(job, request)
+    return image
+
+
+def _require_the_same(sent: Mapping[BlockId, bytes], built: Mapping[BlockId, bytes]) -> None:
+    wrong = sorted(block for block in sent.keys() | built.keys() if sent.get(block) != built.get(block))
+    if wrong:
+        named = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in wrong[:5])
+        raise _Refused("differs", f"this office would make it otherwise: {named}")
+
+
+def _require_name(job: Job, request: SignRequest) -> None:
+    if job.name is None:
+        return
+    pattern = re.escape(job.name)
+    for field, what in (("uuid8", re.escape(request.uuid.hex()[:8])), ("uuid", re.escape(request.uuid.hex()))):
+        pattern = pattern.replace(re.escape(f"{{{field}}}"), what)
+    pattern = re.sub(r"\\\{unit(?::0[1-9])?\\\}", r"[0-9]{1,10}", pattern)
+    if request.name is None or not re.fullmatch(pattern, request.name):
+        raise _Refused("differs", f"the name {request.name!r} is not of the job's pattern")
+
+
+def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int, Calibration]:
+    octets, rule = request.calibration, job.calibration
+    if rule.rule == "none":
+        if octets is not None:
+            raise _Refused("job", "the job gives its boards no calibration")
+        return {}
+    if octets is None or len(octets) > _MAX_CALIBRATION:
+        raise _Refused("job", "the job asks for a calibration, and none came along")
+    wanted = rule.wants(request.uuid)
+    if rule.rule != "any" and hashlib.sha256(octets).hexdigest() != wanted:
+        raise _Refused("job", "the calibration is not the one that the job names")
+    found = read_calibrations(*_text_of(octets), profile)
+    if rule.rule == "any":
+        days = timedelta(days=rule.max_age_days or 0)
+        now = datetime.now(UTC)
+        if any(one.date is None or not now - days <= one.date <= now + timedelta(days=1) for one in found.values()):
+            raise _Refused("job", f"the calibration is older than {days.days} days, or has no date")
+    return found
+
+
+def _text_of(octets: bytes) -> tuple[str, str]:
+    """The text of a calibration file, and a name that says what kind it is: JSON, TOML, else CSV."""
+    try:
+        text = octets.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadData("The calibration is no UTF-8 text.") from error
+    if text.lstrip()[:1] in ("{", "["):
+        return text, "calibration.json"
+    try:
+        tomllib.loads(text)
+    except (ValueError, RecursionError):
+        return text, "calibration.csv"
+    return text, "calibration.toml"
+
+
+def _profile(station: Station, job: Job) -> Profile:
+    path = profile_file(station, job)
+    return _loaded(str(path), path.stat().st_mtime_ns, station.home)
+
+
+@lru_cache(maxsize=16)
+def _loaded(path: str, _changed: int, home: Path) -> Profile:
+    """A profile that every board of a job is built from, read once while its file stays as it is."""
+    return load_profile(Path(path), default_folders(home))

@@ -1,0 +1,260 @@
+"""What the owner of the CA key does: the registry, and every version of its roster (contract/plant.md section 1).
+
+A version is made of the one that counts here. Where the CA key is elsewhere it is drafted here and signed there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime, timedelta
+from typing import Any
+from uuid import uuid4
+
+from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.plant.folding import now, put_roster, require_roster
+from teds_provision.plant.past import Told, past
+from teds_provision.protocol.handover.strict_json import load_exact
+from teds_provision.protocol.keys import fingerprint, station_key_message, verify
+from teds_provision.protocol.plant.document import MemberRequest, payload
+from teds_provision.protocol.plant.roster import (
+    NOWHERE,
+    USUAL,
+    Member,
+    Place,
+    Removed,
+    Role,
+    Roster,
+    Share,
+    Why,
+    open_roster,
+    read_roster,
+    seal_roster,
+)
+from teds_provision.station.station import Station
+from teds_provision.store.tables.plant import PlantRecord
+
+FIRST_ROLES: frozenset[Role] = frozenset({"keeper", "sign", "line", "base"})
+
+
+def _whole(moment: datetime) -> datetime:
+    return moment.replace(microsecond=0)
+
+
+def draft_first(station: Station, name: str, days: timedelta = USUAL) -> Roster:
+    """Roster 1 of a new registry, with this station alone; raises PolicyRefused where one was joined."""
+    if station.plant.joined is not None:
+        raise PolicyRefused("This station belongs to a registry already.", hint="See: teds-provision registry status")
+    own = Member(station.name, station.point, station.identity.signature, frozenset(FIRST_ROLES))
+    moment = _whole(now())
+    return Roster(str(uuid4()), name, 1, "", moment, moment + days, (own,))
+
+
+def signed(station: Station, draft: Roster) -> Roster:
+    """A draft, signed by the CA; raises NotFound where its key is not here, BadData for what no reader takes."""
+    ca = station.vault.ca()
+    if ca is None or ca.point != station.ca:
+        raise NotFound(
+            "The CA key is not in this vault.",
+            hint="Add --draft FILE, and sign that where the CA key is: registry sign FILE",
+        )
+    return open_roster(seal_roster(draft, ca), station.ca)
+
+
+def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[Told]) -> int:
+    """Belong to a registry from now on, and tell what the store says already; returns how many events that made."""
+    if roster.member(station.fingerprint) is None:
+        raise PolicyRefused(
+            f"The roster of {roster.name} does not name this station.",
+            hint="Give its owner a request: registry request --output FILE; there: registry add FILE --role …",
+        )
+    station.unlock()
+    with station.transaction():
+        mac = station.seals.note("plant", roster.registry)
+        before = station.plant.tables.plant()
+        if before is not None and before.registry != roster.registry:
+            station.plant.tables.forget_plant()
+            before = None
+        record = before or PlantRecord(roster.registry)
+        station.plant.tables.put_plant(replace(record, left=None, url=url or record.url, mac=mac))
+        put_roster(station, roster)
+        for act, uuid, members in told:
+            station.plant.tell(act, uuid, **members)
+        station.audit("registry", None, "joined", registry=roster.registry, version=roster.version, events=len(told))
+    return len(told)
+
+
+def create(station: Station, name: str, days: timedelta = USUAL) -> tuple[Roster, int]:
+    """Make a registry with this station as its first member; returns roster 1 and how many events the past made."""
+    roster = signed(station, draft_first(station, name, days))
+    return roster, join(station, roster, url=None, told=list(past(station)))
+
+
+# -- the next version --------------------------------------------------------------------------------------------------
+
+
+def following(station: Station, **change: Any) -> Roster:
+    """The version after the one that counts here, not signed yet; dates as they are but for ``created``."""
+    own = require_roster(station)
+    created = max(_whole(now()), own.created)
+    change.setdefault("expires", max(own.expires, created + timedelta(days=1)))
+    return replace(own, version=own.version + 1, previous=own.hash, created=created, hash="", octets=b"", **change)
+
+
+def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Roster:
+    """Draft a roster with one member more; raises PolicyRefused for a key of another CA or one that was removed."""
+    own = require_roster(station)
+    if not verify(station.ca, station_key_message(request.point), request.certificate):
+        raise PolicyRefused(
+            f"Station {request.name} is not certified by this owner's CA, so it cannot join.",
+            hint="A station without nodes of its own is made anew: init --request, trust ca sign, init --certificate",
+        )
+    there = own.by_key.get(request.fingerprint)
+    if isinstance(there, Removed):
+        raise PolicyRefused(
+            f"{there.name} was removed with this key, and a removed key never comes back.",
+            hint="Make a new station on that machine: init in another --home",
+        )
+    member = Member(request.name, request.point, request.certificate, roles)
+    if there is not None:
+        raise PolicyRefused(f"{there.name} is a member already.", hint="Change its roles: registry role")
+    if any(one.name == request.name for one in own.members):
+        raise PolicyRefused(f"Another member is called {request.name!r}.", hint="Choose another name: --name")
+    return following(station, members=(*own.members, member))
+
+
+def with_roles(station: Station, name: str, roles: frozenset[Role], last: Place | None) -> Roster:
+    """Draft a roster in which a member has these roles; one that loses ``sign`` keeps what it signed up to ``last``."""
+    own = require_roster(station)
+    member = require_member(own, name)
+    if "keeper" in member.roles and "keeper" not in roles:
+        raise PolicyRefused(
+            f"{member.name} is a keeper, and that is taken by a removal alone: else its bans would end in silence.",
+            hint=f"registry remove {member.name} --retired",
+        )
+    place = member.signed
+    if "sign" in roles:
+        place = None
+    elif "sign" in member.roles:
+        place = last if last is not None else station.plant.tables.chain(member.fingerprint).counted
+    changed = replace(member, roles=roles, signed=place)
+    return following(station, members=tuple(changed if one is member else one for one in own.members))
+
+
+def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
+    """Draft a roster in which somebody is removed; ``last`` is the number of the last page that counts of it.
+
+    For a retired one that is the newest page here unless said; for a lost or stolen one it must be said.
+    """
+    own = require_roster(station)
+    member = require_member(own, name)
+    chain = station.plant.tables.chain(member.fingerprint)
+    if last is None and why != "retired":
+        raise UsageFailure(
+            f"Up to which page do you believe {member.name}?", hint="Add --last N; registry log shows its pages."
+        )
+    place = chain.counted if last is None else page_place(station, member.fingerprint, last)
+    removed = Removed(member.name, member.point, member.roles, why, place, member.signed)
+    members = tuple(one for one in own.members if one is not member)
+    share = tuple(replace(one, to=tuple(to for to in one.to if to != member.fingerprint)) for one in own.share)
+    return following(
+        station, members=members, removed=(*own.removed, removed), share=tuple(one for one in share if one.to)
+    )
+
+
+def page_place(station: Station, of: str, n: int) -> Place:
+    """Number and H of a page that counts here; raises NotFound."""
+    if n == 0:
+        return NOWHERE
+    chain = station.plant.tables.chain(of)
+    found = [hash for number, hash, _ in station.plant.tables.page_names(chain.chain) if number == n]
+    if not found or n > chain.counted[0]:
+        raise NotFound(f"Page {n} of that station is not here, or does not count.", hint="See: registry status")
+    for number, hash, previous in station.plant.tables.page_names(chain.chain):
+        if number == n + 1 and len(found) > 1 and previous in found:
+            return n, previous
+        if number == n and len(found) == 1:
+            return n, hash
+    return n, found[0]
+
+
+def shared(station: Station, share: Share) -> Roster:
+    """Draft a roster that shares keys so; a share of the same nodes is replaced."""
+    own = require_roster(station)
+    for to in share.to:
+        member = own.member(to)
+        if member is None or "base" not in member.roles:
+            raise PolicyRefused(
+                f"{own.name_of(to)} is no member with the role base, so it takes no keys.", hint="registry role"
+            )
+    return following(station, share=(*(one for one in own.share if one.what != share.what), share))
+
+
+def unshared(station: Station, what: tuple[str, str]) -> Roster:
+    """Draft a roster that shares these nodes no more; raises NotFound where they were not."""
+    own = require_roster(station)
+    kept = tuple(one for one in own.share if one.what != what)
+    if len(kept) == len(own.share):
+        raise NotFound("The roster has no such share.", hint="See: teds-provision registry status")
+    return following(station, share=kept)
+
+
+def renewed(station: Station, days: timedelta) -> Roster:
+    """Draft the same roster with a new end."""
+    return following(station, expires=_whole(now()) + days)
+
+
+def require_member(roster: Roster, name: str) -> Member:
+    """A member by name or fingerprint; raises NotFound."""
+    found = roster.named(name)
+    if not isinstance(found, Member):
+        known = ", ".join(one.name for one in roster.members)
+        raise NotFound(f"{name!r} is no member of {roster.name}.", hint=f"Members: {known}.")
+    return found
+
+
+def write_draft(draft: Roster) -> bytes:
+    """A draft as a file."""
+    return payload(draft.unsigned()) + b"\n"
+
+
+def read_draft(octets: bytes, ca: bytes) -> Roster:
+    """A draft out of a file; raises BadData."""
+    draft = read_roster(load_exact(octets, "The draft"), ca)
+    if json.loads(payload(draft.unsigned())) != json.loads(octets):
+        raise BadData("The draft holds what this version does not know.", hint="Sign it with the version that made it.")
+    return draft
+
+
+def changes(before: Roster | None, after: Roster) -> list[str]:
+    """What a new version changes, in sentences; every key with all 64 digits."""
+    said = [f"roster {after.version} of {after.name} ({after.registry}), until {after.expires:%Y-%m-%d}"]
+    there = before.by_key if before is not None else {}
+    for member in after.members:
+        old = there.get(member.fingerprint)
+        roles = " ".join(sorted(member.roles))
+        if not isinstance(old, Member):
+            said.append(f"  adds {member.name} as {roles}")
+            said.append(f"    {fingerprint(member.point)}")
+        elif old.roles != member.roles:
+            said.append(f"  {member.name}: {' '.join(sorted(old.roles))} becomes {roles}")
+            if member.signed is not None:
+                said.append(f"    what it signed up to page {member.signed[0]} stays authentic")
+    for left in after.removed:
+        if not isinstance(there.get(left.fingerprint), Removed):
+            said.append(f"  removes {left.name} ({left.why}); its pages up to {left.last[0]} count")
+            said.append(f"    {left.fingerprint}")
+    shares = set(before.share) if before is not None else set()
+    said += [f"  shares {_share(one)} with {_names(after, one)}" for one in after.share if one not in shares]
+    said += [f"  shares {_share(one)} no more" for one in shares if one.what not in {n.what for n in after.share}]
+    return said
+
+
+def _share(share: Share) -> str:
+    return "all nodes" if share.what[0] == "all" else f"{share.what[0]} {share.what[1]}"
+
+
+def _names(roster: Roster, share: Share) -> str:
+    names = ", ".join(roster.name_of(one) for one in share.to)
+    return names + (", and forgets them itself" if share.forget else "")

@@ -1,0 +1,450 @@
+"""Keys that travel by themselves: copies by the roster's shares, receipts, and what waits for a person.
+
+A parcel is a bundle as ``export-keys`` seals it, for one receiver; its receipt; or a document of a line, sealed the
+same way. What leaves lies in the store before it is sent, and what came before it is taken away, so a sync that is
+cut anywhere is followed by the same sync: a parcel of a known id is sent once more, a bundle that was taken in gives
+its receipt once more (contract/plant.md section 4).
+"""
+
+from __future__ import annotations
+
+import uuid as uuids
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from itertools import chain
+from typing import Final
+
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.handover import incoming, outgoing, pending
+from teds_provision.plant.post import Parcel, Post
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import CONTENT_TYPE
+from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, time_text
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.plant import sharing
+from teds_provision.protocol.plant.claim import Claim
+from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, open_document
+from teds_provision.protocol.plant.fold import View
+from teds_provision.protocol.plant.roster import Roster
+from teds_provision.station.station import Station
+from teds_provision.store import TrustRecord, pages
+from teds_provision.store.tables.parcels import ParcelKind, ParcelRow
+from teds_provision.store.tables.plant import Alarm
+
+NODES: Final = 10_000
+"""So many nodes go into one copy."""
+DAYS: Final = 7
+_COMMAND: Final = "registry sync"
+_SMALL: Final = 8 << 20
+"""Documents of a line are smaller, sealed; a larger parcel is a bundle."""
+_KEPT: Final = 64
+"""So many parcels of one sender wait here for a person; the others stay where they are."""
+_OF_A_LINE: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
+_KINDS: Final = {JOB.typ: JOB, SIGN_REQUEST.typ: SIGN_REQUEST, SIGNED.typ: SIGNED}
+
+Views = Callable[[Sequence[bytes]], Mapping[bytes, View]]
+"""What the plant says of some nodes, by UUID."""
+
+
+# -- in ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Received:
+    """How many parcels of a sync were dealt with, and how many wait for a person."""
+
+    taken: int
+    waiting: int
+
+
+def take_in(station: Station, post: Post, views: Views, now: datetime) -> Received:
+    """Take in what lies there for this station; what needs a person is kept for ``import-keys --received``."""
+    roster = station.plant.roster
+    if roster is None:
+        return Received(0, 0)
+    reader = _Reader(station, roster, views, now)
+    taken = sum(reader.again(row) for row in station.plant.parcels.parcels("in", "later"))
+    for parcel in post.parcels(station.fingerprint):
+        done = reader.take(parcel)
+        if done is not None:
+            post.drop(parcel.id, station.fingerprint)
+            taken += done
+    return Received(taken, len(station.plant.parcels.parcels("in", "waiting", "later")))
+
+
+class _Reader:
+    """Deals with parcels one by one."""
+
+    def __init__(self, station: Station, roster: Roster, views: Views, now: datetime) -> None:
+        self.station, self.roster, self.views, self.now = station, roster, views, now
+        self.quiet = silent_stations(station, roster, now)
+
+    def again(self, row: ParcelRow) -> bool:
+        """Judge once more what came before its sender's pages did; whoever is still unheard of is for a person."""
+        octets = self.station.plant.parcels.parcel_document(row.id, "in")
+        with self.station.lock(_COMMAND):
+            try:
+                plan = incoming.plan_import(self.station, octets, self.now)
+            except TedsProvisionError as error:
+                return self._end(row, error)
+            why = "" if isinstance(plan, incoming.Imported) else self._why_not(plan)
+            if why:
+                self.station.plant.parcels.turn_parcel(row.id, "in", "waiting", why)
+                return False
+            import_parcel(self.station, row, plan)
+            return True
+
+    def take(self, parcel: Parcel) -> bool | None:
+        """Deal with what lies there: True where it is done, False where it is kept here, None where it stays there."""
+        tables = self.station.plant.parcels
+        if tables.parcel(parcel.id, "in") is not None:
+            return False
+        try:
+            typ, inner = _inner(parcel.octets, self.station)
+            if typ in _OF_A_LINE:
+                return self._keep_document(parcel, typ, inner)
+            if not parcel.octets.startswith(b"{"):
+                return self._receipt(parcel)
+            return self._bundle(parcel)
+        except TedsProvisionError as error:
+            return self._junk(parcel, error)
+
+    def _bundle(self, parcel: Parcel) -> bool | None:
+        with self.station.lock(_COMMAND):
+            try:
+                plan = incoming.plan_import(self.station, parcel.octets, self.now)
+            except incoming.NothingTaken as error:
+                self._refuse(error)
+                return True
+            row = self._row(parcel, "bundle")
+            if isinstance(plan, incoming.Imported):
+                import_parcel(self.station, replace(row, peer=plan.row.peers[0], about=plan.row.id), plan)
+                return True
+            bundle = plan.opened.bundle
+            row = replace(row, peer=bundle.sender, about=bundle.id, expires=time_text(bundle.expires))
+            why = self._why_not(plan)
+            if not why:
+                import_parcel(self.station, row, plan)
+                return True
+            return self._keep(replace(row, state="later" if why == sharing.LATER else "waiting", detail=why), parcel)
+
+    def _why_not(self, plan: incoming.ImportPlan) -> str:
+        """Why a bundle is not taken in without a question, "" where it is."""
+        bundle, roster, me = plan.opened.bundle, self.roster, self.station.fingerprint
+        if bundle.mode != "copy":
+            return "a move is a person's to take in"
+        if self.now >= roster.expires:
+            return "the roster has expired"
+        if roster.member(bundle.sender) is None:
+            return "its sender is no member"
+        if bundle.ca != self.station.ca:
+            return "its nodes keep another CA"
+        later = ""
+        for page in pages(plan.taken):
+            held = self._unproven_of(bundle.sender, [one.node.uuid for one in page])
+            pins = self.station.pins.of_page([one.node.uuid for one in page])
+            seen = self.views([one.node.uuid for one in page])
+            for one in page:
+                node, pin = one.node, pins.get(one.node.uuid)
+                if any(key_id != node.kid for key_id in held.get(node.uuid, ())):
+                    return f"{node.uuid.hex()}: a key of it from this sender was never proven"
+                offer = sharing.Offer(node.uuid, node.epoch, node.kid, fingerprint(node.node_key))
+                why = sharing.why_not(
+                    roster,
+                    seen[node.uuid],
+                    offer,
+                    sender=bundle.sender,
+                    receiver=me,
+                    pin=pin.fingerprint if pin is not None else None,
+                    quiet=self.quiet,
+                )
+                if why and why != sharing.LATER:
+                    return f"{node.uuid.hex()}: {why}"
+                later = later or why
+        return later
+
+    def _unproven_of(self, sender: str, page: Sequence[bytes]) -> dict[bytes, list[str]]:
+        """Keys that came from this sender and were never proven, by node."""
+        held: dict[bytes, list[str]] = {}
+        for key in self.station.keys.of_page(page):
+            if key.state == "pending" and key.source == "import":
+                held.setdefault(key.uuid, []).append(key.key_id)
+        return {
+            uuid: keys
+            for uuid, keys in held.items()
+            if any(holder.fingerprint == sender for holder in self.station.keys.holders(uuid))
+        }
+
+    def _receipt(self, parcel: Parcel) -> bool:
+        with self.station.lock(_COMMAND):
+            closed = pending.close(self.station, parcel.octets)
+            receipt = closed.receipt
+            tables = self.station.plant.parcels
+            with self.station.transaction():
+                for row in tables.parcels("out", "ready", "sent"):
+                    if row.kind == "bundle" and row.about == receipt.id and row.peer == receipt.sender:
+                        tables.turn_shared(row.id, "taken")
+                        tables.turn_shared(row.id, "refused", [one.uuid for one in receipt.refused])
+                        tables.drop_parcel(row.id, "out")
+        return True
+
+    def _keep_document(self, parcel: Parcel, typ: str, inner: bytes) -> bool | None:
+        """Keep a job, a request or an answer for the command that it is for; a member signed it."""
+        document = open_document(inner, self._member, _KINDS[typ])
+        row = replace(self._row(parcel, _OF_A_LINE[typ]), peer=document.signer, about=document.hash, state="waiting")
+        with self.station.durable(_COMMAND):
+            return self._keep(row, replace(parcel, octets=inner))
+
+    def _member(self, digits: str) -> bytes | None:
+        member = self.roster.member(digits)
+        return None if member is None else member.point
+
+    def _keep(self, row: ParcelRow, parcel: Parcel) -> bool | None:
+        tables = self.station.plant.parcels
+        if sum(one.peer == row.peer for one in tables.parcels("in", "waiting", "later")) >= _KEPT:
+            return None
+        with self.station.transaction():
+            tables.put_parcel(row, parcel.octets)
+        return False
+
+    def _refuse(self, error: incoming.NothingTaken) -> None:
+        """Say on the next page that nothing of a bundle was taken: it is never sent again for these keys."""
+        with self.station.transaction():
+            for one in error.nodes:
+                told = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": one.why}
+                self.station.plant.tell("refused", one.node.uuid, **told)
+            self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
+
+    def _end(self, row: ParcelRow, error: TedsProvisionError) -> bool:
+        if isinstance(error, incoming.NothingTaken):
+            self._refuse(error)
+        self.station.plant.parcels.drop_parcel(row.id, "in")
+        return True
+
+    def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
+        """What nobody can use is thrown away and told; it would lie there until it expires."""
+        if not isinstance(error, (BadData, NotAuthentic, NotFound, PolicyRefused)):
+            raise error
+        with self.station.durable(_COMMAND):
+            self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, error.message))
+            self.station.audit("import", None, "parcel thrown away", parcel=parcel.id, why=error.message)
+        return True
+
+    def _row(self, parcel: Parcel, kind: ParcelKind) -> ParcelRow:
+        return ParcelRow(parcel.id, "in", parcel.sender or "0" * 64, kind, "later", parcel.expires)
+
+
+def _inner(octets: bytes, station: Station) -> tuple[str, bytes]:
+    """``typ`` and octets of what is sealed in a small parcel; "" for bundles and what is not sealed."""
+    if not octets.startswith(b"{") or len(octets) > _SMALL:
+        return "", b""
+    inner = jose.decrypt(octets, station.vault.identity(), cty=CONTENT_TYPE, max_octets=_SMALL)
+    header = load_object(decode_base64url(inner.partition(b".")[0], "The JWS header"), "The JWS header")
+    typ = header.get("typ")
+    return (typ, inner) if isinstance(typ, str) and typ in _OF_A_LINE else ("", b"")
+
+
+def import_parcel(station: Station, row: ParcelRow, plan: incoming.ImportPlan | incoming.Imported) -> incoming.Imported:
+    """Take a bundle in and put its receipt among what leaves, all in one transaction; the caller holds the lock."""
+    with station.transaction():
+        done = plan if isinstance(plan, incoming.Imported) else incoming.import_bundle(station, plan)
+        station.plant.parcels.drop_parcel(row.id, "in")
+        _put_out(station, "receipt", done.row.peers[0], done.receipt.strip(), done.row.id, DAYS)
+    return done
+
+
+def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]]:
+    """What came of a kind and waits, oldest first, each with its document."""
+    tables = station.plant.parcels
+    return [(row, tables.parcel_document(row.id, "in")) for row in tables.parcels("in", "waiting") if row.kind == kind]
+
+
+# -- out ---------------------------------------------------------------------------------------------------------------
+
+
+def enqueue(station: Station, kind: ParcelKind, to: str, document: bytes, days: int = DAYS) -> str:
+    """Seal a signed document of a line for a member, to leave with the next sync; its id. Raises NotFound."""
+    roster = station.plant.roster
+    member = roster.member(to) if roster is not None else None
+    if member is None:
+        raise NotFound(f"Station {to[:16]} is no member of the plant.", hint="See: teds-provision registry status")
+    sealed = jose.encrypt(document, [member.point], cty=CONTENT_TYPE)
+    with station.durable(_COMMAND):
+        return _put_out(station, kind, to, sealed, "", days)
+
+
+def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> str:
+    """Have a bundle of ``export-keys --send`` leave with the next sync; its id. The caller holds the lock.
+
+    The same order again, while its parcel waits, gives the same parcel.
+    """
+    peer = plan.receivers[0].fingerprint
+    for row in station.plant.parcels.parcels("out", "ready", "sent"):
+        if row.kind == "bundle" and row.about == plan.id and row.peer == peer and row.expires > time_text(now):
+            return row.id
+    sealed = outgoing.seal_export(station, plan, now)
+    with station.transaction():
+        outgoing.record_export(station, sealed)
+        parcel = _put_out(station, "bundle", peer, sealed.octets, plan.id, expires=plan.expires)
+        station.plant.parcels.put_shared(((one.uuid, one.epoch) for one in plan.nodes), peer, parcel, "sent")
+    return parcel
+
+
+def send_out(station: Station, post: Post, views: Views, now: datetime) -> int:
+    """Send what waits: copies that are due, receipts, what a person sent; returns how many parcels left."""
+    roster = station.plant.roster
+    if roster is None:
+        return 0
+    _expire(station, now)
+    _note_refused(station)
+    if now < roster.expires:
+        _make_copies(station, roster, views, now)
+        _forget(station, roster, views)
+    return _send(station, roster, post)
+
+
+def waiting_out(station: Station) -> int:
+    """How many parcels were made and not receipted."""
+    return sum(row.kind != "receipt" for row in station.plant.parcels.parcels("out", "ready", "sent"))
+
+
+def _put_out(
+    station: Station,
+    kind: ParcelKind,
+    to: str,
+    document: bytes,
+    about: str,
+    days: int = DAYS,
+    expires: datetime | None = None,
+) -> str:
+    parcel = str(uuids.uuid4())
+    until = time_text(expires or datetime.now(UTC) + timedelta(days=days))
+    station.plant.parcels.put_parcel(ParcelRow(parcel, "out", to, kind, "ready", until, about), document)
+    return parcel
+
+
+def _send(station: Station, roster: Roster, post: Post) -> int:
+    tables, sent = station.plant.parcels, 0
+    for row in tables.parcels("out", "ready"):
+        if roster.member(row.peer) is None:
+            continue  # a removed station gets nothing; a move to it is a person's to take back
+        try:
+            post.send(Parcel(row.id, row.peer, tables.parcel_document(row.id, "out"), row.expires, station.fingerprint))
+        except PolicyRefused:
+            break  # too much waits there: the rest goes with the next sync
+        with station.durable(_COMMAND):
+            if row.kind == "bundle":
+                tables.turn_parcel(row.id, "out", "sent")
+            else:
+                tables.drop_parcel(row.id, "out")
+        sent += 1
+    return sent
+
+
+def _expire(station: Station, now: datetime) -> None:
+    """What nobody receipted in time is made anew: a copy as another one, a move under its old id."""
+    tables = station.plant.parcels
+    for row in tables.parcels("out", "ready", "sent"):
+        if row.expires > time_text(now):
+            continue
+        with station.lock(_COMMAND):
+            handover = station.handovers.get(row.about, "out") if row.kind == "bundle" else None
+            with station.transaction():
+                tables.forget_shared(row.id)
+                tables.drop_parcel(row.id, "out")
+            if handover is not None and handover.mode == "move" and handover.state == pending.OPEN:
+                nodes = tuple(bytes.fromhex(one) for one in pending.Notes.from_json(handover.nodes).uuids)
+                order = outgoing.ExportOrder((row.peer,), nodes, "move")
+                with suppress(PolicyRefused, NotFound):  # revoked or forgotten since: `handover undo` says so
+                    send_export(station, outgoing.plan_export(station, order, now), now)
+
+
+def _note_refused(station: Station) -> None:
+    """Note which copies their receivers say, on a page, that they refused: they are not made again."""
+    tables, me = station.plant.parcels, station.fingerprint
+    for row in tables.parcels("out", "sent"):
+        held = tables.shared_in(row.id) if row.kind == "bundle" else []
+        if not held:
+            continue
+        claims = station.plant.tables.claims_of([held[0][0]]).get(held[0][0], {})
+        claim = Claim.from_json(claims[row.peer]) if row.peer in claims else Claim()
+        if any(bundle == row.about and peer == me for bundle, peer, _ in claim.refused):
+            with station.durable(_COMMAND):
+                tables.turn_shared(row.id, "refused")
+                tables.drop_parcel(row.id, "out")
+
+
+def _make_copies(station: Station, roster: Roster, views: Views, now: datetime) -> None:
+    """Make the copies that the roster's shares ask of this station."""
+    me, quiet = station.fingerprint, silent_stations(station, roster, now)
+    for receiver in sorted({to for share in roster.share for to in sharing.receivers(roster, me, share)}):
+        clear, disputed = _due(station, roster, views, receiver, quiet)
+        if not clear and not disputed:
+            continue
+        member = roster.member(receiver)
+        assert member is not None
+        to = TrustRecord(member.name, "station", member.point, receiver)
+        with station.lock(_COMMAND):
+            for part in (clear, disputed):  # what is in dispute waits for a person there, and holds up nothing else
+                for plan in outgoing.plan_copies(station, to, part, now, most=NODES) if part else ():
+                    send_export(station, plan, now)
+
+
+def _due(
+    station: Station, roster: Roster, views: Views, receiver: str, quiet: set[str]
+) -> tuple[list[bytes], list[bytes]]:
+    """Nodes of which a receiver gets a copy from here; those that stations do not agree on apart."""
+    me, tables = station.fingerprint, station.plant.parcels
+    shares = [share for share in roster.share if receiver in sharing.receivers(roster, me, share)]
+    clear: list[bytes] = []
+    disputed: list[bytes] = []
+    own = _seen(views, tables.unshared(receiver))
+    gone = quiet or roster.removed  # else whoever made a key shares it
+    others = _seen(views, tables.unshared(receiver, imported=True)) if gone else iter(())
+    mine = (one for one in others if sharing.sharer(roster, one[3], (one[1], one[2]), quiet) == me)
+    for uuid, _, _, view in chain(own, mine):
+        if sharing.shares_any(shares, view, me) and not sharing.gave_away(view, receiver):
+            (disputed if view.conflicts else clear).append(uuid)
+    return clear, disputed
+
+
+def _seen(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterator[tuple[bytes, int, str, View]]:
+    """Nodes with what the plant says of them, a page at a time."""
+    for page in pages(rows):
+        seen = views([uuid for uuid, _, _ in page])
+        yield from ((uuid, epoch, key_id, seen[uuid]) for uuid, epoch, key_id in page)
+
+
+def _forget(station: Station, roster: Roster, views: Views) -> None:
+    """Delete the keys of which all receivers of a share with ``forget`` have sent a receipt; a tap brings one back."""
+    me, tables = station.fingerprint, station.plant.parcels
+    if not any(share.forget for share in roster.share):
+        return
+    for page in pages(tables.receipted()):
+        seen = views([uuid for uuid, _, _ in page])
+        for uuid, epoch, taken in page:
+            shares = [share for share in roster.share if sharing.shares_any([share], seen[uuid], me)]
+            if sharing.forgets(roster, me, shares, taken):
+                _delete(station, uuid, epoch)
+
+
+def _delete(station: Station, uuid: bytes, epoch: int) -> None:
+    with station.durable(_COMMAND):
+        for key in station.keys.of(uuid):
+            if key.epoch <= epoch:
+                station.keys.remove_key(uuid, key.key_id)
+        station.plant.tell("forgot", uuid, epoch=epoch)
+        station.audit("handover", uuid, "forgot", epoch=epoch)
+
+
+def silent_stations(station: Station, roster: Roster, now: datetime) -> set[str]:
+    """Members, but this one, of which no page came that was made within the last seven days."""
+    tables, created = station.plant.tables, dict[str, datetime | None]()
+    for digits, said in tables.chains().items():
+        if roster.member(digits) is not None and digits != station.fingerprint:
+            page = tables.page(said.chain, *said.counted) if said.counted[0] else None
+            at = page.created if page is not None else ""
+            created[digits] = datetime.fromisoformat(at) if at else None
+    return sharing.silent(created, now)

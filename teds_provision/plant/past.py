@@ -1,0 +1,91 @@
+"""Joining with a past: what a station's store says already, as events (contract/plant.md section 2).
+
+Nodes that were provisioned before the plant was made stay authentic at every member: what this station signed, and
+still remembers, is told in its first pages.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+from teds_provision.errors import BadData, TedsProvisionError
+from teds_provision.handover.pending import UNDONE, Notes
+from teds_provision.protocol.datasheet import signature_good
+from teds_provision.protocol.fingerprints import is_whole
+from teds_provision.protocol.handover.revocation import open_revocation
+from teds_provision.station.station import Station
+from teds_provision.store import KeyRecord
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import Image
+
+Told = tuple[str, bytes | None, dict[str, Any]]
+
+
+def past(station: Station) -> Iterator[Told]:
+    """What this station would have told had it been a member: act, node, members; nothing is written."""
+    for entry in station.pins.each():
+        if is_whole(entry.fingerprint) and entry.assurance != "registry":
+            yield "pinned", entry.uuid, {"fingerprint": entry.fingerprint, "assurance": entry.assurance}
+    keys = {record.uuid: record for record in station.keys.all() if record.state == "active"}
+    for uuid, record in keys.items():
+        pinned = station.pins.pinned(uuid)
+        if record.source == "agreement" and is_whole(pinned):
+            yield "agreed", uuid, {"fingerprint": pinned, "epoch": record.epoch, "key_id": record.key_id}
+    yield from _handed(station, keys)
+    for shown in station.nodes.each_shown():
+        for epoch, sequence, digest in signed_here(station, shown.uuid):
+            yield "signed", shown.uuid, {"epoch": epoch, "sequence": sequence, "teds_sha256": digest}
+    for ban in station.policy.revocations():
+        try:
+            own = open_revocation(ban.statement, lambda kid: station.point if kid == station.fingerprint else None)
+        except TedsProvisionError:  # another station's word: it tells that itself
+            continue
+        yield "revoked", ban.uuid, {"statement": own.statement}
+
+
+def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[Told]:
+    """Keys that left and came, by the handovers that are remembered."""
+    for row in station.handovers.all():
+        notes = Notes.from_json(row.nodes)
+        refused = {uuid for uuid, _ in notes.refused}
+        for at, digits in enumerate(notes.uuids):
+            uuid = bytes.fromhex(digits)
+            held, node = keys.get(uuid), station.nodes.get(uuid)
+            key_id = notes.keys[at] if at < len(notes.keys) else held.key_id if held is not None else None
+            if digits in refused or row.state == UNDONE or key_id is None:
+                continue
+            same = held is not None and held.key_id == key_id
+            epoch = held.epoch if held is not None and same else node.epoch if node is not None else 0
+            handed = {"epoch": epoch, "key_id": key_id, "mode": row.mode, "bundle": row.id}
+            if row.direction == "in" and same and held is not None and held.source == "import":
+                yield "took", uuid, {**handed, "peer": row.peers[0]}
+            elif row.direction == "out":
+                yield from (("gave", uuid, {**handed, "peer": peer}) for peer in row.peers)
+
+
+def signed_here(station: Station, uuid: bytes) -> Iterator[tuple[int, int, str]]:
+    """Epoch, sequence and digest of every remembered datasheet of a node that verifies under this station's own key."""
+    draft = station.nodes.draft(uuid)
+    images: list[Image] = [record.image for record in station.nodes.history(uuid)]
+    images += [draft.image] if draft is not None and draft.stage == "signed" else []
+    seen: set[str] = set()
+    for image in images:
+        octets = image.security
+        try:
+            shown = security.decode(octets) if octets is not None else None
+        except BadData:
+            continue
+        if octets is None or shown is None or not shown.signed or shown.station_key != station.point:
+            continue
+        digest = hashlib.sha256(octets).hexdigest()
+        if digest not in seen and signature_good(shown, octets, uuid):
+            seen.add(digest)
+            yield shown.key_epoch, shown.sequence, digest
+
+
+def count(told: list[Told]) -> dict[str, int]:
+    """How many events of each act."""
+    return dict(Counter(act for act, _, _ in told))

@@ -1,0 +1,420 @@
+"""The registry on PostgreSQL, as a member sees it: read rows, append pages, post a roster, send and take parcels.
+
+Nothing that comes from here is believed: whoever calls checks who signed it. A connection is TLS 1.3 to a server whose
+name is verified, and logs in by SCRAM bound to that channel; no password stands in a URL, a file or a variable. Each
+method is one round trip, but for :meth:`Registry.pages`, which takes one for every few pages.
+
+No wait is endless: libpq's own keepalive is two hours, so ``tcp_user_timeout`` and short keepalives notice a connection
+that is half open, the server ends a statement after 60 s, and a watch of our own ends the connection where a server
+that hangs does not.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+
+from teds_provision.errors import (
+    Fork,
+    NotMember,
+    PolicyRefused,
+    RegistryFailure,
+    StoreFailure,
+    TedsProvisionError,
+    UsageFailure,
+)
+from teds_provision.lazy import how_to_install, late
+from teds_provision.plant import schema, scram
+from teds_provision.plant.post import Carried, Parcel
+from teds_provision.sanitize import printable
+
+if TYPE_CHECKING:
+    import psycopg
+else:
+    psycopg = late("psycopg")
+
+CONNECTING: Final = 10
+"""Seconds for a connection to come about."""
+STATEMENT: Final = 60
+"""Seconds for one statement, by the server's clock; ours gives a little more."""
+PAGES_AT_ONCE: Final = 32
+_GRACE: Final = 5.0
+_CHANNEL: Final = "teds"
+_FROM_URL: Final = frozenset({"host", "hostaddr", "port", "dbname", "sslrootcert", "sslcrl", "sslcrldir"})
+_NO_SCHEMA: Final = frozenset({"42P01", "3F000", "42883"})  # no such table, schema, function
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A parcel that waits in the database; ``sender`` and ``to`` are fingerprints, ``octets`` its size."""
+
+    id: str
+    sender: str
+    to: str
+    octets: int
+    expires: datetime
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the database has at one moment, all of it unchecked.
+
+    ``rosters`` are those that members posted, each once; ``posted`` is this station's own. ``heads`` are number and H
+    of each chain's newest page.
+    """
+
+    registry: str
+    rosters: tuple[bytes, ...] = field(repr=False)
+    posted: bytes | None = field(repr=False)
+    heads: Mapping[str, tuple[int, str]]
+    parcels: tuple[Waiting, ...]
+    newest: tuple[int, bytes] | None = field(repr=False)
+    """This station's own newest page there, where it is a short one: each sync looks at it."""
+
+
+_LOOK: Final = """\
+select 'meta', null::bytea, version, registry::text, null::bytea, null::timestamptz from registry.meta
+union all select 'roster', null, bool_or(station = registry.me())::int, jws, null, null
+  from registry.roster group by jws
+union all select 'head', station, n, encode(hash, 'hex'), null, null from registry.member
+union all select 'parcel', sender, octet_length(document), id::text, recipient, expires from registry.parcel
+  where recipient = registry.me() or sender = registry.me()
+union all select 'page', p.station, p.n, p.jws, null, null from registry.page p
+  join registry.member m on (m.station, m.n) = (p.station, p.n)
+  where p.station = registry.me() and octet_length(p.jws) <= 65536"""
+
+# What a login of a member may do in a database where the schema was not run by a superuser, or pg_restore undid it.
+_OPEN_DOORS: Final = """\
+select what from (values
+  ('TEMP for PUBLIC', has_database_privilege(current_database(), 'TEMP')),
+  ('CREATE on schema public', coalesce((select has_schema_privilege(oid, 'CREATE') from pg_namespace
+    where nspname = 'public'), false)),
+  ('pg_notify', has_function_privilege('pg_catalog.pg_notify(text, text)', 'EXECUTE')),
+  ('session advisory locks', has_function_privilege('pg_catalog.pg_advisory_lock(bigint)', 'EXECUTE')),
+  ('large objects', has_function_privilege('pg_catalog.lo_from_bytea(oid, bytea)', 'EXECUTE')),
+  ('writing pages past the functions', has_table_privilege('registry.page', 'INSERT, UPDATE, DELETE')),
+  ('a superuser''s login', (select rolsuper or rolcreaterole or rolbypassrls from pg_roles
+    where rolname = session_user))
+) as door(what, open) where open"""
+
+
+def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
+    """What libpq is told for a registry's URL; raises UsageFailure (2) where the URL says more than where it is.
+
+    ``postgresql://HOST[:PORT]/DATABASE[?sslrootcert=FILE]``; without the file libpq's own place for root certificates
+    counts. Whoever could write ``sslmode`` or a user into it would decide whom this station trusts.
+    """
+    parts = urlsplit(url)
+    if parts.scheme not in ("postgresql", "postgres"):
+        raise UsageFailure("The registry is named as postgresql://HOST/DATABASE, or by --files DIR.")
+    if parts.password is not None or "password" in parts.query:
+        raise UsageFailure(
+            "The URL of a registry holds no password.", hint="The station has its own: registry request --output FILE"
+        )
+    if parts.username is not None:
+        raise UsageFailure("The URL of a registry names no user: each station logs in as itself.")
+    require_driver()
+    told: dict[str, Any]
+    try:
+        told = psycopg.conninfo.conninfo_to_dict(url)
+    except psycopg.ProgrammingError as error:
+        raise UsageFailure(f"PostgreSQL's driver does not understand this URL: {_words(error)}") from error
+    unknown = sorted(set(told) - _FROM_URL)
+    if unknown:
+        raise UsageFailure(f"The URL of a registry may not set {', '.join(unknown)}.", hint="Leave it away.")
+    if not told.get("host") or not told.get("dbname"):
+        raise UsageFailure("The URL of a registry names host and database: postgresql://HOST/DATABASE")
+    return told | {
+        "user": schema.role_of(fingerprint),
+        "password": scram.password(secret),
+        "sslmode": "verify-full",
+        "ssl_min_protocol_version": "TLSv1.3",
+        "channel_binding": "require",
+        "gssencmode": "disable",
+        "target_session_attrs": "read-write",  # a standby that lags shows less than there is
+        "connect_timeout": CONNECTING,
+        "tcp_user_timeout": CONNECTING * 1000,
+        "keepalives_idle": 10,
+        "keepalives_interval": 5,
+        "keepalives_count": 3,
+        "application_name": "teds-provision",
+        "client_encoding": "UTF8",
+        "options": f"-c statement_timeout={STATEMENT}s -c lock_timeout=10s -c idle_in_transaction_session_timeout=60s",
+    }
+
+
+def require_driver() -> None:
+    """Raise UsageFailure where psycopg is missing."""
+    try:
+        _ = psycopg.conninfo
+    except ImportError as error:
+        raise UsageFailure(
+            "A registry on PostgreSQL needs psycopg, which is not installed.", hint=how_to_install("registry")
+        ) from error
+
+
+class Registry:
+    """One login at the database, connected at its first use and again after a failure.
+
+    Every method raises RegistryFailure (5: not reached, login refused, no answer), NotMember (6), PolicyRefused (6:
+    full), Fork (4), StoreFailure (7: schema, gap).
+    """
+
+    def __init__(self, told: Mapping[str, Any], patience: float = STATEMENT + _GRACE) -> None:
+        self._told, self._patience = told, patience
+        self._connection: psycopg.Connection[tuple[Any, ...]] | None = None
+
+    def close(self) -> None:
+        """End the connection; a later use makes another one."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with suppress(psycopg.Error):
+                connection.close()
+
+    def interrupt(self) -> None:
+        """End whatever another thread waits for here: its connection is cut, and what it asks fails."""
+        connection = self._connection
+        if connection is not None:
+            _shut(connection)
+
+    def look(self) -> Look:
+        """All that tells whether anything is new, in one round trip."""
+        rows = self._rows(_LOOK, ())
+        meta = next((row for row in rows if row[0] == "meta"), None)
+        if meta is None:
+            raise StoreFailure("The database holds no registry.", hint="Its keeper runs: registry sql | psql")
+        if meta[2] > schema.VERSION:
+            raise StoreFailure(
+                f"The database has schema {meta[2]}; this program knows {schema.VERSION}.",
+                hint="Use a newer version of teds-provision.",
+            )
+        return Look(
+            meta[3],
+            tuple(row[3].encode() for row in rows if row[0] == "roster"),
+            next((row[3].encode() for row in rows if row[0] == "roster" and row[2]), None),
+            {row[1].hex(): (row[2], row[3]) for row in rows if row[0] == "head"},
+            tuple(Waiting(row[3], row[1].hex(), row[4].hex(), row[2], row[5]) for row in rows if row[0] == "parcel"),
+            next(((row[2], row[3].encode()) for row in rows if row[0] == "page"), None),
+        )
+
+    def pages(self, after: Mapping[str, int]) -> Iterator[tuple[str, int, bytes]]:
+        """Pages of these stations above these numbers, ascending: station, number in the database, octets."""
+        for station, n in after.items():
+            last, more = n, True
+            while more:
+                rows = self._rows(
+                    "select n, jws from registry.page where station = %s and n > %s order by n limit %s",
+                    (bytes.fromhex(station), last, PAGES_AT_ONCE),
+                )
+                for last, jws in rows:
+                    yield station, last, jws.encode()
+                more = len(rows) == PAGES_AT_ONCE
+
+    def append(self, pages: Sequence[tuple[int, str, bytes]]) -> None:
+        """Push own pages (number, H of the one before or "", octets): one round trip, one transaction.
+
+        Whether a push that was cut came through, the same push again finds out: pages that are there are done.
+        """
+        with self._connected() as connection, connection.pipeline():
+            for n, previous, octets in pages:
+                asked = (n, bytes.fromhex(previous), octets.decode())
+                connection.execute("select registry.append(%s, %s, %s)", asked)
+
+    def post_roster(self, version: int, octets: bytes) -> None:
+        """Say which roster is the newest here."""
+        self._rows("select registry.post_roster(%s, %s)", (version, octets.decode()))
+
+    def send(self, parcel: str, to: str, octets: bytes, until: datetime) -> None:
+        """Leave a parcel for a station; the same id again changes nothing."""
+        try:
+            self._rows("select registry.send(%s, %s, %s, %s)", (parcel, bytes.fromhex(to), octets, until))
+        except _AlreadyThere:
+            return
+
+    def parcel(self, parcel: str) -> bytes | None:
+        """A parcel's octets, None where it is there no more."""
+        rows = self._rows("select document from registry.parcel where id = %s", (parcel,))
+        return bytes(rows[0][0]) if rows else None
+
+    def remove(self, parcels: Sequence[str]) -> None:
+        """Take parcels away that came here or were sent from here."""
+        self._rows("delete from registry.parcel where id = any(%s::uuid[])", (list(parcels),))
+
+    def open_doors(self) -> list[str]:
+        """What this login may do that no member should; empty where the schema was run by a superuser."""
+        return [str(row[0]) for row in self._rows(_OPEN_DOORS, ())]
+
+    def listen(self) -> None:
+        """Be told from now on of what others do; on a connection that does nothing else."""
+        self._rows(f"listen {_CHANNEL}", ())
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until somebody did something; False where nothing came in ``seconds``."""
+        with self._connected(seconds) as connection:
+            return any(True for _ in connection.notifies(timeout=seconds, stop_after=1))
+
+    def _rows(self, statement: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+        with self._connected() as connection:
+            cursor = connection.execute(statement, values)
+            return cursor.fetchall() if cursor.description is not None else []
+
+    @contextmanager
+    def _connected(self, more: float = 0.0) -> Iterator[psycopg.Connection[tuple[Any, ...]]]:
+        """The connection, for what takes at most a statement's time and ``more``; failures are of ours."""
+        require_driver()
+        ended = threading.Event()
+        try:
+            if self._connection is None or self._connection.closed:
+                self._connection = psycopg.connect(**self._told, autocommit=True)
+            with _cut_after(self._connection, self._patience + more, ended):
+                yield self._connection
+        except psycopg.Error as error:
+            if self._connection is not None and (self._connection.broken or ended.is_set()):
+                self.close()
+            raise _failure(error, late=ended.is_set()) from error
+
+
+class PostgresPost:
+    """The registry as a :class:`.post.Post`: one look at the beginning of a sync, then only what it showed to be new.
+
+    So a sync that finds nothing new is one round trip.
+    """
+
+    everybody = False
+
+    def __init__(self, registry: Registry, where: str, station: str) -> None:
+        self._registry, self._station = registry, station
+        self.where = where
+        self._seen: Look | None = None
+
+    def registry(self) -> str | None:
+        """The registry that the database is of; looks anew, so a sync asks this first."""
+        self._seen = self._registry.look()
+        return self._seen.registry
+
+    def rosters(self) -> Iterator[bytes]:
+        """What members posted."""
+        yield from self._look.rosters
+
+    def post_roster(self, version: int, hash: str, octets: bytes) -> None:
+        """Say which roster is the newest here, where the database does not know it of this station."""
+        if self._look.posted != octets:
+            self._registry.post_roster(version, octets)
+
+    def heads(self) -> Mapping[str, int]:
+        """The greatest number of a page that is there, by station."""
+        return {station: n for station, (n, _) in self._look.heads.items() if n}
+
+    def pages(self, station: str, after: int) -> Iterator[Carried]:
+        """The pages of a station above a number."""
+        look, there = self._look, self._look.heads.get(station, (0, ""))[0]
+        if station == self._station and look.newest is not None and look.newest[0] == there == after + 1:
+            yield Carried(station, *look.newest)
+        elif there > after:
+            for of, n, octets in self._registry.pages({station: after}):
+                yield Carried(of, n, octets)
+
+    def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
+        """Push a page of one's own."""
+        self._registry.append([(n, previous, octets)])
+
+    def parcels(self, to: str) -> Iterator[Parcel]:
+        """What lies there for this station."""
+        for waiting in self._look.parcels:
+            octets = self._registry.parcel(waiting.id) if waiting.to == to else None
+            if octets is not None:
+                yield Parcel(waiting.id, to, octets, waiting.expires.astimezone(UTC).isoformat(), waiting.sender)
+
+    def send(self, parcel: Parcel) -> None:
+        """Leave a parcel."""
+        if all(waiting.id != parcel.id for waiting in self._look.parcels):
+            self._registry.send(parcel.id, parcel.to, parcel.octets, datetime.fromisoformat(parcel.expires))
+
+    def drop(self, parcel: str, to: str) -> None:
+        """Take a parcel away."""
+        self._registry.remove([parcel])
+
+    def interrupt(self) -> None:
+        """Cut the connection under whatever another thread does with it."""
+        self._registry.interrupt()
+
+    def close(self) -> None:
+        """End the connection."""
+        self._registry.close()
+
+    @property
+    def _look(self) -> Look:
+        if self._seen is None:
+            self.registry()
+        assert self._seen is not None
+        return self._seen
+
+
+def where_of(url: str) -> str:
+    """A registry's URL as people are shown it: host and database."""
+    parts = urlsplit(url)
+    return f"postgresql://{parts.hostname or ''}{f':{parts.port}' if parts.port else ''}{parts.path}"
+
+
+@contextmanager
+def _cut_after(connection: psycopg.Connection[Any], seconds: float, ended: threading.Event) -> Iterator[None]:
+    """Cut the connection where the block takes longer: a server that hangs keeps TCP alive and answers nothing."""
+
+    def cut() -> None:
+        ended.set()
+        _shut(connection)
+
+    watch = threading.Timer(seconds, cut)
+    watch.daemon = True
+    watch.start()
+    try:
+        yield
+    finally:
+        watch.cancel()
+
+
+def _shut(connection: psycopg.Connection[Any]) -> None:
+    with suppress(OSError, psycopg.Error), socket.socket(fileno=os.dup(connection.pgconn.socket)) as end:
+        end.shutdown(socket.SHUT_RDWR)
+
+
+class _AlreadyThere(TedsProvisionError):
+    """A parcel of this id is there."""
+
+
+def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
+    """What a person has to know of an error of the database; its own words are made harmless."""
+    state, words = error.sqlstate, _words(error)
+    match state:
+        case "TE001":
+            return NotMember("The registry does not know this station as an open member.", hint="See: registry status")
+        case "TE002":
+            return Fork(f"The registry refuses a page: {words}", hint="See: registry status")
+        case "TE003":
+            return StoreFailure(f"The registry refuses a page: {words}", hint="Run it again: registry sync")
+        case "TE004":
+            return PolicyRefused(f"The registry takes no more parcels: {words}.", hint="They go with a later sync.")
+        case "23505":
+            return _AlreadyThere("A parcel of this id is there.")
+        case "53100" | "53200":
+            return RegistryFailure(f"The database is full: {words}", hint="Its administrator has to make room.")
+        case _ if state in _NO_SCHEMA:
+            return StoreFailure("The database holds no registry.", hint="Its keeper runs: registry sql | psql")
+        case "42501":
+            return StoreFailure(f"The database does not let a member do this: {words}", hint="Run again: registry sql")
+    if late:
+        return RegistryFailure("The registry did not answer in time.", hint="Everything else works without it.")
+    return RegistryFailure(f"The registry cannot be used: {words}", hint="Everything else works without it.")
+
+
+def _words(error: BaseException) -> str:
+    """The first line of a foreign message, which a server may have written."""
+    lines = [printable(line.strip()) for line in str(error).splitlines() if line.strip()]
+    return lines[0][:300] if lines else type(error).__name__

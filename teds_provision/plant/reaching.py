@@ -1,0 +1,66 @@
+"""Where a station's registry is, and the connection to it: a folder, or PostgreSQL."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
+
+from teds_provision.errors import NotMember, PolicyRefused
+from teds_provision.plant import postgres
+from teds_provision.plant.files import FilesPost
+from teds_provision.plant.membership import FILES
+from teds_provision.plant.post import Post
+from teds_provision.station.station import Station
+
+
+def post_of(station: Station) -> Post | None:
+    """What carries for this station, by what it joined; None where nothing is known that does. Opens no connection."""
+    record = station.plant.joined
+    if record is None or record.url is None:
+        return None
+    if record.url.startswith(FILES):
+        return FilesPost(Path(record.url.removeprefix(FILES)))
+    return database(station, record.url)
+
+
+def database(station: Station, url: str) -> postgres.PostgresPost:
+    """The registry at a URL, by the login that this station's request named (the vault opens); not connected yet.
+
+    Raises UsageFailure (the URL, the driver), NotMember (no request was ever made).
+    """
+    return postgres.PostgresPost(postgres.Registry(_told(station, url)), postgres.where_of(url), station.fingerprint)
+
+
+def listener(station: Station) -> postgres.Registry | None:
+    """A second connection that is told when somebody did something; None where a folder carries."""
+    record = station.plant.joined
+    if record is None or record.url is None or record.url.startswith(FILES):
+        return None
+    return postgres.Registry(_told(station, record.url))
+
+
+def absolute(url: str) -> str:
+    """A URL whose root certificate is found from any folder."""
+    parts = urlsplit(url)
+    words = [
+        (name, str(Path(value).absolute()) if name == "sslrootcert" and value != "system" else value)
+        for name, value in parse_qsl(parts.query, keep_blank_values=True)
+    ]
+    return urlunsplit(parts._replace(query=urlencode(words, quote_via=quote)))
+
+
+def require_registry(post: Post, registry: str) -> None:
+    """Raise PolicyRefused where a database is of another registry than the roster that is to be joined."""
+    there = post.registry()
+    if there != registry:
+        raise PolicyRefused(f"{post.where} is of another registry ({there}) than the roster ({registry}).")
+
+
+def _told(station: Station, url: str) -> dict[str, object]:
+    kept = station.plant.login()
+    if kept is None:
+        raise NotMember(
+            "This station has no login at a database yet.",
+            hint="Make one: registry request --output FILE; the database's keeper runs: registry sql --member FILE",
+        )
+    return postgres.parameters(url, station.fingerprint, kept[0])

@@ -1,0 +1,76 @@
+-- registry/1. A post office: it carries signed pages and sealed parcels and decides nothing. `registry sql` prints this, with :registry filled in,
+-- as one transaction; it may be run again at any time (after a pg_restore it must be). Run it as a superuser in a database of its own: a mere owner gets
+-- warnings, and the last revokes do not take (measured). What members may call belongs to teds_owner, who is no superuser and cannot log in.
+begin;
+set local lock_timeout = '500ms';
+revoke all on schema public from public;
+do $$ begin execute format('revoke all on database %I from public', current_database()); -- no TEMP, no CONNECT
+  if not exists (select from pg_roles where rolname = 'teds_member') then create role teds_member nologin; end if;
+  if not exists (select from pg_roles where rolname = 'teds_reader') then create role teds_reader nologin; end if;
+  if not exists (select from pg_roles where rolname = 'teds_owner') then create role teds_owner nologin; end if;
+  execute format('grant connect on database %I to teds_member, teds_reader', current_database()); end $$;
+create schema if not exists registry authorization teds_owner;
+grant execute on function pg_catalog.pg_notify(text, text) to teds_owner;
+set local role teds_owner;
+grant usage on schema registry to teds_member, teds_reader;
+create table if not exists registry.meta (one bool primary key default true check (one), version int not null, registry uuid not null);
+insert into registry.meta(version, registry) values (1, :'registry') on conflict do nothing;
+do $$ begin if (select version from registry.meta) <> 1 then raise exception 'this is schema %, not 1', (select version from registry.meta); end if; end $$;
+create table if not exists registry.member (role name primary key, station bytea not null unique check (length(station) = 32), open boolean not null default true,
+  n int not null default 0, hash bytea not null default '\x', at timestamptz);
+-- the newest roster that each member knows: nobody can take a version's place, and one that was rolled back is put back by whoever has it
+create table if not exists registry.roster (station bytea primary key references registry.member(station), version int not null check (version > 0),
+  jws text not null check (octet_length(jws) <= 1048576));
+create table if not exists registry.page (station bytea not null references registry.member(station), n int not null check (n > 0), hash bytea not null,
+  jws text not null check (octet_length(jws) between 100 and 1048576), received timestamptz not null default now(), primary key (station, n));
+create table if not exists registry.parcel (id uuid primary key, recipient bytea not null references registry.member(station), sender bytea not null,
+  document bytea not null check (octet_length(document) <= 67108864), expires timestamptz not null, received timestamptz not null default now());
+create index if not exists parcel_to on registry.parcel (recipient);
+create index if not exists parcel_from on registry.parcel (sender);
+create or replace function registry.me() returns bytea language sql stable security definer set search_path = pg_catalog, pg_temp
+  as $$ select station from registry.member where role = session_user and open $$;
+create or replace function registry.append(wanted int, previous bytea, page text) returns int language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
+declare m registry.member; h bytea := sha256(convert_to(left(page, length(page) - position('.' in reverse(page))), 'UTF8')); begin
+  if current_setting('transaction_isolation') <> 'read committed' then raise exception 'isolation' using errcode = 'TE005'; end if;
+  select * into m from registry.member where role = session_user and open for update;
+  if not found then raise exception 'not a member' using errcode = 'TE001'; end if;
+  if wanted <= m.n then
+    if exists (select from registry.page p where p.station = m.station and p.n = wanted and p.hash = h) then return m.n; end if; -- the same page again
+    raise exception 'fork: another page % of this station is here', wanted using errcode = 'TE002'; end if;
+  if wanted > m.n + 1 then raise exception 'gap: the registry has % pages of this station', m.n using errcode = 'TE003'; end if;
+  if previous is distinct from m.hash then raise exception 'fork: page % does not follow', wanted using errcode = 'TE002'; end if;
+  insert into registry.page(station, n, hash, jws) values (m.station, wanted, h, page);
+  update registry.member set n = wanted, at = now(), hash = h where role = session_user;
+  perform pg_notify('teds', encode(m.station, 'hex') || ' ' || wanted);
+  return wanted; end $$;
+create or replace function registry.post_roster(number int, document text) returns void language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
+declare who bytea := registry.me(); begin
+  if who is null then raise exception 'not a member' using errcode = 'TE001'; end if;
+  insert into registry.roster as r (station, version, jws) values (who, number, document)
+    on conflict (station) do update set version = excluded.version, jws = excluded.jws;
+  perform pg_notify('teds', 'roster ' || number); end $$;
+create or replace function registry.send(parcel uuid, receiver bytea, content bytea, until timestamptz) returns void language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
+declare who bytea := registry.me(); waiting bigint; begin
+  if who is null then raise exception 'not a member' using errcode = 'TE001'; end if;
+  if until > now() + interval '31 days' then raise exception 'too long' using errcode = 'TE004'; end if;
+  delete from registry.parcel where expires < now() and sender = who;
+  select coalesce(sum(octet_length(document)), 0) into waiting from registry.parcel where sender = who;
+  if waiting + octet_length(content) > 268435456 then raise exception 'too much waits' using errcode = 'TE004'; end if;
+  insert into registry.parcel(id, recipient, sender, document, expires) values (parcel, receiver, who, content, until);
+  perform pg_notify('teds', 'parcel ' || encode(receiver, 'hex')); end $$;
+alter table registry.parcel enable row level security;
+drop policy if exists mine on registry.parcel;
+drop policy if exists gone on registry.parcel;
+create policy mine on registry.parcel for select using ((select registry.me()) in (recipient, sender));
+create policy gone on registry.parcel for delete using ((select registry.me()) in (recipient, sender));
+revoke all on all tables in schema registry from public, teds_member, teds_reader;
+revoke all on all functions in schema registry from public;
+grant execute on function registry.append(int, bytea, text), registry.post_roster(int, text), registry.send(uuid, bytea, bytea, timestamptz), registry.me() to teds_member;
+grant select on registry.page, registry.member, registry.roster, registry.meta, registry.parcel to teds_member;
+grant delete on registry.parcel to teds_member;
+grant select on registry.page, registry.member, registry.roster, registry.meta to teds_reader;
+reset role;
+-- what every login may do by default and a thief would like
+revoke execute on function pg_catalog.lo_create(oid), pg_catalog.lo_creat(integer), pg_catalog.lo_from_bytea(oid, bytea), pg_catalog.lowrite(integer, bytea), pg_catalog.lo_put(oid, bigint, bytea), pg_catalog.lo_truncate(integer, integer), pg_catalog.lo_truncate64(integer, bigint) from public;
+revoke execute on function pg_catalog.pg_advisory_lock(bigint), pg_catalog.pg_advisory_lock(integer,integer), pg_catalog.pg_notify(text, text) from public;
+commit;

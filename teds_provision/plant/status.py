@@ -1,0 +1,168 @@
+"""What a person sees of the plant: where everybody stands, what is to be decided, what was said (section 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any, Final
+
+from teds_provision.plant.folding import AT_ONCE, heads_digest, now, views
+from teds_provision.protocol.handover.strict_json import load_exact
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
+from teds_provision.station.station import Station
+from teds_provision.store.tables.plant import Alarm, Chain, PlantRecord
+
+SILENT: Final = timedelta(days=7)
+"""A station whose newest page that counts is older than this is silent."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a station stands: its newest page that counts, since when (seconds), and in a word."""
+
+    name: str
+    fingerprint: str
+    roles: tuple[str, ...]
+    n: int
+    age: int | None
+    state: str
+
+
+@dataclass(frozen=True)
+class Status:
+    """The plant at one moment; ``standings`` of members, then of removed ones."""
+
+    record: PlantRecord
+    roster: Roster
+    standings: tuple[Standing, ...]
+    unsent: int
+    conflicts: int
+    alarms: tuple[Alarm, ...]
+    heads: tuple[str, int]
+    at: datetime
+
+    @property
+    def expired(self) -> bool:
+        """Whether the roster's time is over."""
+        return self.at >= self.roster.expires
+
+    @property
+    def expires_soon(self) -> bool:
+        """Whether its end is near enough to be said."""
+        return self.at >= self.roster.expires - WARN_BEFORE
+
+    @property
+    def exit_code(self) -> int:
+        """0, 4 with alarms that nobody has seen, 6 where the roster has expired or this station was removed."""
+        removed = not any(one.state == "here" for one in self.standings)
+        return 6 if self.expired or removed else 4 if any(not one.seen for one in self.alarms) else 0
+
+
+def moment(roster: Roster) -> datetime:
+    """Now, and never before the roster was made: a clock that was put back changes nothing."""
+    return max(now(), roster.created)
+
+
+def status(station: Station, record: PlantRecord, roster: Roster) -> Status:
+    """Look at the store alone; no connection is opened."""
+    at = moment(roster)
+    chains = station.plant.tables.chains()
+    return Status(
+        record,
+        roster,
+        tuple(_standing(station, one, chains.get(one.fingerprint), at) for one in roster.by_key.values()),
+        station.plant.tables.unsent(),
+        len({uuid for uuid, _, _ in station.plant.tables.conflicts()}),
+        tuple(station.plant.tables.alarms()),
+        heads_digest(station),
+        at,
+    )
+
+
+def _standing(station: Station, one: Any, chain: Chain | None, at: datetime) -> Standing:
+    n = chain.counted[0] if chain is not None else 0
+    age = None
+    if chain is not None and n:
+        created = next((c for number, h, c, _ in station.plant.tables.page_times(chain.chain, 50)
+                        if (number, h) == chain.counted and c), None)  # fmt: skip
+        age = max(0, int((at - datetime.fromisoformat(created)).total_seconds())) if created else None
+    if not isinstance(one, Member):
+        state = one.why
+    elif one.fingerprint == station.fingerprint:
+        state = "here"
+    elif chain is not None and chain.waits is not None:
+        state = "newer version"
+    elif any(
+        alarm.code == "two-histories" and alarm.about == one.fingerprint for alarm in station.plant.tables.alarms()
+    ):
+        state = "two histories"
+    else:
+        state = "nothing said" if not n else "silent" if age is None or age > SILENT.total_seconds() else "heard"
+    roles = tuple(role for role in ("keeper", "line", "sign", "base", "audit") if role in one.roles)
+    return Standing(one.name, one.fingerprint, roles, n, age, state)
+
+
+@dataclass(frozen=True)
+class Said:
+    """An event as a station said it, on page ``n``; ``counts``: whether the page does."""
+
+    station: str
+    n: int
+    counts: bool
+    event: dict[str, Any]
+
+
+def log(
+    station: Station, *, uuid: bytes | None = None, of: str | None = None, since: str | None = None
+) -> Iterator[Said]:
+    """What stations said, chain by chain in the order of their pages: verified when the page came in."""
+    for one, chain in sorted(station.plant.tables.chains().items()):
+        if of is not None and one != of:
+            continue
+        counted = chain.counted
+        for page in station.plant.tables.each_page(chain.chain):
+            if since is not None and page.created < since:
+                continue
+            for value in load_exact(page.content, "A page").get("events", ()):
+                read = event.read(value)
+                if isinstance(read, event.Event) and uuid in (None, read.uuid):
+                    yield Said(one, page.n, page.n <= counted[0], dict(read.members))
+
+
+def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator[dict[str, Any]]:
+    """What the plant says of every node of which anybody claims anything, by UUID, a page at a time.
+
+    ``text`` is the beginning of a UUID, or a part of the name.
+    """
+    after, wanted = b"", (text or "").lower()
+    while uuids := station.plant.tables.claimed_nodes(after, AT_ONCE):
+        after = uuids[-1]
+        for uuid, seen in views(station, roster, uuids).items():
+            name = seen.name or ""
+            if wanted and not uuid.hex().startswith(wanted) and wanted not in name.lower():
+                continue
+            holders = {} if seen.holder is None else seen.holder[1]
+            newest = max(((w[0], roster.name_of(one), w[2]) for one, w in seen.written.items()), default=None)
+            yield {
+                "uuid": uuid.hex(),
+                "name": seen.name,
+                "says": {
+                    "epoch": seen.holder[0] if seen.holder is not None else None,
+                    "holders": {key: [roster.name_of(one) for one in who] for key, who in holders.items()},
+                    "fingerprint": seen.pin,
+                    "pinned_by": {roster.name_of(one): pin for one, pin in seen.pins.items()},
+                    "sequence": newest[0] if newest is not None else None,
+                    "written_by": newest[1] if newest is not None else None,
+                    "profile": newest[2] if newest is not None else None,
+                    "revoked": [roster.name_of(one.said.sender) for one in seen.bans],
+                },
+                "conflicts": [{"name": conflict, "why": why} for conflict, why in seen.conflicts.items()],
+            }
+
+
+def page_list(station: Station, of: str, most: int = 20) -> list[tuple[int, str, str]]:
+    """Number, H and time of the newest pages of a station, newest first: to choose a last one from."""
+    chain = station.plant.tables.chain(of)
+    return [(n, hash, created) for n, hash, created, _ in station.plant.tables.page_times(chain.chain, most)]

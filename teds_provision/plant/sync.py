@@ -1,0 +1,426 @@
+"""``registry sync``: what this station says goes out, what others say comes in (contract/plant.md section 6).
+
+Every step can be cut anywhere; the same command carries on. Nothing here needs the other side to be honest: rosters
+count by the CA's signature, pages by their station's, and this station's own chain is looked at before anything is
+added to it, so that a copy of this home, or one that was put back, finds itself out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from teds_provision.errors import NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.plant import leaving, parcels
+from teds_provision.plant.folding import (
+    EVENTS_AT_ONCE,
+    alarm,
+    judge,
+    now,
+    octets_of,
+    require_roster,
+    take_pages,
+    take_rosters,
+    views,
+)
+from teds_provision.plant.post import Carried, Post
+from teds_provision.protocol.handover.strict_json import load_exact
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.document import NewerFormat, hash_of
+from teds_provision.protocol.plant.fold import View
+from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Draft, Page, open_page, seal_page
+from teds_provision.protocol.plant.roster import Roster
+from teds_provision.station.plant import new_home
+from teds_provision.station.station import Station
+from teds_provision.store import StoreLock, utc_now
+from teds_provision.store.tables.plant import Chain
+
+LOCK_FILE: Final = "registry.lock"
+_ROOM: Final = 20_000
+"""Octets of a page that are kept for its heads and its other members."""
+
+
+class NotMember(PolicyRefused):
+    """A station does not belong to the registry (any more)."""
+
+    code = "not-member"
+
+
+class Fork(NotAuthentic):
+    """Pages under this station's key that it did not write: a disk image was put back, or a copy of it is at work."""
+
+    code = "fork"
+
+
+@dataclass
+class Synced:
+    """What a sync did: pages out and in, the sentences that a person should read, stations that were behind."""
+
+    pushed: int = 0
+    fetched: int = 0
+    judged: int = 0
+    parcels_in: int = 0
+    parcels_out: int = 0
+    waiting: int = 0
+    """Parcels that came and that a person has to take in (``import-keys --received``)."""
+    told: list[str] = field(default_factory=list)
+    rosters: list[int] = field(default_factory=list)
+
+
+@contextmanager
+def alone(station: Station) -> Iterator[None]:
+    """One sync at a time in a home: a second waits 10 s, then StoreLocked."""
+    lock = StoreLock(station.home, command="registry sync", notice=station.notice, file=LOCK_FILE)
+    with lock:
+        yield
+
+
+def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
+    """Bring this station and what carries to the same state, as far as signatures go.
+
+    ``connected``: it is what the station joined by; how far that came is remembered. Raises LinkFailure, NotMember,
+    Fork, PolicyRefused.
+    """
+    station.unlock()
+    with alone(station):
+        done = Synced()
+        done.rosters = [one.version for one, how, _ in _rosters(station, post, done) if how.startswith("taken")]
+        roster = require_roster(station)
+        if roster.member(station.fingerprint) is None:
+            judge(station)
+            raise NotMember(
+                f"This station was removed from {roster.name} (roster {roster.version}).",
+                hint="A removed key never comes back: make a new station (init) and have it added.",
+            )
+        _own_head(station, post, roster, done, connected=connected)
+        while close_page(station, roster) is not None:
+            pass
+        _push(station, post, roster, done, connected=connected)
+        _fetch(station, post, roster, done)
+        done.judged = judge(station)
+        hearsay(station, roster, done)
+        _parcels(station, post, roster, done)
+        if connected:
+            with station.transaction():
+                joined = station.plant.joined
+                assert joined is not None
+                station.plant.tables.put_plant(replace(joined, synced=utc_now()))
+        return done
+
+
+def _rosters(station: Station, post: Post, done: Synced) -> list[tuple[Roster, str, str]]:
+    """Take the best roster that lies there, and post one's own."""
+    joined = station.plant.joined
+    if joined is not None and post.registry() not in (None, joined.registry):
+        raise PolicyRefused(
+            f"{post.where} is of another registry ({post.registry()}).", hint="Give the one that this station joined."
+        )
+    told = take_rosters(station, post.rosters())
+    for roster, how, why in told:
+        if how != "taken":
+            done.told.append(f"roster {roster.version}: {how}: {why}")
+    held = station.plant.tables.held_roster()
+    if held is not None:
+        post.post_roster(held.version, held.hash, held.octets)
+    return [(one, str(how), why) for one, how, why in told]
+
+
+def _parcels(station: Station, post: Post, roster: Roster, done: Synced) -> None:
+    """Take in and send keys, once the pages are here that say whose they are."""
+
+    def seen(uuids: Sequence[bytes]) -> Mapping[bytes, View]:
+        return views(station, roster, uuids)
+
+    at = max(now(), roster.created)
+    leaving.review(station, roster, at)
+    came = parcels.take_in(station, post, seen, at)
+    done.parcels_in, done.waiting = came.taken, came.waiting
+    done.parcels_out = parcels.send_out(station, post, seen, at)
+
+
+# -- one's own chain ---------------------------------------------------------------------------------------------------
+
+
+def own_chain(station: Station) -> Chain:
+    """The chain of this station."""
+    return station.plant.tables.chain(station.fingerprint)
+
+
+def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, connected: bool) -> None:
+    """Look at what lies there under this station's key before anything is added to it; the order is the contract's."""
+    chain, joined = own_chain(station), station.plant.joined
+    assert joined is not None
+    restored = station.plant.restored
+    known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain)}
+    above = max(0, joined.acknowledged - 1) if connected and not restored else 0
+    found, junk = read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
+    if junk and not post.everybody:
+        alarm(station, "junk", station.fingerprint, junk[0], f"{post.where} has pages that our key did not sign")
+        raise NotAuthentic(
+            f"{post.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
+            hint=f"Take them off there: registry sql --mend {roster.name_of(station.fingerprint)} {junk[0]}",
+        )
+    if junk:
+        done.told.append(f"{post.where}: {len(junk)} files in this station's place that it did not sign; passed over")
+    new = [page for page in found if (page.n, page.hash) not in known]
+    if not new:
+        station.plant.tables.end_alarms("fork", station.fingerprint)
+    elif restored and _follows(chain, new):
+        adopt(station, roster, new)
+        done.told.append(f"{len(new)} pages that this station wrote before its backup are back")
+    else:
+        homes = ", ".join(sorted({page.home or "unknown" for page in new}))
+        first = min(page.n for page in new)
+        alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
+        raise Fork(
+            f"{post.where} has pages under this station's key that are not of this home, from number {first} on"
+            f" (home {homes}; here {station.plant.home}): a disk image was put back, or a copy of it is at work.",
+            hint="Look who has a copy; in doubt remove this station. Then: teds-provision registry resume",
+        )
+    if restored:
+        _after_restore(station, roster, {page.n for page in found})
+    there = max((page.n for page in found), default=0)
+    if connected and there < joined.acknowledged and not post.everybody:
+        why = f"page {joined.acknowledged} was there, and now {there} is the last"
+        alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why)
+        done.told.append(f"{post.where} was rolled back: {why}; it is filled again")
+
+
+def _follows(chain: Chain, new: Sequence[Page]) -> bool:
+    """Whether pages go on, without a gap, from the newest page that counts here."""
+    place = chain.counted
+    for page in sorted(new, key=lambda one: one.n):
+        if (page.n - 1, page.previous) != place:
+            return False
+        place = page.n, page.hash
+    return True
+
+
+def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
+    """Take back pages that this station wrote: their events wait no more, what they say is known again."""
+    with station.transaction():
+        take_pages(station, roster, sorted(pages, key=lambda one: one.n))
+        ids = [one.get("id") for page in pages for one in page.events if isinstance(one, dict)]
+        station.plant.tables.drop_events([one for one in ids if isinstance(one, str)])
+        for page in pages:
+            _know_again(station, page)
+        station.audit("registry", None, "adopted", pages=[page.n for page in pages])
+
+
+def _know_again(station: Station, page: Page) -> None:
+    """Epochs and sequences that this station reached before it was put back: none of them is given out twice."""
+    reached: dict[bytes, tuple[int, int]] = {}
+    for one in map(event.read, page.events):
+        if isinstance(one, event.Event) and one.act in ("agreed", "signed", "written") and one.uuid is not None:
+            epoch, sequence = reached.get(one.uuid, (0, 0))
+            reached[one.uuid] = max(epoch, one.members["epoch"]), max(sequence, one.members.get("sequence", 0))
+    for uuid, (epoch, sequence) in reached.items():
+        node = station.nodes.get(uuid)
+        if node is not None:
+            station.nodes.remember(uuid, epoch=max(node.epoch, epoch), sequence=max(node.sequence, sequence))
+
+
+def _after_restore(station: Station, roster: Roster, there: set[int]) -> None:
+    """A home that a backup rebuilt goes on only when nobody has seen pages of it that are neither here nor there."""
+    newest = max({own_chain(station).counted[0]} | there)
+    for who, about, n, _ in station.plant.tables.heads():
+        if about == station.fingerprint and n > newest and roster.member(who) is not None:
+            raise PolicyRefused(
+                f"This home came back from a backup, and {roster.name_of(who)} has seen page {n} of it; {newest} is the"
+                " last one here.",
+                hint=f"Bring them: registry sync --files DIR that {roster.name_of(who)} filled; or registry resume",
+            )
+    station.plant.end_restored()
+
+
+def resume(station: Station, post: Post) -> int:
+    """Go on after a fork, by a person's word: the pages that lie there are adopted, one's own unsent events stay.
+
+    A page of this home whose place another one took there is told again with what it said; returns how many were
+    adopted.
+    """
+    station.unlock()
+    with alone(station):
+        roster = require_roster(station)
+        chain = own_chain(station)
+        found, _ = read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)
+        known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain)}
+        new = [page for page in found if (page.n, page.hash) not in known]
+        with station.transaction():
+            if new:
+                newest = max(new, key=lambda one: (one.n, one.hash))
+                tables = station.plant.tables
+                theirs = {(page.n, page.hash) for page in found}
+                lost = [place for place in _counted(station, chain) if place not in theirs and place[0] >= new[0].n]
+                tables.put_chain(replace(chain, accepted=(newest.n, newest.hash)))
+                adopt(station, roster, new)
+                _tell_again(station, chain, lost, new)
+            station.plant.tables.end_alarms("fork", station.fingerprint)
+            station.plant.end_restored()
+            joined = station.plant.joined
+            assert joined is not None
+            station.plant.tables.put_plant(replace(joined, acknowledged=0))
+            station.audit("registry", None, "resumed", adopted=len(new))
+        new_home(station.home)
+    return len(new)
+
+
+def _counted(station: Station, chain: Chain) -> list[tuple[int, str]]:
+    return [(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain) if n <= chain.counted[0]]
+
+
+def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:
+    adopted = {one.get("id") for page in new for one in page.events if isinstance(one, dict)}
+    for n, hash in lost:
+        row = station.plant.tables.page(chain.chain, n, hash)
+        for one in load_exact(row.content, "A page")["events"] if row is not None else ():
+            if one["id"] not in adopted:
+                station.plant.say(one)
+
+
+def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page | None:
+    """Put what waits into the next page, in one transaction; None where nothing does (unless ``empty``)."""
+    tables = station.plant.tables
+    with station.transaction():
+        chain = own_chain(station)
+        waiting = tables.outbox(MOST_EVENTS)
+        if (not waiting and not empty) or station.plant.restored:
+            return None
+        events: list[tuple[str, dict[str, object]]] = []
+        room = MOST_PAYLOAD - _ROOM
+        for _, id, text in waiting:
+            room -= len(text.encode()) + 1
+            if room < 0 and events:
+                break
+            events.append((id, load_exact(text.encode(), "An event")))
+        n, previous = chain.counted
+        entry = station.audit_log.newest()
+        draft = Draft(roster.registry, n + 1, previous, station.plant.home, now(), _fresh_heads(station, chain), entry)
+        octets = seal_page(draft, [one for _, one in events], station.vault.identity())
+        page = open_page(octets, roster.registry, lambda kid: station.point)
+        take_pages(station, roster, [page])
+        tables.drop_events([id for id, _ in events])
+    return page
+
+
+def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
+    """What this station verified of others and did not say yet."""
+    said = {about: (n, hash) for who, about, n, hash in station.plant.tables.heads() if who == own.station}
+    return {
+        one: chain.counted
+        for one, chain in station.plant.tables.chains().items()
+        if one != own.station and chain.counted[0] and said.get(one) != chain.counted
+    }
+
+
+# -- out and in --------------------------------------------------------------------------------------------------------
+
+
+def read_pages(carried: Iterator[Carried], roster: Roster, station: str) -> tuple[list[Page], list[int]]:
+    """The pages that a station signed among those under its name, and the numbers of those that it did not."""
+    good: list[Page] = []
+    junk: list[int] = []
+    for one in carried:
+        try:
+            page = open_page(one.octets, roster.registry, roster.point_of)
+            if page.station != station or page.n != one.n:
+                raise NotAuthentic("It lies in the place of another page.")
+            good.append(page)
+        except NewerFormat:
+            raise
+        except TedsProvisionError:
+            junk.append(one.n)
+    return good, junk
+
+
+def _push(station: Station, post: Post, roster: Roster, done: Synced, *, connected: bool) -> None:
+    """Put there what is lacking: one's own pages, and in a folder everybody's."""
+    heads = post.heads()
+    for one, chain in station.plant.tables.chains().items():
+        own = one == station.fingerprint
+        if not own and not post.everybody:
+            continue
+        there = {hash_of(carried.octets) for carried in post.pages(one, 0)} if post.everybody else set()
+        above = 0 if post.everybody else heads.get(one, 0)
+        for n, hash, previous in station.plant.tables.page_names(chain.chain):
+            if n <= above or hash in there or (own and not post.everybody and n > chain.counted[0]):
+                continue
+            row = station.plant.tables.page(chain.chain, n, hash)
+            assert row is not None
+            post.append(one, n, previous, hash, octets_of(row))
+            done.pushed += own
+    joined, newest = station.plant.joined, own_chain(station).counted[0]
+    assert joined is not None
+    if connected and joined.acknowledged != newest:
+        station.plant.tables.put_plant(replace(joined, acknowledged=newest))
+
+
+def _fetch(station: Station, post: Post, roster: Roster, done: Synced) -> None:
+    """Take in what others say, station by station; what one of them broke holds up nobody else's."""
+    heads = post.heads()
+    for one in roster.by_key:
+        if one == station.fingerprint or one not in heads:
+            continue
+        chain = station.plant.tables.chain(one)
+        names = station.plant.tables.page_names(chain.chain)
+        known, numbers = {hash for _, hash, _ in names}, {n for n, _, _ in names} | {0}
+        batch: list[Page] = []
+        junk: list[int] = []
+        waits = None
+        for carried in post.pages(one, max(numbers)):
+            if hash_of(carried.octets) in known:
+                continue
+            try:
+                page = open_page(carried.octets, roster.registry, roster.point_of)
+                if page.station != one or page.n != carried.n:
+                    raise NotAuthentic("It lies in the place of another page.")
+            except NewerFormat as newer:
+                waits = newer.message
+                break
+            except TedsProvisionError:  # nobody's page: it ends nothing, and is asked for again
+                junk.append(carried.n)
+                continue
+            if page.n - 1 not in numbers:
+                break
+            numbers.add(page.n)
+            known.add(page.hash)
+            batch.append(page)
+            if sum(len(each.events) for each in batch) >= EVENTS_AT_ONCE:
+                take_pages(station, roster, batch)
+                done.fetched += len(batch)
+                batch = []
+        take_pages(station, roster, batch)
+        done.fetched += len(batch)
+        _tell_junk(station, roster, one, junk, post)
+        if waits is not None:
+            alarm(station, "newer-format", one, max(numbers) + 1, waits)
+        if waits != chain.waits:
+            station.plant.tables.put_chain(replace(station.plant.tables.chain(one), waits=waits))
+
+
+def _tell_junk(station: Station, roster: Roster, one: str, junk: Sequence[int], post: Post) -> None:
+    if not junk:
+        station.plant.tables.end_alarms("junk", one)
+    for n in junk[:1]:
+        alarm(station, "junk", one, n, f"{post.where}: {len(junk)} pages of {roster.name_of(one)} that it did not sign")
+
+
+def hearsay(station: Station, roster: Roster, done: Synced) -> None:
+    """Tell what members say that they saw of others and nobody showed this station; it ends nothing."""
+    chains = station.plant.tables.chains()
+    for who, about, n, hash in station.plant.tables.heads():
+        chain = chains.get(about)
+        if roster.member(who) is None or about not in roster.by_key or who == station.fingerprint:
+            continue
+        if chain is None or n > chain.counted[0]:
+            here = chain.counted[0] if chain is not None else 0
+            names = station.plant.tables.page_names(chain.chain) if chain is not None else []
+            if not any((n, hash) == (number, named) for number, named, _ in names):
+                saw = f"{roster.name_of(who)} saw page {n} of {roster.name_of(about)}"
+                done.told.append(f"{saw}; the last one here is {here}")
+        elif not any((n, hash) == (number, named) for number, named, _ in station.plant.tables.page_names(chain.chain)):
+            done.told.append(
+                f"{roster.name_of(who)} says that page {n} of {roster.name_of(about)} is another than the one here"
+            )

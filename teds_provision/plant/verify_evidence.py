@@ -1,0 +1,237 @@
+"""Evidence checked with nothing but files: no station, no store, no network (``evidence verify``)."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.errors import BadData, NotAuthentic, TedsProvisionError
+from teds_provision.files import read_limited
+from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.plant import evidence as codec
+from teds_provision.protocol.plant.document import ROSTER
+from teds_provision.protocol.plant.evidence import Evidence, Ready, Signatures
+from teds_provision.protocol.plant.roster import Roster, open_roster
+from teds_provision.steps.whitelist import read_whitelist
+from teds_provision.teds.codec import security
+
+_FEW: Final = 50
+"""So many are judged sooner than another process is ready."""
+_CHUNK: Final = 64
+
+
+@dataclass(frozen=True)
+class Grounds:
+    """What evidence is judged by: the owner's CA key (65 octets); who belongs; the key of each board."""
+
+    ca: bytes
+    pins: Mapping[bytes, str] | None = None
+    roster: Roster | None = None
+
+    @classmethod
+    def of(cls, ca: bytes, pins: Path | None = None, roster: Path | None = None) -> Grounds:
+        """Read ``pins``, a whitelist file, and a roster that this CA signed; raises NotFound, NotAuthentic, BadData."""
+        listed = None if pins is None else {one.uuid: one.fingerprint or "" for one in read_whitelist(pins)}
+        named = None if roster is None else open_roster(read_limited(roster, ROSTER.most, "roster"), ca)
+        return cls(ca, listed, named)
+
+    def faults(self, evidence: Evidence) -> list[str]:
+        """What is wrong with a document, a sentence each; empty for a good one."""
+        one = codec.ready(evidence)
+        return self.faults_of(one, codec.check_signatures(one))
+
+    def faults_of(self, one: Ready, signatures: Signatures) -> list[str]:
+        """As :meth:`faults`, where the signatures were checked already."""
+        evidence = one.evidence
+        found = codec.faults_of(one, signatures, self.ca)
+        if self.roster is not None:
+            found += _wrong_members(evidence, self.roster)
+        if self.pins is not None:
+            pinned = self.pins.get(evidence.uuid)
+            if not pinned:
+                found.append("its UUID is not in the list of pins")
+            elif not same_key(pinned, fingerprint(evidence.node)):
+                found.append("its key is not the one in the list of pins")
+        return found
+
+
+def _wrong_members(evidence: Evidence, roster: Roster) -> Iterator[str]:
+    """What a roster says against a document. When a lost or stolen station said it, no file can tell."""
+    station = evidence.facts.station
+    yield from _gone(roster, station, "its station")
+    if roster.by_key.get(station) is not None and not roster.roles_of(station) - {"audit"}:
+        yield "its station has no role that works on boards"
+    if evidence.verdict != codec.PASSED:
+        return
+    try:
+        shown = security.decode(evidence.teds)
+    except BadData:
+        return  # told already
+    signer = fingerprint(shown.station_key) if shown.station_key is not None else ""
+    if signer != station:
+        yield from _gone(roster, signer, "the station that signed the datasheet")
+    found = roster.by_key.get(signer)
+    if found is not None and "sign" not in found.roles and not (found.signed and found.signed[0]):
+        yield "the station that signed the datasheet has not the role sign"
+
+
+def _gone(roster: Roster, station: str, what: str) -> Iterator[str]:
+    left = roster.removed_one(station)
+    if left is not None and left.why != "retired":
+        yield f"{what} was removed: {left.why}"
+    elif left is None and roster.member(station) is None:
+        yield f"{what} is not in the roster"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What became of one file: what it says, and what is wrong with it; ``exit_code`` as the command would end."""
+
+    path: Path
+    evidence: Evidence | None = None
+    faults: tuple[str, ...] = ()
+    error: TedsProvisionError | None = None
+
+    @property
+    def good(self) -> bool:
+        """Whether everything holds, also of an attempt that failed."""
+        return self.evidence is not None and not self.faults
+
+    @property
+    def exit_code(self) -> int:
+        """0, 4 (not authentic), 3 (no such file), 8 (unreadable)."""
+        if self.error is not None:
+            return self.error.exit_code
+        return NotAuthentic.exit_code if self.faults else 0
+
+    @property
+    def word(self) -> str:
+        """One word for the totals."""
+        if self.evidence is None:
+            return "unreadable"
+        return self.evidence.verdict if self.good else "not authentic"
+
+    def to_json(self) -> dict[str, Any]:
+        """One line of the result."""
+        told: dict[str, Any] = {"file": str(self.path), "good": self.good, "faults": list(self.faults)}
+        if self.evidence is not None:
+            facts = self.evidence.facts
+            told |= {
+                "uuid": self.evidence.uuid.hex(),
+                "verdict": self.evidence.verdict,
+                "station": facts.station,
+                "job": facts.job,
+                "unit": facts.unit,
+                "attempt": facts.attempt,
+                "finished": self.evidence.finished,
+            }
+        if self.error is not None:
+            told["error"] = {"code": self.error.code, "message": self.error.message}
+        return told
+
+
+@dataclass
+class Totals:
+    """How many files came to which word; ``exit_code`` is that of the worst."""
+
+    files: int = 0
+    words: dict[str, int] = field(default_factory=dict)
+    exit_code: int = 0
+
+    def add(self, judged: Judged) -> None:
+        """Count one in."""
+        self.join(Totals(1, {judged.word: 1}, judged.exit_code))
+
+    def join(self, others: Totals) -> None:
+        """Count in what was counted elsewhere."""
+        self.files += others.files
+        for word, count in others.words.items():
+            self.words[word] = self.words.get(word, 0) + count
+        self.exit_code = max(self.exit_code, others.exit_code, key=_WORST.index)
+
+    def to_json(self) -> dict[str, Any]:
+        """The last line."""
+        return {"totals": {"files": self.files, **dict(sorted(self.words.items()))}}
+
+
+_WORST: Final = (0, 7, 3, 8, 1, 4)
+Tell = Callable[[Judged], str]
+"""The line of one file, as it is shown; called in whichever process judged it."""
+
+
+def verify_evidence(
+    grounds: Grounds, files: Sequence[str], tell: Tell, *, processes: int | None = None
+) -> Iterator[tuple[list[str], Totals]]:
+    """Judge every file, in order: what ``tell`` says of each, and their totals; a fault of one stops no other.
+
+    More than a few files are shared among ``processes`` (as many as there are cores).
+    """
+    work = _Work(grounds, tell, files)
+    workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
+    if len(files) <= _FEW or workers <= 1:
+        yield from (work.done(range(at, min(at + _CHUNK, len(files)))) for at in range(0, len(files), _CHUNK))
+        return
+    yield work.done(range(1))  # what is loaded late is there before there are more processes
+    size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
+    context = multiprocessing.get_context("fork")  # what is judged by is simply there
+    with context.Pool(workers, initializer=_begin, initargs=(work,)) as pool:
+        yield from pool.imap(_done, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
+
+
+@dataclass(frozen=True)
+class _Work:
+    grounds: Grounds
+    tell: Tell
+    files: Sequence[str]
+
+    def done(self, places: range) -> tuple[list[str], Totals]:
+        lines, totals = [], Totals()
+        for judged in judge_files(self.grounds, [Path(self.files[place]) for place in places]):
+            totals.add(judged)
+            lines.append(self.tell(judged))
+        return lines, totals
+
+
+_work: _Work | None = None
+
+
+def _begin(work: _Work) -> None:
+    global _work  # noqa: PLW0603 - set once, in a process of its own
+    _work = work
+    gc.freeze()
+
+
+def _done(places: range) -> tuple[list[str], Totals]:
+    assert _work is not None
+    return _work.done(places)
+
+
+def judge_file(grounds: Grounds, path: Path) -> Judged:
+    """Judge one file; whatever is wrong with it is in what is returned."""
+    return judge_files(grounds, [path])[0]
+
+
+def judge_files(grounds: Grounds, paths: Sequence[Path]) -> list[Judged]:
+    """Judge some files: all are read, then all signatures are checked in a row."""
+    read = [_read(path) for path in paths]
+    checked = [codec.check_signatures(one) if isinstance(one, Ready) else None for one in read]
+    found = []
+    for path, one, signatures in zip(paths, read, checked, strict=True):
+        if isinstance(one, Ready) and signatures is not None:
+            found.append(Judged(path, one.evidence, tuple(grounds.faults_of(one, signatures))))
+        elif isinstance(one, TedsProvisionError):
+            found.append(Judged(path, error=one))
+    return found
+
+
+def _read(path: Path) -> Ready | TedsProvisionError:
+    try:
+        return codec.ready(codec.read(read_limited(path, codec.MAX_OCTETS, "evidence", failure=BadData)))
+    except TedsProvisionError as error:
+        return error

@@ -1,0 +1,166 @@
+"""How a line does: first-pass yield, seconds per step, failures by code, per station (``job status``).
+
+From evidence where it is at hand; of other stations from their pages alone, which say no seconds.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any, Final
+
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.evidence import GOOD_RESULTS, PASSED, Evidence, read
+from teds_provision.protocol.plant.job import Job
+from teds_provision.station.station import Station
+
+COLUMNS: Final = ("station", "name", "uuid", "unit", "attempt", "verdict", "code", "finished", "seconds")
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One attempt at one board.
+
+    ``code`` is that of the error that ended it, None where it passed; ``steps`` are seconds, None where nobody says.
+    """
+
+    station: str
+    uuid: bytes
+    unit: int | None
+    attempt: int
+    code: str | None
+    finished: str
+    steps: dict[str, float] | None = None
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> Attempt:
+        """What evidence says of its attempt; a step that failed counts in ``code`` alone."""
+        facts = evidence.facts
+        steps = {name: milliseconds / 1000 for name, result, milliseconds in facts.steps if result in GOOD_RESULTS}
+        return cls(facts.station, evidence.uuid, facts.unit, facts.attempt, facts.failure, evidence.finished, steps)
+
+
+@dataclass
+class StationYield:
+    """One station's part of a job. ``units``: boards; ``first``: those that passed at their first attempt."""
+
+    station: str
+    name: str
+    allotment: int
+    units: int = 0
+    passed: int = 0
+    first: int = 0
+    attempts: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
+    steps: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Median and worst seconds of each step, over the attempts that passed."""
+
+    @property
+    def over(self) -> bool:
+        """Whether it took more units than the job allots to it."""
+        return self.units > self.allotment
+
+    @property
+    def first_pass(self) -> float | None:
+        """Share of the boards that passed at their first attempt, None before the first board."""
+        return round(self.first / self.units, 4) if self.units else None
+
+    def to_json(self) -> dict[str, Any]:
+        """One station of ``job status``."""
+        steps = {name: {"median": middle, "worst": worst} for name, (middle, worst) in self.steps.items()}
+        told: dict[str, Any] = {
+            "station": self.station,
+            "name": self.name,
+            "allotment": self.allotment,
+            "units": self.units,
+            "passed": self.passed,
+            "first_pass": self.first_pass,
+            "attempts": self.attempts,
+            "over": self.over,
+        }
+        return {**told, "failures": dict(self.failures.most_common()), "steps": steps}
+
+
+def attempts_of(station: Station, job: str, files: Iterable[bytes] = ()) -> list[Attempt]:
+    """Every attempt that is known of a job: own evidence, evidence of others (``files``), and the pages of others.
+
+    A file that is no evidence of this job raises BadData, or is passed over.
+    """
+    found: dict[tuple[str, bytes, int], Attempt] = {}
+    for row in station.plant.line.evidence(job=job):
+        one = Attempt.of(read(row.document))
+        found[one.station, one.uuid, one.attempt] = one
+    for octets in files:
+        evidence = read(octets)
+        if evidence.facts.job == job:
+            one = Attempt.of(evidence)
+            found[one.station, one.uuid, one.attempt] = one
+    documented = {one.station for one in found.values()}
+    said = [one for one in _of_pages(station, job) if one.station not in documented]
+    return sorted([*found.values(), *said], key=lambda one: (one.station, one.uuid, one.attempt))
+
+
+def _of_pages(station: Station, job: str) -> Iterator[Attempt]:
+    """What pages say: one event is one attempt, in their order."""
+    tables, counts = station.plant.tables, Counter[tuple[str, bytes]]()
+    for name, chain in tables.chains().items():
+        for page in tables.each_page(chain.chain):
+            for value in json.loads(page.content).get("events", []):
+                told = event.read(value)
+                if not isinstance(told, event.Event) or told.act != "evidence" or told.uuid is None:
+                    continue
+                if told.members["job"] != job:
+                    continue
+                counts[name, told.uuid] += 1
+                verdict = told.members["verdict"]
+                code = None if verdict == PASSED else verdict.partition(": ")[2] or verdict
+                yield Attempt(name, told.uuid, told.members["unit"], counts[name, told.uuid], code, told.at)
+
+
+def yields(station: Station, job: Job, attempts: Iterable[Attempt]) -> list[StationYield]:
+    """What each station of a job did, those without any attempt included."""
+    roster = station.plant.roster
+    names = {key: roster.name_of(key) if roster is not None else key[:16] for key in job.stations}
+    found = {key: StationYield(key, names[key], number) for key, number in job.stations.items()}
+    by_board: dict[tuple[str, bytes], list[Attempt]] = {}
+    for one in attempts:
+        by_board.setdefault((one.station, one.uuid), []).append(one)
+    times: dict[str, dict[str, list[float]]] = {}
+    for (key, _), tries in by_board.items():
+        name = roster.name_of(key) if roster is not None else key[:16]
+        part = found.setdefault(key, StationYield(key, name, 0))
+        tries.sort(key=lambda one: one.attempt)
+        part.units += 1
+        part.attempts += len(tries)
+        part.passed += any(one.code is None for one in tries)
+        part.first += tries[0].code is None and tries[0].attempt == 1
+        part.failures.update(one.code for one in tries if one.code is not None)
+        for one in tries:
+            for step, seconds in (one.steps or {}).items() if one.code is None else ():
+                times.setdefault(key, {}).setdefault(step, []).append(seconds)
+    for key, steps in times.items():
+        found[key].steps = {step: (round(median(all_of), 3), max(all_of)) for step, all_of in steps.items()}
+    return list(found.values())
+
+
+def to_csv(station: Station, attempts: Iterable[Attempt]) -> str:
+    """Every attempt as a line of CSV."""
+    roster = station.plant.roster
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    attempts = list(attempts)
+    steps = list(dict.fromkeys(step for one in attempts for step in one.steps or {}))
+    writer.writerow([*COLUMNS, *steps])
+    for one in attempts:
+        name = roster.name_of(one.station) if roster is not None else ""
+        name = f"'{name}" if name[:1] in ("=", "+", "-", "@") else name  # a sheet would take it for a formula
+        seconds = "" if one.steps is None else f"{sum(one.steps.values()):.3f}"
+        verdict = "passed" if one.code is None else "failed"
+        row = [one.station, name, one.uuid.hex(), one.unit or "", one.attempt, verdict, one.code or "", one.finished]
+        writer.writerow([*row, seconds, *((one.steps or {}).get(step, "") for step in steps)])
+    return out.getvalue()

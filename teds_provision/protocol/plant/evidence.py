@@ -1,0 +1,479 @@
+"""Evidence of one board and attempt: an in-toto Statement v1 in a DSSE envelope (line.md, "Evidence"). Pure.
+
+The station signs the envelope (ECDSA P-256 with SHA-256, DER, over the PAE of DSSE 1.0). The board signs too: Prove,
+over a challenge that binds subject and facts, so that who changes them afterwards needs the board again.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
+
+from teds_provision.errors import BadData
+from teds_provision.limits import check_size
+from teds_provision.protocol import datasheet
+from teds_provision.protocol.handover.strict_json import LAST_U32, Members, load_object, refuse_many
+from teds_provision.protocol.keys import (
+    POINT_OCTETS,
+    SIGNATURE_OCTETS,
+    PrivateKey,
+    fingerprint,
+    is_point,
+    node_key_message,
+    prove_message,
+    public_key,
+    verify,
+)
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.security import SecurityTeds
+
+PAYLOAD_TYPE: Final = "application/vnd.in-toto+json"
+STATEMENT_TYPE: Final = "https://in-toto.io/Statement/v1"
+PREDICATE_TYPE: Final = "urn:x-teds-provision:evidence:1"
+MAX_OCTETS: Final = 1 << 20
+"""The Security TEDS of 255 channels with all their TEDS, twice, in hex and base64, is half of it."""
+NONCE_OCTETS: Final = 16
+PASSED, FAILED = "passed", "failed"
+GOOD_RESULTS: Final = frozenset({"ok", "done", "nothing to do", "skipped"})
+"""Results of a step that ended well; any other is the code of the error that ended the attempt."""
+
+_MAX_SEPARATORS: Final = 40_000
+_MAX_STEPS: Final = 64
+_DEPTH: Final = 4
+_UUID_NAME: Final = re.compile(r"teds:([0-9a-f]{20})")
+_DIGEST: Final = re.compile(r"[0-9a-f]{64}")
+_TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
+_HEX: Final = re.compile(r"(?:[0-9a-f]{2})*")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the board signs, beside which datasheet it has: who made it, for which job, from what, step by step.
+
+    ``epoch``, ``sequence`` and ``blocks`` (channel, access code, SHA-256) are those of the Security TEDS. ``job`` and
+    ``unit`` are None outside a job, ``heads`` (first 16 digits, number of chains) where no registry was joined.
+    ``steps``: name, result, milliseconds. Times are ``2026-01-31T12:00:00Z``.
+    """
+
+    station: str
+    job: str | None
+    unit: int | None
+    attempt: int
+    profile: str | None
+    profile_sha256: str | None
+    calibration_sha256: str | None
+    epoch: int
+    sequence: int
+    blocks: tuple[tuple[int, int, str], ...]
+    steps: tuple[tuple[str, str, int], ...]
+    assurance: str
+    tool: str
+    begun: str
+    heads: tuple[str, int] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Member ``facts`` of the predicate."""
+        lists = {"blocks": [list(one) for one in self.blocks], "steps": [list(one) for one in self.steps]}
+        return {**vars(self), **lists, "heads": None if self.heads is None else list(self.heads)}
+
+    @property
+    def failure(self) -> str | None:
+        """The code of the error that ended the attempt, None where no step failed."""
+        return next((result for _, result, _ in self.steps if result not in GOOD_RESULTS), None)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What is to be proven of a board: its UUID, the Security TEDS that it shows (framed), and the facts."""
+
+    uuid: bytes
+    teds: bytes = field(repr=False)
+    facts: Facts
+
+    @property
+    def subject(self) -> list[dict[str, Any]]:
+        """Member ``subject`` of the Statement."""
+        return [{"name": f"teds:{self.uuid.hex()}", "digest": {"sha256": hashlib.sha256(self.teds).hexdigest()}}]
+
+    def challenge(self, nonce: bytes) -> bytes:
+        """The challenge (32 octets) of Prove; see :func:`challenge`."""
+        return challenge(nonce, canonical(self.facts.to_json(), self.subject))
+
+
+def canonical(facts: Mapping[str, Any], subject: object) -> bytes:
+    """RFC 8785 form of ``{facts, subject}``, which hold texts, whole numbers, lists and null alone."""
+    members = {"facts": facts, "subject": subject}
+    try:
+        return json.dumps(members, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:  # half a surrogate pair
+        raise BadData("A text of the evidence is not Unicode.") from error
+
+
+def challenge(nonce: bytes, bound: bytes) -> bytes:
+    """What the board signs by Prove: SHA-256("TEDS1 evidence" ‖ 00 ‖ nonce ‖ RFC 8785 form)."""
+    return hashlib.sha256(b"TEDS1 evidence\0" + nonce + bound).digest()
+
+
+def pae(payload: bytes) -> bytes:
+    """What a DSSE envelope of our payload type signs (DSSE 1.0, "Signature Definition")."""
+    return b"DSSEv1 %d %s %d %s" % (len(PAYLOAD_TYPE), PAYLOAD_TYPE.encode(), len(payload), payload)
+
+
+def seal(
+    key: PrivateKey,
+    certificate: bytes,
+    claim: Claim,
+    *,
+    nonce: bytes,
+    proof: bytes,
+    finished: str,
+    operator: str | None = None,
+) -> bytes:
+    """Return the envelope, signed by the station ``key`` with its ``certificate`` (field 104, 64 octets).
+
+    ``proof`` is the board's signature over the challenge of ``nonce``; both are empty for a failed attempt at a board
+    that does not answer any more.
+    """
+    shown = security.decode(claim.teds)
+    node = {"point": shown.node_key.hex(), "nonce": nonce.hex(), "proof": proof.hex(), "teds": claim.teds.hex()}
+    predicate = {
+        "facts": claim.facts.to_json(),
+        "verdict": PASSED if claim.facts.failure is None else FAILED,
+        "finished": finished,
+        **({"operator": operator} if operator is not None else {}),
+        "node": node,
+        "station": {"point": key.point.hex(), "certificate": base64.b64encode(certificate).decode()},
+    }
+    statement = {
+        "_type": STATEMENT_TYPE,
+        "subject": claim.subject,
+        "predicateType": PREDICATE_TYPE,
+        "predicate": predicate,
+    }
+    payload = json.dumps(statement, separators=(",", ":"), ensure_ascii=False).encode()
+    raw = key.sign(pae(payload))
+    der = encode_dss_signature(int.from_bytes(raw[:32], "big"), int.from_bytes(raw[32:], "big"))
+    signature = {"keyid": fingerprint(key.point), "sig": base64.b64encode(der).decode()}
+    envelope = {
+        "payload": base64.b64encode(payload).decode(),
+        "payloadType": PAYLOAD_TYPE,
+        "signatures": [signature],
+    }
+    return json.dumps(envelope, separators=(",", ":")).encode()
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A document as it was read; nothing of it is verified yet (:func:`faults`).
+
+    ``bound`` is the RFC 8785 form that the board signed. ``nonce`` and ``proof`` are empty where no board answered.
+    """
+
+    uuid: bytes
+    digest: str
+    facts: Facts
+    verdict: str
+    finished: str
+    operator: str | None
+    node: bytes
+    nonce: bytes
+    proof: bytes
+    teds: bytes = field(repr=False)
+    station: bytes
+    certificate: bytes
+    bound: bytes = field(repr=False)
+    payload: bytes = field(repr=False)
+    keyid: str
+    signature: bytes = field(repr=False)
+
+
+def read(octets: bytes) -> Evidence:
+    """Read an envelope; raises BadData for what is not of our form, whatever the octets."""
+    check_size(len(octets), MAX_OCTETS, "the evidence")
+    refuse_many(sum(octets.count(mark) for mark in (b",", b"[", b"{")), 64, "an envelope of evidence")
+    envelope = load_object(octets, "The evidence")
+    if envelope.keys() != {"payload", "payloadType", "signatures"} or envelope["payloadType"] != PAYLOAD_TYPE:
+        raise BadData(f"This is not a DSSE envelope of {PAYLOAD_TYPE}.", hint="Evidence comes from: evidence export")
+    signatures = envelope["signatures"]
+    if not isinstance(signatures, list) or len(signatures) != 1 or not isinstance(signatures[0], dict):
+        raise BadData("The envelope of the evidence has not exactly one signature.")
+    keyid, signature = signatures[0].get("keyid"), base64_of(signatures[0].get("sig"), "sig")
+    if signatures[0].keys() != {"keyid", "sig"}:
+        raise BadData("The signature of the envelope has other members than keyid and sig.")
+    payload = base64_of(envelope["payload"], "payload")
+    return _statement(payload, keyid if isinstance(keyid, str) else "", signature)
+
+
+def _statement(payload: bytes, keyid: str, signature: bytes) -> Evidence:
+    refuse_many(sum(payload.count(mark) for mark in (b",", b"[", b"{")), _MAX_SEPARATORS, "evidence")
+    statement = load_object(payload, "The statement")
+    if statement.get("_type") != STATEMENT_TYPE or statement.get("predicateType") != PREDICATE_TYPE:
+        raise BadData(f"This is no in-toto Statement v1 of {PREDICATE_TYPE}.")
+    subject = statement.get("subject")
+    uuid, digest = _subject(subject)
+    predicate = Members(statement.get("predicate"), "The predicate")
+    members = Members(predicate.get("facts"), "The facts")
+    facts = _facts(members, predicate.get("facts"))
+    node = Members(predicate.get("node"), "The node of the evidence")
+    station = Members(predicate.get("station"), "The station of the evidence")
+    nonce, proof = _hex(node, "nonce", (0, NONCE_OCTETS)), _hex(node, "proof", (0, SIGNATURE_OCTETS))
+    if bool(nonce) != bool(proof):
+        raise BadData("The evidence holds one of nonce and proof, not both.")
+    verdict = predicate.text("verdict")
+    if verdict not in (PASSED, FAILED):
+        raise BadData(f"The verdict of the evidence is neither {PASSED} nor {FAILED}.")
+    return Evidence(
+        uuid,
+        digest,
+        facts,
+        verdict,
+        _time(predicate, "finished"),
+        predicate.text_or_none("operator"),
+        _hex(node, "point", (POINT_OCTETS,)),
+        nonce,
+        proof,
+        _hex(node, "teds", None),
+        _hex(station, "point", (POINT_OCTETS,)),
+        base64_of(station.get("certificate"), "certificate"),
+        canonical(predicate.get("facts"), subject),
+        payload,
+        keyid,
+        signature,
+    )
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A document of which everything but its signatures was looked at: its Security TEDS, or why that is none."""
+
+    evidence: Evidence
+    shown: SecurityTeds | None
+    why: str
+    datasheet: bytes
+    board: bytes
+
+
+class Signatures(NamedTuple):
+    """Which signatures of a document hold; None: not asked for."""
+
+    envelope: bool
+    node_key: bool
+    datasheet: bool | None
+    board: bool | None
+
+
+def ready(evidence: Evidence) -> Ready:
+    """Look at everything that comes before the signatures."""
+    try:
+        shown = security.decode(evidence.teds)
+        signed = security.tbs(evidence.uuid, evidence.teds)
+    except BadData as error:
+        return Ready(evidence, None, error.message, b"", b"")
+    asked = prove_message(evidence.uuid, challenge(evidence.nonce, evidence.bound)) if evidence.proof else b""
+    return Ready(evidence, shown, "", signed, asked)
+
+
+def check_signatures(one: Ready) -> Signatures:
+    """Check the signatures alone: of many documents in a row each costs half of what it costs between other work."""
+    evidence, shown = one.evidence, one.shown
+    envelope = _signed_by(evidence.station, pae(evidence.payload), evidence.signature)
+    if shown is None:
+        return Signatures(envelope, False, None, None)
+    node_key = verify(shown.node_key, node_key_message(evidence.uuid, shown.node_key), shown.node_key_signature)
+    made: bool | None = None
+    if evidence.verdict == PASSED and shown.station_key is not None and shown.signature is not None:
+        made = verify(shown.station_key, one.datasheet, shown.signature)
+    board = verify(evidence.node, one.board, evidence.proof) if evidence.proof else None
+    return Signatures(envelope, node_key, made, board)
+
+
+def faults(evidence: Evidence, ca: bytes) -> list[str]:
+    """What is wrong with a document, a sentence each; empty for one that holds under the owner's ``ca`` (65 octets).
+
+    A document of an attempt that ``failed`` claims no datasheet: its Security TEDS is what the board showed, and the
+    board's proof may be absent.
+    """
+    one = ready(evidence)
+    return faults_of(one, check_signatures(one), ca)
+
+
+def faults_of(one: Ready, signatures: Signatures, ca: bytes) -> list[str]:
+    """As :func:`faults`, where the signatures were checked already."""
+    words = _wrong_words(one.evidence)
+    return [*words, *_wrong_datasheet(one, signatures, ca), *_wrong_signatures(one.evidence, signatures, ca)]
+
+
+def _wrong_words(evidence: Evidence) -> Iterator[str]:
+    if not evidence.facts.station == evidence.keyid == fingerprint(evidence.station):
+        yield "the facts name another station than the one that signed"
+    if (evidence.facts.failure is None) != (evidence.verdict == PASSED):
+        yield f"the verdict is {evidence.verdict}, the steps say otherwise"
+    if evidence.digest != hashlib.sha256(evidence.teds).hexdigest():
+        yield "the subject is not the digest of the Security TEDS that is here"
+    if evidence.verdict == PASSED and not evidence.proof:
+        yield "the board did not sign it"
+
+
+def _wrong_datasheet(one: Ready, signatures: Signatures, ca: bytes) -> Iterator[str]:
+    evidence, facts, shown = one.evidence, one.evidence.facts, one.shown
+    if shown is None:
+        yield f"its Security TEDS is not canonical: {one.why}"
+        return
+    if shown.node_key != evidence.node:
+        yield "the Security TEDS names another node key (field 101)"
+    if not signatures.node_key:
+        yield "field 102 does not sign this key for this UUID"
+    if (shown.sequence, shown.key_epoch) != (facts.sequence, facts.epoch):
+        yield "sequence or epoch of the facts are not those of the Security TEDS"
+    if blocks_of(shown) != facts.blocks:
+        yield "the blocks of the facts are not those of the Security TEDS (field 108)"
+    if evidence.verdict != PASSED:
+        return
+    if not shown.signed:
+        yield "nobody signed the datasheet"
+        return
+    if not datasheet.is_certified(ca, shown.station_key, shown.station_key_signature):
+        yield "the station that signed the datasheet is not certified by this CA (field 104)"
+    if not signatures.datasheet:
+        yield "field 100 does not verify: the datasheet was changed"
+
+
+def _wrong_signatures(evidence: Evidence, signatures: Signatures, ca: bytes) -> Iterator[str]:
+    if not datasheet.is_certified(ca, evidence.station, evidence.certificate):
+        yield "its station is not certified by this CA"
+    if not signatures.envelope:
+        yield "the station's signature does not verify: the evidence was changed"
+    if signatures.board is False:
+        yield "the board did not sign these facts (Prove)"
+
+
+def blocks_of(shown: SecurityTeds) -> tuple[tuple[int, int, str], ...]:
+    """Fields 108 as ``facts`` list them: channel, access code, SHA-256 as 64 hex digits."""
+    return tuple((channel, code, digest.hex()) for (channel, code), digest in shown.signed_blocks.items())
+
+
+def _signed_by(point: bytes, message: bytes, der: bytes) -> bool:
+    try:
+        public_key(point).verify(der, message, ec.ECDSA(hashes.SHA256()))
+    except (InvalidSignature, BadData):
+        return False
+    return True
+
+
+def _subject(subject: object) -> tuple[bytes, str]:
+    match subject:
+        case [{"name": str(name), "digest": {"sha256": str(digest), **more_digests}, **more}]:
+            found = _UUID_NAME.fullmatch(name)
+            if found and _DIGEST.fullmatch(digest) and not more_digests and not more:
+                return bytes.fromhex(found[1]), digest
+    raise BadData("The subject of the statement is not one teds:UUID with its SHA-256.")
+
+
+def _facts(members: Members, raw: dict[str, Any]) -> Facts:
+    _require_plain(raw)
+    heads = members.get("heads")
+    return Facts(
+        station=_sha256(members, "station"),
+        job=None if members.get("job") is None else members.random_id("job"),
+        unit=None if members.get("unit") is None else members.u32("unit", 1),
+        attempt=members.u32("attempt", 1),
+        profile=members.text_or_none("profile"),
+        profile_sha256=_sha256_or_none(members, "profile_sha256"),
+        calibration_sha256=_sha256_or_none(members, "calibration_sha256"),
+        epoch=members.u32("epoch"),
+        sequence=members.u32("sequence"),
+        blocks=tuple(_block(one) for one in members.list_of("blocks")),
+        steps=tuple(_step(one) for one in _short(members.list_of("steps"))),
+        assurance=members.text("assurance"),
+        tool=members.text("tool"),
+        begun=_time(members, "begun"),
+        heads=None if heads is None else _heads(heads),
+    )
+
+
+def _require_plain(value: object, depth: int = _DEPTH) -> None:
+    """Raise BadData for what RFC 8785 would have to spell: floating numbers, true and false, huge integers."""
+    if isinstance(value, dict | list) and depth:
+        for one in value.values() if isinstance(value, dict) else value:
+            _require_plain(one, depth - 1)
+    elif not (value is None or isinstance(value, str) or (type(value) is int and 0 <= value <= LAST_U32)):
+        raise BadData("The facts hold something else than texts, whole numbers, lists and null.")
+
+
+def _short(steps: list[Any]) -> list[Any]:
+    if len(steps) > _MAX_STEPS:
+        raise BadData(f"The facts name {len(steps)} steps; at most {_MAX_STEPS} are read.")
+    return steps
+
+
+def _block(one: object) -> tuple[int, int, str]:
+    match one:
+        case [int(channel), int(code), str(digest)] if channel <= 0xFFFF and code <= 0xFF and _DIGEST.fullmatch(digest):
+            return channel, code, digest
+    raise BadData("A block of the facts is not [channel, access code, SHA-256].")
+
+
+def _step(one: object) -> tuple[str, str, int]:
+    match one:
+        case [str(name), str(result), int(milliseconds)] if name.isprintable() and result.isprintable():
+            return name, result, milliseconds
+    raise BadData("A step of the facts is not [name, result, milliseconds].")
+
+
+def _heads(heads: object) -> tuple[str, int]:
+    match heads:
+        case [str(digits), int(count)] if re.fullmatch(r"[0-9a-f]{16}", digits):
+            return digits, count
+    raise BadData("The heads of the facts are not [16 digits, number of chains].")
+
+
+def _sha256(members: Members, name: str) -> str:
+    """As ``Members.sha256``, and in lower case: another spelling is another text to the board's signature."""
+    text = members.sha256(name)
+    if text != members.get(name):
+        raise BadData(f"The facts: {name} is not in lower case.")
+    return text
+
+
+def _sha256_or_none(members: Members, name: str) -> str | None:
+    return None if members.get(name) is None else _sha256(members, name)
+
+
+def _time(members: Members, name: str) -> str:
+    text = members.text(name)
+    if not _TIME.fullmatch(text):
+        raise BadData(f"The evidence: {name} is not a time like 2026-01-31T12:00:00Z.")
+    members.time(name)  # the 31st of February is none either
+    return text
+
+
+def _hex(members: Members, name: str, lengths: tuple[int, ...] | None) -> bytes:
+    text = members.get(name)
+    if not isinstance(text, str) or not _HEX.fullmatch(text) or (lengths and len(text) // 2 not in lengths):
+        raise BadData(f"The evidence: {name} is not hex of the right length.")
+    octets = bytes.fromhex(text)
+    if name == "point" and not is_point(octets):
+        raise BadData("The evidence holds a key that is no point of P-256.")
+    return octets
+
+
+def base64_of(text: object, name: str) -> bytes:
+    """Read a text of base64 that is spelled one way; raises BadData that calls it ``name``."""
+    try:
+        octets = binascii.a2b_base64(text, strict_mode=True) if isinstance(text, str) else None
+    except ValueError as error:
+        raise BadData(f"The evidence: {name} is not base64.") from error
+    if octets is None or binascii.b2a_base64(octets, newline=False).decode() != text:
+        raise BadData(f"The evidence: {name} is not base64 in its one spelling.")
+    return octets

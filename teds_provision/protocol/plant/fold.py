@@ -1,0 +1,217 @@
+"""What holds of a node when many stations speak of it: a pure function of their claims, the roster and one's own store.
+
+Nothing here asks who was first (contract/plant.md sections 2 and 3), so every station that has the same pages comes to
+the same view, in whatever order they reached it. What others say informs, and holds back what this station would do
+for the first time; it takes nothing away (rule 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.handover.revocation import Revocation
+from teds_provision.protocol.plant.claim import Claim, Key
+from teds_provision.protocol.plant.roster import Roster
+
+TWO_KEYS: Final = "two keys"
+TWO_HOLDERS: Final = "two holders"
+OTHER_PIN: Final = "other pin"
+BY_CONTACT: Final = frozenset({"tap", "bus"})
+
+
+@dataclass(frozen=True)
+class Own:
+    """What this station's own store says of the node.
+
+    ``pin`` is the key that the UUID is pinned to here, ``assurance`` how ("" for none), ``met`` whether the node itself
+    showed it here. ``holds``: it has a link key. ``holders``: who, by this store, holds or was given the node's key.
+    ``lifted``: bans (H) that a person took back here.
+    """
+
+    station: str
+    pin: str | None = None
+    assurance: str = ""
+    met: bool = False
+    holds: bool = False
+    holders: frozenset[str] = frozenset()
+    lifted: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A ban that stands in somebody's page: H, whose page, whether that page counts, what is banned and by whom."""
+
+    hash: str
+    page_of: str
+    counts: bool
+    said: Revocation
+
+
+@dataclass(frozen=True)
+class View:
+    """What the plant says of a node; stations are fingerprints.
+
+    ``pin`` is the key that all keepers who pin it name, ``pins`` whom each station pins. ``held``: which member holds
+    which key;
+    ``holder``: the highest epoch that anybody claims, and who claims which key of it. ``made``: who agreed the key
+    that it holds. ``conflicts`` by name, with a sentence. ``key_it``: whether this station may agree a key with it.
+    """
+
+    pin: str | None
+    pins: Mapping[str, str]
+    held: Mapping[str, Key]
+    made: frozenset[str]
+    holder: tuple[int, Mapping[str, tuple[str, ...]]] | None
+    written: Mapping[str, tuple[int, str, str | None]]
+    gave: frozenset[tuple[str, int, str, str, str, str]]
+    resets: frozenset[tuple[str, int]]
+    bans: tuple[Statement, ...]
+    name: str | None
+    groups: Mapping[str, bool]
+    conflicts: Mapping[str, str]
+    key_it: bool
+    left: Mapping[str, Key] = field(default_factory=dict)
+    """Removed stations that agreed the last key that they had."""
+    keeper_groups: Mapping[str, bool] = field(default_factory=dict)
+    own_groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def view(
+    roster: Roster,
+    claims: Mapping[str, Claim],
+    own: Own,
+    statements: Sequence[Statement] = (),
+    liftings: Mapping[str, Collection[str]] = {},
+) -> View:
+    """Say what holds of one node.
+
+    ``claims`` by station, of pages that count; ``liftings``: by H of a ban, who lifted it on a page that counts.
+    """
+    counted = {station: claim for station, claim in sorted(claims.items()) if roster.roles_of(station) - {"audit"}}
+    keepers = {station for station in counted if "keeper" in roster.roles_of(station)}
+    pins = {station: claim.pin[0] for station, claim in counted.items() if claim.pin is not None}
+    keepers_pins = {pins[station] for station in keepers if station in pins}
+    pin = next(iter(keepers_pins)) if len(keepers_pins) == 1 else None
+
+    # A reset counts where its proof is of the key that the node is pinned to: anybody can reset a board of his own.
+    judge = own.pin if own.pin is not None else pin
+    resets = frozenset(
+        reset for claim in counted.values() for reset in claim.resets if judge is not None and same_key(reset[0], judge)
+    )
+    reset_to = max((epoch for _, epoch in resets), default=-1)
+
+    held: dict[str, Key] = {}
+    made: set[str] = set()
+    left: dict[str, Key] = {}
+    for station, claim in counted.items():
+        key = claim.key()
+        if key is not None and roster.member(station) is None and claim.agreed is not None and claim.agreed[:2] == key:
+            left[station] = key
+        if key is None or roster.member(station) is None or key[0] <= max(claim.forgot, reset_to):
+            continue
+        if any((epoch, key_id) == key and mode == "move" for _, _, epoch, key_id, mode in claim.left()):
+            continue
+        held[station] = key
+        if claim.agreed is not None and claim.agreed[:2] == key:
+            made.add(station)
+    says: dict[str, list[str]] = {}
+    hearable = {one: key for one, key in held.items() if roster.roles_of(one) & {"line", "base", "keeper"}}
+    top = max((epoch for epoch, _ in hearable.values()), default=None)
+    for station, (epoch, key_id) in hearable.items():
+        if epoch == top:
+            says.setdefault(key_id, []).append(station)
+
+    conflicts: dict[str, str] = {}
+    named = {**{s: c.agreed[2] for s, c in counted.items() if c.agreed is not None}, **pins}
+    if own.pin is not None:
+        named[own.station] = own.pin
+    if len(keepers_pins) > 1:
+        conflicts[TWO_KEYS] = "keepers pin " + _who(roster, {s: pins[s] for s in keepers if s in pins})
+    elif pin is None and not own.met and len(_keys(named.values())) > 1:
+        conflicts[TWO_KEYS] = _who(roster, named)
+    elif pin is not None and own.pin is not None and not same_key(pin, own.pin):
+        conflicts[OTHER_PIN] = f"keepers pin {pin[:16]}, and {own.pin[:16]} is pinned here"
+    if len(says) > 1:
+        conflicts[TWO_HOLDERS] = f"epoch {top}: " + "; ".join(
+            f"{', '.join(roster.name_of(one) for one in stations)} hold {key_id}" for key_id, stations in says.items()
+        )
+    own_word = own.met or own.holds or (own.pin is not None and own.assurance != "registry")
+
+    return View(
+        pin=pin,
+        pins=pins,
+        held=held,
+        made=frozenset(made),
+        holder=None if top is None else (top, {key_id: tuple(stations) for key_id, stations in says.items()}),
+        written={s: (c.written[0], c.written[1], c.written[3]) for s, c in counted.items() if c.written is not None},
+        gave=frozenset(
+            (station, epoch, key_id, peer, mode, bundle)
+            for station, claim in counted.items()
+            for bundle, peer, epoch, key_id, mode in claim.left()
+        ),
+        resets=resets,
+        bans=tuple(one for one in sorted(statements, key=lambda one: (one.said.created, one.hash))
+                   if bans(roster, one, own, liftings)),
+        name=_name(roster, counted),
+        groups=_groups(roster, counted),
+        conflicts=conflicts,
+        key_it=TWO_KEYS not in conflicts or own_word,
+        left=left,
+        keeper_groups=_groups(roster, {one: counted[one] for one in keepers}),
+        own_groups={
+            station: tuple(sorted(group for group, (member, _) in claim.groups.items() if member))
+            for station, claim in counted.items()
+            if claim.groups
+        },
+    )  # fmt: skip
+
+
+def bans(roster: Roster, one: Statement, own: Own, liftings: Mapping[str, Collection[str]]) -> bool:
+    """Whether a statement bans its node here.
+
+    Its signer is a keeper, or by one's own store holds or was given the node's key; a removed one's word counts from
+    its own pages alone, up to ``last``. Until a keeper lifts it, its signer, or here a person.
+    """
+    signer = one.said.sender
+    if roster.member(signer) is None and (one.page_of != signer or not one.counts):
+        return False
+    if "keeper" not in roster.roles_of(signer) and signer != own.station and signer not in own.holders:
+        return False
+    if own.pin is not None and one.said.fingerprint is not None and not same_key(own.pin, one.said.fingerprint):
+        return False
+    lifted = any(lifter == signer or "keeper" in roster.roles_of(lifter) for lifter in liftings.get(one.hash, ()))
+    return not lifted and one.hash not in own.lifted
+
+
+def _keys(named: Collection[str]) -> list[str]:
+    """The different keys among fingerprints, some of which may be their first digits alone."""
+    found: list[str] = []
+    for one in sorted(named, key=lambda digits: (-len(digits), digits)):
+        if not any(same_key(one, other) for other in found):
+            found.append(one)
+    return found
+
+
+def _who(roster: Roster, named: Mapping[str, str]) -> str:
+    return ", ".join(f"{key[:16]} ({roster.name_of(station)})" for station, key in sorted(named.items()))
+
+
+def _weight(roster: Roster, station: str, at: str) -> tuple[bool, str, str]:
+    """Between stations a keeper's word goes before others', then the greater time, then the higher fingerprint."""
+    return "keeper" in roster.roles_of(station), at, station
+
+
+def _name(roster: Roster, claims: Mapping[str, Claim]) -> str | None:
+    names = [(_weight(roster, one, claim.name[1]), claim.name[0]) for one, claim in claims.items() if claim.name]
+    return max(names)[1] if names else None
+
+
+def _groups(roster: Roster, claims: Mapping[str, Claim]) -> dict[str, bool]:
+    said: dict[str, list[tuple[tuple[bool, str, str], bool]]] = {}
+    for station, claim in claims.items():
+        for group, (member, at) in claim.groups.items():
+            said.setdefault(group, []).append((_weight(roster, station, at), member))
+    return {group: max(words)[1] for group, words in sorted(said.items())}

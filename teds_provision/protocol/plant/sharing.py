@@ -1,0 +1,115 @@
+"""Whose keys go to whom by themselves, and which come in without a question (contract/plant.md section 4). Pure.
+
+A copy makes no new key, and only who made a key shares it: so nothing goes round in circles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Final
+
+from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.plant.fold import View
+from teds_provision.protocol.plant.roster import Roster, Share
+
+SILENT: Final = timedelta(days=7)
+"""Who made no page for so long is not waited for: another holder shares in its place."""
+
+
+def receivers(roster: Roster, sender: str, share: Share) -> tuple[str, ...]:
+    """Who gets copies by a share: its stations that are members with ``base``, but the sender."""
+    return tuple(one for one in share.to if one != sender and "base" in roster.roles_of(one) and roster.member(one))
+
+
+def shares_any(shares: Iterable[Share], view: View, sender: str) -> bool:
+    """Whether a node is one of any share's: all, a profile that the sender wrote on it, a group.
+
+    A group is the sender's own, or a keeper's: else any member could put a node where its key is shared.
+    """
+    profile = view.written[sender][2] if sender in view.written else None
+    groups = {*view.own_groups.get(sender, ()), *(group for group, member in view.keeper_groups.items() if member)}
+    return any(
+        kind == "all" or (kind == "profile" and name == profile) or (kind == "group" and name in groups)
+        for kind, name in (share.what for share in shares)
+    )
+
+
+def gave_away(view: View, station: str) -> bool:
+    """Whether a station gave the node away by a move that stands."""
+    return any(giver == station and mode == "move" for giver, _, _, _, mode, _ in view.gave)
+
+
+def sharer(roster: Roster, view: View, key: tuple[int, str], silent: AbstractSet[str]) -> str | None:
+    """Who has to share a key (epoch, key id): who made it, else the holder with the lowest fingerprint; None: unknown.
+
+    ``silent`` are stations of which no page came for :data:`SILENT`. A removed one shares nothing.
+    """
+    holders = sorted(station for station, held in view.held.items() if held == key)
+    makers = [station for station in holders if station in view.made and station not in silent]
+    if makers:
+        return makers[0]
+    gone = key in view.left.values() or any(station in view.made for station in holders)
+    return next((station for station in holders if station not in silent), None) if gone else None
+
+
+def silent(created: Mapping[str, datetime | None], now: datetime) -> set[str]:
+    """Stations whose newest page that counts was made more than :data:`SILENT` before now."""
+    return {station for station, at in created.items() if at is None or now - at > SILENT}
+
+
+@dataclass(frozen=True)
+class Offer:
+    """One node of a bundle that came: its key's epoch and id, and the fingerprint of the node's own key."""
+
+    uuid: bytes
+    epoch: int
+    key_id: str
+    node: str
+
+
+LATER: Final = "the sender's pages are not here yet"
+
+
+def why_not(
+    roster: Roster, view: View, offer: Offer, *, sender: str, receiver: str, pin: str | None, quiet: AbstractSet[str]
+) -> str:
+    """Why a copy of one node is not taken in by itself, "" where it is.
+
+    ``pin``: the node's key by one's own store; ``quiet``: the silent stations. :data:`LATER` is looked at once more.
+    """
+    fits = [share for share in roster.share if receiver in receivers(roster, sender, share)]
+    if not fits:
+        return "no share of the roster sends it here"
+    if view.conflicts:
+        return "; ".join(f"{name}: {why}" for name, why in sorted(view.conflicts.items()))
+    named = pin or view.pin
+    if named is not None and not same_key(named, offer.node):
+        return "it comes with another node key than the one that it is pinned to"
+    key = (offer.epoch, offer.key_id)
+    if view.held.get(sender) != key:
+        return LATER
+    if sharer(roster, view, key, quiet) != sender:
+        return f"{roster.name_of(sender)} did not make this key, and others of its holders can be asked"
+    if named is None and not _claims(view, sender, offer.node):
+        return LATER
+    if not shares_any(fits, view, sender):
+        return "no share of the roster is of this node"
+    return ""
+
+
+def _claims(view: View, sender: str, node: str) -> bool:
+    """Whether the sender names this node key, else somebody: as there is no conflict, nobody names another one."""
+    named = [view.pins[sender]] if sender in view.pins else list(view.pins.values())
+    return any(same_key(one, node) for one in named)
+
+
+def forgets(roster: Roster, me: str, fitting: Iterable[Share], taken: Collection[str]) -> bool:
+    """Whether a key may be deleted here: shares that say so, none that names me, and all their receivers receipted."""
+    shares = list(fitting)
+    if not any(share.forget for share in shares) or any(me in share.to for share in shares):
+        return False
+    wanted = {one for share in shares if share.forget for one in receivers(roster, me, share)}
+    return bool(wanted) and wanted <= set(taken)

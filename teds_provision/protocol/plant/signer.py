@@ -1,0 +1,72 @@
+"""Whose signature under a datasheet counts (contract/plant.md section 1, "verify").
+
+Being certified by the owner's CA is not enough in a plant: the roster says who may sign, and for who may not any more
+the pages say what was signed before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Literal, NamedTuple
+
+from teds_provision.protocol.plant.roster import Member, Place, Removed, Roster
+
+
+class Word(NamedTuple):
+    """Who said of a datasheet's digest, on page ``n`` of its chain, that it signed it, or (``vouched``) vouches."""
+
+    station: str
+    n: int
+    vouched: bool
+
+
+class Signing(NamedTuple):
+    """Passed, failed, or unproven for want of pages; and why."""
+
+    result: Literal["passed", "failed", "unproven"]
+    why: str = ""
+
+
+def limit_of(one: Member | Removed) -> Place | None:
+    """Up to which page the ``signed`` events of somebody without ``sign`` count; None: it never had it."""
+    if isinstance(one, Member):
+        return one.signed
+    if "sign" in one.roles:
+        return one.last
+    return None if one.signed is None else min(one.signed, one.last, key=lambda place: place[0])
+
+
+def signing(
+    roster: Roster,
+    signer: str,
+    words: Collection[Word],
+    *,
+    counted: Mapping[str, int],
+    keepers_behind: bool,
+    added: bool,
+) -> Signing:
+    """Judge the signer (fingerprint) of one datasheet.
+
+    ``words`` are those about its digest, of pages that count; ``counted``: how many pages of each chain count here;
+    ``keepers_behind``: a member has seen pages of a keeper that are not here; ``added``: a person trusts the signer's
+    key here.
+    """
+    one = roster.by_key.get(signer)
+    own = [word.n for word in words if word.station == signer and not word.vouched]
+    if isinstance(one, Member) and "sign" in one.roles:
+        return Signing("passed", "" if own else "in no page yet")
+    if any(word.vouched and "keeper" in roster.roles_of(word.station) for word in words):
+        return Signing("passed", "vouched for by a keeper")
+    if one is None:
+        if added:
+            return Signing("passed", "trusted here")
+        return Signing("failed", f"station {signer[:16]} is not in the roster")
+    limit = limit_of(one)
+    if limit is not None and any(n <= limit[0] for n in own):
+        return Signing("passed", f"signed by {one.name} while it had the role")
+    if limit is not None and counted.get(signer, 0) < limit[0]:
+        return Signing("unproven", f"pages of {one.name} are missing here")
+    if isinstance(one, Removed) and keepers_behind:
+        return Signing("unproven", "pages of a keeper are missing here")
+    why = "never had the role sign" if limit is None else "this datasheet is not in its pages of that time"
+    return Signing("failed", f"{one.name} {'was removed' if isinstance(one, Removed) else 'may not sign'}: {why}")

@@ -1,0 +1,48 @@
+"""What the profile of a node says of its channels beside the datasheet: the unit that people see, frame, deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.station.station import Station
+from teds_provision.teds.profile import ChannelProfile, default_folders, find_profile, load_profile
+
+
+def shown_units(station: Station, uuid: bytes) -> Mapping[int, str]:
+    """The unit of each channel whose profile names one to show its values in; a profile that cannot be read has none.
+
+    Values are computed, published and kept in SI whatever it says.
+    """
+    return _displays(channel_profiles(station, uuid))
+
+
+def units_of_profile(name_or_path: str, home: Path) -> Mapping[int, str]:
+    """As :func:`shown_units`, of a profile by its name or the path of its file."""
+    return _displays(_channels_of(name_or_path, home))
+
+
+def channel_profiles(station: Station, uuid: bytes) -> Mapping[int, ChannelProfile]:
+    """The channels of a node's profile by number; none where it has none, or one that cannot be read."""
+    record = station.nodes.get(uuid)
+    return _channels_of(record.profile, station.home) if record is not None and record.profile else {}
+
+
+def _displays(channels: Mapping[int, ChannelProfile]) -> Mapping[int, str]:
+    return {number: one.display for number, one in channels.items() if one.display}
+
+
+def _channels_of(name_or_path: str, home: Path) -> Mapping[int, ChannelProfile]:
+    folders = default_folders(home)
+    try:
+        path = find_profile(name_or_path, folders)
+        return _read(path, folders, path.stat().st_mtime_ns)
+    except (TedsProvisionError, OSError):
+        return {}
+
+
+@lru_cache(maxsize=64)  # a plant has a thousand nodes and a dozen types
+def _read(path: Path, folders: tuple[Path, ...], _changed: int) -> Mapping[int, ChannelProfile]:
+    return {one.number: one for one in load_profile(path, folders).channels}

@@ -1,0 +1,1 @@
+"""Stations of one owner: documents, fold, registry."""

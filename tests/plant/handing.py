@@ -1,0 +1,206 @@
+"""Stations of one owner in this process: one CA, a roster, and a post that lies in memory."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from teds_provision.handover import trust
+from teds_provision.plant.post import Carried, Parcel
+from teds_provision.protocol.keys import PrivateKey, node_key_message, station_key_message
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.claim import Claim
+from teds_provision.protocol.plant.fold import Own, View, view
+from teds_provision.protocol.plant.roster import Member, Removed, Roster, Share, open_roster, seal_roster
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import agree
+from teds_provision.steps.identify import identify
+from teds_provision.store import WhitelistEntry, utc_now
+from teds_provision.store.tables.plant import PlantRecord, RosterRow
+from tests.bench import PASSPHRASE, Board, make_station, talk
+
+REGISTRY = "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"
+
+
+def ask(prompt: str, confirm: bool) -> str:
+    return PASSPHRASE
+
+
+@dataclass
+class MemoryPost:
+    """A post office in memory: what one station sends lies there for the other."""
+
+    everybody: bool = False
+    where: str = "memory"
+    there: dict[str, Parcel] = field(default_factory=dict)
+    full: bool = False
+
+    def registry(self) -> str | None:
+        return REGISTRY
+
+    def rosters(self) -> Iterator[bytes]:
+        return iter(())
+
+    def post_roster(self, version: int, hash: str, octets: bytes) -> None:
+        return None
+
+    def heads(self) -> Mapping[str, int]:
+        return {}
+
+    def pages(self, station: str, after: int) -> Iterator[Carried]:
+        return iter(())
+
+    def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
+        return None
+
+    def parcels(self, to: str) -> Iterator[Parcel]:
+        yield from [one for one in self.there.values() if one.to == to]
+
+    def send(self, parcel: Parcel) -> None:
+        from teds_provision.errors import PolicyRefused
+
+        if self.full:
+            raise PolicyRefused("full")
+        self.there.setdefault(parcel.id, parcel)
+
+    def drop(self, parcel: str, to: str) -> None:
+        self.there.pop(parcel, None)
+
+    def close(self) -> None:
+        return None
+
+
+class Plant:
+    """Stations of one owner: the first has the CA key; all have joined, and hear all that any of them told."""
+
+    def __init__(self, folder: Path, *names: str) -> None:
+        self.stack = ExitStack()
+        first = make_station(folder / names[0], names[0])
+        self.stations = {names[0]: first}
+        self.stack.callback(first.close)
+        for name in names[1:]:
+            home = folder / name
+            request = trust.ask_for_certificate(home, name=name, keystore="file", ask=ask)
+            certificate = trust.sign_request(first, trust.read_request(request))
+            made = trust.adopt_certificate(home, certificate, ask=ask)
+            self.stack.callback(made.close)
+            self.stations[name] = made
+        self.post = MemoryPost()
+        self.deaf: set[str] = set()
+        """Stations whose pages nobody has."""
+        self.roster_ = Roster(
+            REGISTRY,
+            "plant",
+            0,
+            "",
+            datetime.now(UTC).replace(microsecond=0),
+            datetime.now(UTC).replace(microsecond=0) + timedelta(days=90),
+            (),
+        )
+
+    def __getitem__(self, name: str) -> Station:
+        return self.stations[name]
+
+    @property
+    def ca(self) -> PrivateKey:
+        found = next(iter(self.stations.values())).vault.ca()
+        assert found is not None
+        return found
+
+    def roster(
+        self,
+        roles: Mapping[str, str],
+        *share: Share,
+        removed: Mapping[str, tuple[int, str]] = {},
+        days: int = 90,
+    ) -> Roster:
+        """The next roster, by the names of stations and their roles; every station of it takes it."""
+        before = self.roster_
+        made = datetime.now(UTC).replace(microsecond=0) - timedelta(days=1)
+        draft = replace(
+            before,
+            version=before.version + 1,
+            previous=before.hash,
+            created=made,
+            expires=made + timedelta(days=days),
+            members=tuple(
+                Member(
+                    name,
+                    self[name].point,
+                    self.ca.sign(station_key_message(self[name].point)),
+                    frozenset(words.split()),
+                )
+                for name, words in roles.items()
+            ),
+            removed=tuple(
+                Removed(name, self[name].point, frozenset({"base"}), "stolen", last) for name, last in removed.items()
+            ),
+            share=share,
+        )
+        octets = seal_roster(draft, self.ca)
+        self.roster_ = open_roster(octets, self.ca.point)
+        for name in roles:
+            station = self[name]
+            with station.transaction():
+                station.plant.tables.put_plant(PlantRecord(REGISTRY))
+                mac = station.seals.note("roster", self.roster_.hash)
+                station.plant.tables.put_roster(
+                    RosterRow(self.roster_.version, self.roster_.hash, octets, True, utc_now(), mac)
+                )
+        return self.roster_
+
+    def trusted(self) -> None:
+        """Have all trust each other, as the roster does."""
+        for station in self.stations.values():
+            for name, other in self.stations.items():
+                if other is not station and not any(one.point == other.point for one in station.policy.trusted()):
+                    path = station.home.parent / f"{name}.pem"
+                    from teds_provision.protocol.keys import to_pem
+
+                    path.write_text(to_pem(other.point))
+                    trust.add(station, [trust.candidate(station, name, path, "station")])
+
+    def views(self, name: str):  # type: ignore[no-untyped-def]
+        """What a station knows of nodes: every event that anybody told who is not ``deaf``."""
+
+        def see(uuid: bytes) -> View:
+            claims: dict[str, Claim] = {}
+            for each, station in self.stations.items():
+                if each in self.deaf and each != name:
+                    continue
+                for _, _, text in station.plant.tables.outbox(10_000):
+                    told = event.read(json.loads(text))
+                    if isinstance(told, event.Event) and told.uuid == uuid:
+                        claims.setdefault(station.fingerprint, Claim()).take(told)
+            own = self[name]
+            pin = own.pins.pinned(uuid)
+            return view(self.roster_, claims, Own(own.fingerprint, pin, "tap" if pin else "", bool(pin)))
+
+        return lambda uuids: {uuid: see(uuid) for uuid in uuids}
+
+    def close(self) -> None:
+        self.stack.close()
+
+
+def keyed(station: Station, board: Board) -> None:
+    """The station meets the board, pins its key and agrees on a link key."""
+    with talk(board) as node:
+        who = identify(station, node)
+        agree(station, node, who, newcomer=WhitelistEntry(node.uuid, who.fingerprint, utc_now(), "tap", None))
+    told = {"fingerprint": who.fingerprint}
+    keys = station.keys.of(board.uuid)
+    with station.transaction():
+        station.plant.tell("pinned", board.uuid, assurance="tap", **told)
+        station.plant.tell("agreed", board.uuid, epoch=keys[-1].epoch, key_id=keys[-1].key_id, **told)
+
+
+def board_of(station: Station, uuid: bytes) -> Board:
+    """A board that a station has keyed."""
+    board = Board(uuid)
+    assert board.key.sign(node_key_message(uuid, board.key.point))
+    keyed(station, board)
+    return board

@@ -1,0 +1,153 @@
+"""Small plants in memory: stations with keys, a CA, pages; and what a reader of some of the pages makes of them."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from teds_provision.protocol.handover.revocation import open_revocation
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.chain import Counting, counting
+from teds_provision.protocol.plant.claim import Claim
+from teds_provision.protocol.plant.fold import Own, Statement, View, view
+from teds_provision.protocol.plant.page import Draft, Page, open_page, seal_page
+from teds_provision.protocol.plant.roster import Member, Place, Removed, Roster, open_roster, seal_roster
+from teds_provision.protocol.plant.signer import Signing, Word, signing
+
+REGISTRY = "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"
+NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
+CA = SoftwareKey(0xCA)
+NODES = [bytes([n] * 10) for n in range(1, 4)]
+
+
+def certificate(key: SoftwareKey) -> bytes:
+    return CA.sign(station_key_message(key.point))
+
+
+def at(second: int) -> str:
+    return (NOW + timedelta(seconds=second)).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+@dataclass
+class Speaker:
+    """A station that writes pages: its key, roles, and all pages, of two histories where it has two."""
+
+    name: str
+    key: SoftwareKey
+    roles: frozenset[str]
+    pages: list[bytes] = field(default_factory=list)
+    head: Place = (0, "")
+    ids: int = 0
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint(self.key.point)
+
+    def event(self, act: str, uuid: bytes | None, second: int = 0, **members: Any) -> dict[str, Any]:
+        self.ids += 1
+        return event.made(act, f"{self.ids:016x}", at(second), uuid, members)
+
+    def page(self, *events: Mapping[str, Any], heads: Mapping[str, Place] = {}, after: Place | None = None) -> Place:
+        """Write the next page, or another one after an earlier place."""
+        n, previous = self.head if after is None else after
+        draft = Draft(REGISTRY, n + 1, previous, "0" * 16, NOW, heads, (1, "0" * 64))
+        octets = seal_page(draft, events, self.key)
+        self.pages.append(octets)
+        opened = open_page(octets, REGISTRY, lambda kid: self.key.point)
+        self.head = opened.n, opened.hash
+        return self.head
+
+
+def speaker(name: str, *roles: str) -> Speaker:
+    return Speaker(name, SoftwareKey(1 + int.from_bytes(name.encode(), "big") % (1 << 200)), frozenset(roles))
+
+
+def roster_of(
+    members: Sequence[Speaker], removed: Sequence[tuple[Speaker, Place]] = (), *, version: int = 1, **signed: Place
+) -> Roster:
+    draft = Roster(
+        REGISTRY, "plant", version, "" if version == 1 else "ab" * 32, NOW, NOW + timedelta(days=90),
+        tuple(Member(one.name, one.key.point, certificate(one.key), one.roles, signed.get(one.name))
+              for one in members),
+        tuple(Removed(one.name, one.key.point, one.roles, "stolen", last, signed.get(one.name))
+              for one, last in removed),
+    )  # fmt: skip
+    return open_roster(seal_roster(draft, CA), CA.point)
+
+
+class Reader:
+    """What somebody makes of a set of pages, with the pure functions alone: the oracle of the store's fold."""
+
+    def __init__(self, roster: Roster, pages: Iterable[bytes], accepted: Mapping[str, Place] = {}) -> None:
+        self.roster = roster
+        self.pages: dict[str, dict[Place, Page]] = {}
+        for octets in pages:
+            page = open_page(octets, REGISTRY, roster.point_of)
+            self.pages.setdefault(page.station, {})[page.n, page.hash] = page
+        self.counting: dict[str, Counting] = {}
+        self.claims: dict[bytes, dict[str, Claim]] = {}
+        self.words: dict[str, list[Word]] = {}
+        self.statements: dict[bytes, list[Statement]] = {}
+        self.liftings: dict[str, set[str]] = {}
+        for station, there in sorted(self.pages.items()):
+            self._fold(station, there, accepted.get(station))
+
+    def _fold(self, station: str, there: dict[Place, Page], accepted: Place | None) -> None:
+        removed = self.roster.removed_one(station)
+        names = [(page.n, page.hash, page.previous) for page in there.values()]
+        counts = counting(names, last=removed.last if removed else None, accepted=accepted)
+        self.counting[station] = counts
+        seen: set[str] = set()
+        for place in counts.pages:
+            for one in map(event.read, there[place].events):
+                if not isinstance(one, event.Event) or one.id in seen:
+                    continue
+                seen.add(one.id)
+                self._take(station, place, one)
+        for place, page in sorted(there.items()):
+            for one in map(event.read, page.events):
+                if isinstance(one, event.Event) and one.act == "revoked" and one.uuid is not None:
+                    said = open_revocation(one.members["statement"], self.roster.point_of)
+                    held = Statement(event.hash_of_statement(said.statement), station, place in counts.pages, said)
+                    if held not in self.statements.setdefault(one.uuid, []):
+                        self.statements[one.uuid].append(held)
+
+    def _take(self, station: str, place: Place, one: event.Event) -> None:
+        if one.act in ("signed", "vouched"):
+            word = Word(station, place[0], one.act == "vouched")
+            self.words.setdefault(one.members["teds_sha256"], []).append(word)
+        elif one.act == "lifted":
+            self.liftings.setdefault(one.members["of"], set()).add(station)
+        elif one.uuid is not None:
+            self.claims.setdefault(one.uuid, {}).setdefault(station, Claim()).take(one)
+
+    def view(self, uuid: bytes, own: Own | None = None) -> View:
+        own = own or Own("f" * 64)
+        claims, said = self.claims.get(uuid, {}), self.statements.get(uuid, [])
+        return view(self.roster, claims, own, said, self.liftings)
+
+    def signing(self, signer: str, digest: str) -> Signing:
+        behind = any(
+            place[0] > self.counted(about)
+            for station, pages in self.pages.items()
+            if self.roster.member(station)
+            for page in pages.values()
+            for about, place in page.heads.items()
+            if "keeper" in self.roster.roles_of(about)
+        )
+        counted = {station: counts.newest[0] for station, counts in self.counting.items()}
+        words = self.words.get(digest, [])
+        return signing(self.roster, signer, words, counted=counted, keepers_behind=behind, added=False)
+
+    def counted(self, station: str) -> int:
+        return self.counting[station].newest[0] if station in self.counting else 0
+
+
+def shuffled(pages: Sequence[bytes], seed: int) -> list[bytes]:
+    mixed = list(pages)
+    random.Random(seed).shuffle(mixed)
+    return mixed

@@ -1,0 +1,206 @@
+"""Evidence of a board: what holds, what does not, and whoever signs it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.serialization import load_pem_public_key
+from in_toto_attestation.v1.statement import Statement
+from securesystemslib.dsse import Envelope
+from securesystemslib.signer import SSlibKey
+
+from teds_provision.errors import NodeSilent, NotAuthentic, TedsProvisionError
+from teds_provision.plant.evidence import sign_evidence
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
+from teds_provision.protocol.plant import evidence as codec
+from teds_provision.protocol.plant.evidence import Claim
+from teds_provision.station.station import Station
+from teds_provision.teds.image import SECURITY
+from tests.bench import Board, MemoryLink, make_station, talk
+from tests.cli.shell import call
+
+from .proofs import evidence_of, facts_of, run, signed_anew
+
+KAT = json.loads((Path(__file__).parents[1] / "vectors" / "profile" / "plant_kat.json").read_text())
+
+
+@pytest.fixture
+def document(station: Station, board: Board) -> bytes:
+    return evidence_of(station, board, operator="A. Meier")
+
+
+def faults(station: Station, document: bytes) -> list[str]:
+    return codec.faults(codec.read(document), station.identity.ca)
+
+
+def test_evidence_holds_under_the_ca_of_its_owner(station: Station, board: Board, document: bytes) -> None:
+    evidence = codec.read(document)
+    assert faults(station, document) == []
+    assert (evidence.uuid, evidence.verdict, evidence.operator) == (board.uuid, "passed", "A. Meier")
+    assert evidence.facts.steps == (("identify", "done", 41), ("write", "done", 1250))
+
+
+def test_public_verifiers_accept_it(station: Station, document: bytes) -> None:
+    """securesystemslib and in-toto-attestation know nothing of us: the key, and what was signed."""
+    envelope = Envelope.from_dict(json.loads(document))
+    key = SSlibKey.from_crypto(load_pem_public_key(to_pem(station.point).encode()), station.identity.fingerprint)
+    assert station.identity.fingerprint in envelope.verify([key], threshold=1)
+    statement = json.loads(envelope.payload)
+    Statement.copy_from_pb(_parsed(statement)).validate()
+    assert statement["predicateType"] == "urn:x-teds-provision:evidence:1"
+
+
+def _parsed(statement: dict[str, Any]) -> Any:
+    from google.protobuf.json_format import ParseDict
+    from in_toto_attestation.v1.statement_pb2 import Statement as Message
+
+    return ParseDict(statement, Message())
+
+
+def test_no_octet_of_it_can_be_another(station: Station, document: bytes) -> None:
+    """Octet by octet, with one bit changed: unreadable, or not authentic."""
+    for at in range(len(document)):
+        changed = document[:at] + bytes([document[at] ^ (1 << at % 7)]) + document[at + 1 :]
+        with suppress(TedsProvisionError):
+            assert faults(station, changed), f"octet {at}"
+
+
+def test_half_a_document_is_none(document: bytes) -> None:
+    for end in range(0, len(document), 97):
+        with pytest.raises(TedsProvisionError):
+            codec.read(document[:end])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: s["predicate"]["facts"].update(unit=2),
+        lambda s: s["predicate"]["facts"].update(attempt=2),
+        lambda s: s["predicate"]["facts"].update(profile="another"),
+        lambda s: s["predicate"]["facts"].update(begun="2026-03-01T11:28:59Z"),
+        lambda s: s["predicate"]["facts"]["steps"].append(["label", "done", 3]),
+        lambda s: s["predicate"]["facts"].update(remark="what no reader knows"),
+        lambda s: s["predicate"]["node"].update(nonce="00" * 16),
+    ],
+)
+def test_its_own_station_cannot_change_a_fact(
+    station: Station, document: bytes, change: Callable[[dict[str, Any]], object]
+) -> None:
+    key = station.credentials(codec.read(document).uuid).key
+    anew = signed_anew(document, key, change)
+    assert faults(station, anew) == ["the board did not sign these facts (Prove)"]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda s: s["predicate"]["facts"]["steps"].append(["check", "node-silent", 3]), "verdict"),
+        (lambda s: s["predicate"].update(verdict="failed"), "verdict"),
+        (lambda s: s["predicate"]["node"].update(nonce="", proof=""), "the board did not sign it"),
+        (lambda s: s["subject"][0].update(name="teds:8d4d9da65281f7000001"), "field 102"),
+        (lambda s: s["predicate"]["facts"].update(sequence=2), "sequence or epoch"),
+        (lambda s: s["predicate"]["facts"]["blocks"].pop(), "field 108"),
+        (lambda s: s["predicate"]["station"].update(certificate="AA=="), "not certified"),
+    ],
+)
+def test_what_its_own_station_signs_anew_is_told(
+    station: Station, document: bytes, change: Callable[[dict[str, Any]], object], why: str
+) -> None:
+    anew = signed_anew(document, station.credentials(codec.read(document).uuid).key, change)
+    assert any(why in fault for fault in faults(station, anew))
+
+
+def test_a_certified_station_cannot_pass_anothers_evidence_off_as_its_own(station: Station, document: bytes) -> None:
+    other = SoftwareKey(11)
+    certificate = station.identity.certify(other.point)
+
+    def mine(statement: dict[str, Any]) -> None:
+        import base64
+
+        statement["predicate"]["facts"]["station"] = fingerprint(other.point)
+        told = {"point": other.point.hex(), "certificate": base64.b64encode(certificate).decode()}
+        statement["predicate"]["station"] = told
+
+    assert faults(station, signed_anew(document, other, mine)) == ["the board did not sign these facts (Prove)"]
+
+
+def test_another_owners_ca_does_not_accept_it(document: bytes) -> None:
+    found = codec.faults(codec.read(document), SoftwareKey(3).point)
+    assert "its station is not certified by this CA" in found
+    assert "the station that signed the datasheet is not certified by this CA (field 104)" in found
+
+
+def test_a_board_that_is_gone_leaves_the_stations_word_on_a_failed_attempt(station: Station, board: Board) -> None:
+    teds = run(station, board).image.blocks[SECURITY]
+    failed = facts_of(station, teds, steps=(("identify", "done", 9), ("write", "node-silent", 40)))
+    with talk(board, MemoryLink(board, lose_request=1)) as node:
+        document = sign_evidence(node, station.credentials(board.uuid), Claim(board.uuid, teds, failed))
+    evidence = codec.read(document)
+    assert (evidence.verdict, evidence.facts.failure, evidence.proof) == ("failed", "node-silent", b"")
+    assert faults(station, document) == []
+
+
+def test_a_board_that_passed_must_sign(station: Station, board: Board) -> None:
+    teds = run(station, board).image.blocks[SECURITY]
+    claim = Claim(board.uuid, teds, facts_of(station, teds))
+    with pytest.raises(NodeSilent), talk(board, MemoryLink(board, lose_request=1)) as node:
+        sign_evidence(node, station.credentials(board.uuid), claim)
+    other = Board()  # the same UUID, another key
+    with pytest.raises(NotAuthentic), talk(other) as node:
+        sign_evidence(node, station.credentials(board.uuid), claim)
+
+
+def test_known_answers_of_another_implementation() -> None:
+    """Its document is of a time before ``node.teds``: what is hashed and signed is the same."""
+    told = KAT["evidence"]
+    payload = codec.base64_of(json.loads(told["file"])["payload"], "payload")
+    statement = json.loads(payload)
+    predicate = statement["predicate"]
+    bound = codec.canonical(predicate["facts"], statement["subject"])
+    assert bound.decode() == told["canonical"]
+    assert codec.challenge(bytes.fromhex(predicate["node"]["nonce"]), bound).hex() == told["challenge"]
+    assert codec.pae(payload).hex() == told["pae"]
+
+
+def test_evidence_verify_needs_nothing_but_files(tmp_path: Path, station: Station, board: Board) -> None:
+    (tmp_path / "evidence").mkdir()
+    good = tmp_path / "evidence" / "a.json"
+    good.write_bytes(evidence_of(station, board))
+    ca, none = tmp_path / "ca.pem", tmp_path / "nowhere"
+    ca.write_text(to_pem(station.identity.ca))
+    done = call(none, "--json", "evidence", "verify", good.parent, "--ca", ca, passphrase=None)
+    told = [json.loads(line) for line in done.out.splitlines()]
+    assert (done.code, told[0]["good"], told[0]["uuid"]) == (0, True, board.uuid.hex())
+    assert told[1] == {"totals": {"files": 1, "passed": 1}}
+    assert not none.exists()
+    (good.parent / "b.json").write_bytes(good.read_bytes().replace(b"payloadType", b"payloadtype"))
+    (good.parent / "c.json").write_bytes(signed_anew(good.read_bytes(), SoftwareKey(9), lambda s: None))
+    done = call(none, "evidence", "verify", good.parent, "--ca", ca, passphrase=None)
+    assert done.code == 4
+    assert done.out.splitlines()[-1] == "3 files: 1 not authentic, 1 passed, 1 unreadable."
+
+
+def test_pins_say_which_board_it_must_have_been(tmp_path: Path, station: Station, board: Board) -> None:
+    file, ca, pins = tmp_path / "a.json", tmp_path / "ca.pem", tmp_path / "pins.csv"
+    file.write_bytes(evidence_of(station, board))
+    ca.write_text(to_pem(station.identity.ca))
+    pins.write_text(f"uuid,fingerprint\n{board.uuid.hex()},{fingerprint(board.key.point)}\n")
+    assert call(tmp_path, "evidence", "verify", file, "--ca", ca, "--pins", pins).code == 0
+    pins.write_text(f"uuid,fingerprint\n{board.uuid.hex()},{'0' * 64}\n")
+    done = call(tmp_path, "evidence", "verify", file, "--ca", ca, "--pins", pins)
+    assert (done.code, "its key is not the one in the list of pins" in done.out) == (4, True)
+
+
+def test_a_stations_own_ca_makes_no_evidence_for_another(tmp_path: Path, station: Station, board: Board) -> None:
+    """A station that was never certified by this CA can sign what it likes."""
+    stranger = make_station(tmp_path / "stranger", "stranger")
+    document = evidence_of(stranger, board)
+    assert faults(stranger, document) == []
+    assert "its station is not certified by this CA" in faults(station, document)
+    assert station_key_message(stranger.point) != station_key_message(station.point)
+    stranger.close()

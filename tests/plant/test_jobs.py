@@ -1,0 +1,359 @@
+"""A line works on a job: what it may, a unit for each board, and what is refused without a unit lost."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, OtherKey, PolicyRefused
+from teds_provision.plant import owner as owning
+from teds_provision.plant.asking import send_job
+from teds_provision.plant.files import FilesPost
+from teds_provision.plant.jobs import find_job, take_job, take_received
+from teds_provision.plant.line import LineRun, Scans
+from teds_provision.plant.verify_evidence import Grounds
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.plant import evidence as codec
+from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
+from teds_provision.station.station import Station
+from teds_provision.steps.board_type import WrongBoard
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.provision import Provisioned, inspect, provision
+from teds_provision.talk.progress import Silent
+from tests.bench import Board, MemoryLink, make_station, talk
+
+from .owner import NOW, alone, job_of, join, member, roster_of
+from .stations import Plant
+
+
+@pytest.fixture
+def owner(tmp_path: Path) -> Iterator[Station]:
+    station = alone(tmp_path / "home")
+    yield station
+    station.close()
+
+
+def build(line: LineRun, board: Board, link: MemoryLink | None = None) -> Provisioned:
+    with talk(board, link) as node:
+        return provision(line.station, node, line.order, accept=lambda who: None, reporter=Silent(), line=line)
+
+
+def line_of(owner: Station, calibrations: Path | None = None, **changes: Any) -> LineRun:
+    return LineRun(owner, take_job(owner, job_of(owner, **changes)), calibrations=calibrations)
+
+
+def board(number: int) -> Board:
+    return Board(uuid=bytes.fromhex("8d4d9da65281f7") + number.to_bytes(3, "big"))
+
+
+def units(line: LineRun) -> list[tuple[int, int, int]]:
+    assert line.job is not None
+    return [(row.unit, row.attempts, row.passed) for row in line.station.plant.line.units(line.job.id)]
+
+
+def test_each_board_gets_one_unit_and_leaves_evidence(owner: Station) -> None:
+    line = line_of(owner, name="angle {unit:03} {uuid8}")
+    boards = [board(number) for number in range(3)]
+    for one in boards:
+        assert build(line, one).verified.verdict == "authentic"
+    assert units(line) == [(1, 1, 1), (2, 1, 1), (3, 1, 1)]
+    assert (line.passed, line.total) == (3, 3)
+    assert line.job is not None
+    rows = list(owner.plant.line.evidence(job=line.job.id))
+    assert [row.unit for row in rows] == [1, 2, 3]
+    for row in rows:
+        assert hashlib.sha256(row.document).hexdigest() == row.sha256
+        found = codec.read(row.document)
+        assert codec.faults(found, owner.identity.ca) == []
+        assert [name for name, _, _ in found.facts.steps][-1] == "check"
+    known = owner.nodes.get(boards[1].uuid)
+    assert known is not None
+    assert known.name == "angle 002 8d4d9da6"
+
+
+def test_a_second_try_takes_no_second_unit(owner: Station) -> None:
+    line, one = line_of(owner), board(1)
+    build(line, one)
+    build(line, one)
+    assert units(line) == [(1, 2, 1)], "its first pass was its first attempt"
+    assert [row.attempt for row in owner.plant.line.evidence(uuid=one.uuid)] == [1, 2]
+
+
+def test_one_board_too_many_is_refused_and_stays_what_it_is(owner: Station) -> None:
+    line = line_of(owner, count=2, stations={owner.identity.fingerprint: 2})
+    build(line, board(1))
+    build(line, board(2))
+    third = board(3)
+    with pytest.raises(PolicyRefused, match="one too many"):
+        build(line, third)
+    assert third.state.state == NodeState.FACTORY
+    assert len(units(line)) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"not_before": NOW + timedelta(hours=1), "ends": NOW + timedelta(hours=2)}, "it begins"),
+        ({"not_before": NOW - timedelta(hours=2), "ends": NOW - timedelta(minutes=5)}, "it ended"),
+        ({"stations": {"0" * 64: 3}}, "not for this station"),
+        ({"profile_sha256": "0" * 64}, "not the one of the job"),
+    ],
+)
+def test_what_can_be_refused_before_a_tap_is(owner: Station, changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(PolicyRefused, match=why):
+        line_of(owner, **changes)
+
+
+def test_a_closed_job_is_refused(owner: Station) -> None:
+    line = line_of(owner)
+    assert line.job is not None
+    owner.plant.line.set_job_state(line.job.id, "closed")
+    with pytest.raises(PolicyRefused, match="closed"):
+        LineRun(owner, line.job)
+
+
+def test_a_board_that_is_not_listed_or_has_another_key_costs_no_unit(owner: Station) -> None:
+    one, other = board(1), board(2)
+    line = line_of(owner, count=None, boards={one.uuid: fingerprint(one.key.point), other.uuid: "0" * 64})
+    with pytest.raises(OtherKey):
+        build(line, other)
+    with pytest.raises(PolicyRefused, match="not in the list"):
+        build(line, board(3))
+    assert units(line) == []
+    build(line, one)
+    assert units(line) == [(1, 1, 1)]
+
+
+def test_a_board_of_another_type_costs_no_unit(tmp_path: Path, owner: Station) -> None:
+    other, one = make_station(tmp_path / "other"), board(1)
+    with talk(one) as node:
+        order = BuildOrder(profile="tactile-finger-sensor")
+        provision(other, node, order, accept=lambda who: None, reporter=Silent())
+    line = line_of(owner)
+    with pytest.raises(WrongBoard):
+        build(line, one)
+    assert units(line) == []
+    other.close()
+
+
+def test_a_board_on_the_bus_is_not_enough_for_a_job_that_asks_for_taps(owner: Station) -> None:
+    line, one = line_of(owner), board(1)
+    with pytest.raises(PolicyRefused, match="assurance tap"):
+        build(line, one, MemoryLink(one, via="can", tapped=True))
+    assert units(line) == []
+    assert one.state.state == NodeState.FACTORY
+
+
+def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Station) -> None:
+    one, two = board(1), board(2)
+    folder = tmp_path / "calibrations"
+    folder.mkdir()
+    file = folder / f"{one.uuid.hex()}.csv"
+    file.write_text("raw, value\n0, 0\n16384, 6.283185307\n")
+    rule = CalibrationRule(
+        "list", by_uuid={uuid: hashlib.sha256(file.read_bytes()).hexdigest() for uuid in (one.uuid, two.uuid)}
+    )
+    line = line_of(owner, folder, calibration=rule)
+    with pytest.raises(NotFound, match="no file"):
+        build(line, two)
+    (folder / f"{two.uuid.hex()}.csv").write_text("raw, value\n0, 0\n16384, 6.28\n")
+    with pytest.raises(PolicyRefused, match="not the one that the job names"):
+        build(line, two)
+    assert units(line) == []
+    build(line, one)
+    (row,) = owner.plant.line.evidence(uuid=one.uuid)
+    assert codec.read(row.document).facts.calibration_sha256 == rule.by_uuid[one.uuid]
+
+
+def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: Path, owner: Station) -> None:
+    one = board(1)
+    file = tmp_path / f"{one.uuid.hex()}.csv"
+    line = line_of(owner, tmp_path, calibration=CalibrationRule("any", max_age_days=30))
+    table = "raw, value\n0, 0\n16384, 6.283185307\n"
+    for dated, why in ((f"# date: {NOW - timedelta(days=31):%Y-%m-%d}\n", "is of"), ("", "has no date")):
+        file.write_text(dated + table)
+        with pytest.raises(PolicyRefused, match=why):
+            build(line, one)
+    file.write_text(f"# date: {NOW - timedelta(days=3):%Y-%m-%d}\n{table}")
+    build(line, one)
+    assert units(line) == [(1, 1, 1)]
+
+
+def test_a_job_is_a_keepers_word_and_its_id_means_one_job(tmp_path: Path, owner: Station) -> None:
+    document = job_of(owner)
+    job = take_job(owner, document)
+    assert take_job(owner, document).hash == job.hash
+    twin = seal_job(replace(job, title="another"), owner.credentials().key)
+    with pytest.raises(PolicyRefused, match="Another job"):
+        take_job(owner, twin)
+    with pytest.raises(NotAuthentic):
+        take_job(owner, seal_job(replace(job, id="11111111-2222-4333-8444-555555555555"), SoftwareKey(5)))
+    join(owner, roster_of(owner, member(owner, "owner", "line", "sign"), version=2, previous="0" * 64))
+    with pytest.raises(PolicyRefused, match="not a keeper"):
+        take_job(owner, document)
+
+
+def test_who_joined_no_registry_takes_no_job(tmp_path: Path, owner: Station) -> None:
+    stranger = make_station(tmp_path / "stranger")
+    with pytest.raises(PolicyRefused, match="joined no registry"):
+        take_job(stranger, job_of(owner))
+    stranger.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda job: replace(job, stations={"0" * 64: 4}), "allotments"),
+        (lambda job: replace(job, ends=job.not_before), "ends"),
+        (lambda job: replace(job, count=None, boards={}), "nodes"),
+        (lambda job: replace(job, name="board {n}"), "pattern"),
+        (lambda job: replace(job, assurance="word"), "assurance"),
+    ],
+)
+def test_a_job_that_does_not_add_up_is_never_signed(owner: Station, change: Callable[[Job], Job], why: str) -> None:
+    job = open_job(job_of(owner), lambda kid: owner.point)
+    with pytest.raises(BadData, match=why):
+        seal_job(change(job), owner.credentials().key)
+
+
+def test_patterns_of_names() -> None:
+    require_pattern("left {unit:03} {uuid}")
+    for wrong in ("{unit:3}", "{unit:00}", "{0}", "{uuid", "}"):
+        with pytest.raises(BadData):
+            require_pattern(wrong)
+
+
+def test_cut_at_every_message_a_unit_is_neither_given_twice_nor_lost(tmp_path: Path) -> None:
+    owner = alone(tmp_path / "count")
+    link = MemoryLink(board(1))
+    build(line_of(owner), link.board, link)
+    owner.close()
+    for first, half in enumerate(("lose_request", "lose_reply"), 1):
+        for lost in range(first, link.count, 2):
+            home = alone(tmp_path / f"{half}{lost}")
+            line, one = line_of(home), board(1)
+            with pytest.raises(NodeSilent):
+                build(line, one, MemoryLink(one, **{half: lost}))  # type: ignore[arg-type]
+            assert build(line, one).verified.verdict == "authentic", (half, lost)
+            (unit,) = units(line)
+            assert (unit[0], bool(unit[2])) == (1, True)
+            rows = list(home.plant.line.evidence(uuid=one.uuid))
+            assert rows[-1].verdict == "passed"
+            assert all(codec.faults(codec.read(row.document), home.identity.ca) == [] for row in rows)
+            home.close()
+
+
+def test_evidence_is_kept_outside_a_job_too(owner: Station) -> None:
+    order = BuildOrder(profile="magnetic-angular-position-sensor")
+    line, one = LineRun(owner, None, order, operator="A. Meier"), board(1)
+    build(line, one)
+    build(line, one)
+    rows = list(owner.plant.line.evidence(uuid=one.uuid))
+    assert [(row.job, row.unit, row.attempt) for row in rows] == [(None, None, 1), (None, None, 2)]
+    assert codec.read(rows[0].document).operator == "A. Meier"
+
+
+def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
+    """Its own evidence stands beside the maker's; nothing is written, and it takes no unit."""
+    plant = Plant(tmp_path)
+    tester = plant.member("tester", "base")
+    told = {"registry": plant.roster.registry, "stations": {plant.north.fingerprint: 2, tester.fingerprint: 1}}
+    document = job_of(plant.north, **told)
+    made, one = LineRun(plant.north, take_job(plant.north, document)), board(1)
+    build(made, one)
+    before = one.state
+    tests = LineRun(tester, take_job(tester, document), only_verify=True)
+    tester.unlock()
+    for attempt in (1, 2):
+        with talk(one) as node:
+            done = inspect(tester, node, tests, Silent())
+        assert done.verified.verdict == "authentic"
+        assert tests.told(one.uuid)["attempt"] == attempt
+    assert one.state == before
+    assert units(tests) == []
+    rows = list(tester.plant.line.evidence(uuid=one.uuid))
+    assert [codec.faults(codec.read(row.document), plant.north.identity.ca) for row in rows] == [[], []]
+    assert {name for name, _, _ in codec.read(rows[0].document).facts.steps} == {"identify", "verify", "check"}
+    other = board(2)
+    with talk(other) as node:
+        order = BuildOrder(profile="tactile-finger-sensor")
+        provision(plant.north, node, order, accept=lambda who: None, reporter=Silent())
+    with talk(other) as node, pytest.raises(WrongBoard):
+        inspect(tester, node, tests, Silent())
+    tampered = {**one.state.blocks, (0, 12): one.state.blocks[0, 12][:-3] + b"\0\0\0"}
+    one.flash.state = replace(one.state, blocks=tampered)
+    one.power_on()
+    with talk(one) as node:
+        assert inspect(tester, node, tests, Silent()).verified.verdict == "not authentic"
+    last = codec.read(list(tester.plant.line.evidence(uuid=one.uuid))[-1].document)
+    assert (last.verdict, last.facts.failure) == ("failed", "not-authentic")
+    assert codec.faults(last, plant.north.identity.ca) == []
+    plant.close()
+
+
+def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> None:
+    line, one, two = line_of(owner), board(1), board(2)
+    line.label_to = tmp_path / "labels" / "x.svg"
+    line.scans = Scans([])
+    with pytest.raises(PolicyRefused, match="Scan the label"):
+        build(line, one)
+    line.scans.take(f"TEDS1:{one.uuid.hex()}:{fingerprint(one.key.point)}")
+    with pytest.raises(WrongBoard, match="label"):
+        build(line, two)
+    assert units(line) == []
+    build(line, one)
+    label = tmp_path / "labels" / f"{one.uuid.hex()}.svg"
+    assert one.uuid.hex() in label.read_text()
+    assert line.told(one.uuid)["label"] == str(label)
+    with pytest.raises(PolicyRefused, match="Scan the label"):
+        build(line, one)
+    line.scans.take(one.uuid.hex())
+    build(line, one)
+    said: list[str] = []
+    Scans(["nonsense\n", "\n"], said.append).listen()
+    assert said == ["This is no label of a board: nonsense"]
+
+
+def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path) -> None:
+    plant = Plant(tmp_path)
+    west = plant.member("west", "line", "sign")
+    told = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
+    line, one = LineRun(west, take_job(west, job_of(plant.north, **told))), board(1)
+    west.unlock()
+    build(line, one)
+    (row,) = west.plant.line.evidence(uuid=one.uuid)
+    document = codec.read(row.document)
+
+    def faults() -> list[str]:
+        assert plant.north.plant.roster is not None
+        return Grounds(plant.north.identity.ca, roster=plant.north.plant.roster).faults(document)
+
+    first = Grounds(plant.north.identity.ca, roster=plant.roster)
+    assert "its station is not in the roster" in first.faults(document)
+    assert faults() == []
+    plant.change(owning.with_roles(plant.north, "west", frozenset({"audit"}), (0, "")))
+    assert "its station has no role that works on boards" in faults()
+    plant.change(owning.without(plant.north, "west", "stolen", 0))
+    assert "its station was removed: stolen" in faults()
+    plant.close()
+
+
+def test_a_job_is_sent_to_those_that_it_is_for(tmp_path: Path) -> None:
+    plant = Plant(tmp_path)
+    west = plant.member("west", "line")
+    told = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
+    job = take_job(plant.north, job_of(plant.north, **told))
+    send_job(plant.north, FilesPost(plant.stick), job)
+    send_job(plant.north, FilesPost(plant.stick), job)
+    plant.round()
+    take_received(west)
+    assert find_job(west, job.id[:8]).hash == job.hash
+    assert list(FilesPost(plant.stick).parcels(west.fingerprint)) == []
+    plant.close()

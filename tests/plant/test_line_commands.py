@@ -1,0 +1,187 @@
+"""The line by its commands: a job is made, worked on, and shown; the evidence is files that anybody checks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from teds_provision.protocol.keys import to_pem
+from teds_provision.station.station import Station as InMemory
+from tests.bench import PASSPHRASE
+from tests.e2e.desk import Desk, Station
+
+from .owner import ALL, ANGLE, alone, join, member, roster_of
+from .stations import certified
+
+pytestmark = pytest.mark.link
+ENDS = ("--ends", "2099-01-01")
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stations")
+    alone(folder / "owner").close()
+    return folder
+
+
+@pytest.fixture
+def desk(tmp_path: Path, prepared: Path) -> Iterator[Desk]:
+    desk = Desk(tmp_path, prepared)
+    yield desk
+    desk.clear()
+
+
+@pytest.fixture
+def owner(desk: Desk) -> Station:
+    return desk.station("owner")
+
+
+def new_job(owner: Station, *more: object) -> dict[str, object]:
+    made = owner.ask("job", "new", "--title", "two angles", "--profile", ANGLE, "--station", "owner", *ENDS, *more)
+    return dict(made)
+
+
+def test_from_an_order_to_boards_with_proof(desk: Desk, owner: Station, tmp_path: Path) -> None:
+    job = new_job(owner, "--count", 2, "--name", "angle {unit:03}", "--output", tmp_path / "two.jws")
+    assert (job["nodes"], job["state"]) == ({"count": 2}, "open")
+    for number in (1, 2):
+        node = desk.node(f"node{number}").start()
+        done = owner.provision("nfc", "--job", tmp_path / "two.jws", "--operator", "A. Meier")
+        assert (done["verdict"], done["unit"], done["of"], done["attempt"]) == ("authentic", number, 2, 1)
+        assert (done["name"], done["job"]) == (f"angle 00{number}", job["id"])
+        node.stop()
+    third = desk.node("third").start()
+    before = third.octets
+    refused = owner.refuses("provision", "--job", str(job["id"])[:8], "--yes", *desk.links.over("nfc"), code=6)
+    assert "one too many" in refused["message"]
+    assert third.octets == before
+    assert owner.ask("evidence", "export", tmp_path / "proof", "--job", job["id"])["written"] == 2
+    again = owner.ask("evidence", "export", tmp_path / "proof")
+    assert (again["files"], again["written"]) == (2, 0)
+    (tmp_path / "ca.pem").write_text(to_pem(_ca(owner)))
+    done = owner.run("--json", "evidence", "verify", tmp_path / "proof", "--ca", tmp_path / "ca.pem")
+    assert (done.code, json.loads(done.out.splitlines()[-1])["totals"]) == (0, {"files": 2, "passed": 2})
+    told = owner.ask("job", "status", job["id"], "--csv", tmp_path / "attempts.csv")
+    (part,) = told["stations"]
+    assert (part["units"], part["passed"], part["first_pass"], part["over"]) == (2, 2, 1.0, False)
+    assert list(part["steps"])[-1] == "check"
+    assert len((tmp_path / "attempts.csv").read_text().splitlines()) == 3
+    assert "2 of 2 passed" in owner.run("job", "status", job["id"]).out
+    assert [one["passed"] for one in owner.ask("job", "list")["jobs"]] == [2]
+    assert owner.ask("job", "close", job["id"])["state"] == "closed"
+    assert owner.log_is_whole()
+
+
+def test_a_bench_goes_on_until_it_is_told_to_stop(desk: Desk, owner: Station) -> None:
+    job = new_job(owner, "--count", 2)
+    running = owner.start("--json", "provision", "--job", job["id"], "--watch", "--yes", *desk.links.over("nfc"))
+    lines = []
+    for number in (1, 2, 3):
+        node = desk.node(f"node{number}").start()
+        lines = running.wait_for_lines(number)
+        node.stop()
+    running.signal(2)
+    running.end()
+    assert [line.get("unit") for line in lines] == [1, 2, None]
+    assert lines[2]["error"]["code"] == "refused"
+
+
+def test_a_job_and_what_it_says_are_not_both_named(owner: Station) -> None:
+    job = new_job(owner, "--count", 2)
+    owner.refuses("provision", "--job", str(job["id"]), "--profile", ANGLE, "--yes", code=2)
+    owner.refuses("provision", "--calibrations", "x", "--yes", code=2)
+    owner.refuses("job", "show", "ffff", code=3)
+    owner.refuses("job", "new", "--title", "x", "--profile", ANGLE, "--station", "owner", *ENDS, code=2)
+
+
+def test_a_killed_line_gives_no_unit_twice(desk: Desk, owner: Station) -> None:
+    """Killed when each step has ended, in turn; the same command carries on."""
+    job = new_job(owner, "--count", 1)
+    desk.node().start()
+    words = ["provision", "--job", job["id"], "--yes", *desk.links.over("nfc")]
+    for step in ("identify", "whitelist", "agree", "build", "sign", "write", "verify"):
+        running = owner.start(*words)
+        running.wait_for(f" {step}")
+        running.process.kill()
+        running.end()
+    done = owner.ask(*words)
+    assert (done["verdict"], done["unit"]) == ("authentic", 1)
+    (part,) = owner.ask("job", "status", job["id"])["stations"]
+    assert (part["units"], part["passed"]) == (1, 1)
+    assert owner.log_is_whole()
+
+
+def test_only_a_keeper_makes_a_job(desk: Desk, owner: Station, prepared: Path) -> None:
+    with closing(_opened(owner)) as station:
+        roster = station.plant.roster
+        assert roster is not None
+        join(station, roster_of(station, member(station, "owner", *ALL[1:]), version=2, previous=roster.hash))
+    more = ("--title", "x", "--profile", ANGLE, "--station", "owner", "--count", 1)
+    assert "not a keeper" in owner.refuses("job", "new", *more, *ENDS, code=6)["message"]
+
+
+def _opened(owner: Station) -> InMemory:
+    return InMemory.open(owner.home, ask=lambda prompt, confirm=False: PASSPHRASE)
+
+
+def _ca(owner: Station) -> bytes:
+    with closing(_opened(owner)) as station:
+        return station.identity.ca
+
+
+@pytest.fixture
+def west(desk: Desk, owner: Station) -> Station:
+    """A line that signs nothing itself, beside the owner's office."""
+    folder = desk.folder / "west"
+    with closing(_opened(owner)) as station:
+        made = certified(folder, "west", station)
+        roster = station.plant.roster
+        assert roster is not None
+        members = (member(station, "owner", *ALL), member(made, "west", "line"))
+        new = roster_of(station, *members, version=2, previous=roster.hash)
+        for one in (station, made):
+            join(one, new)
+        made.close()
+    return Station(desk, folder)
+
+
+def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, west: Station, tmp_path: Path) -> None:
+    stick, job = tmp_path / "stick", tmp_path / "two.jws"
+    stick.mkdir()
+    more = ("--count", 2, "--output", job, "--sign", "owner")
+    made = owner.ask("job", "new", "--title", "two", "--profile", ANGLE, "--station", "west", *ENDS, *more)
+    office = owner.start("--json", "signer", "run", "--job", made["id"], "--files", stick)
+    node = desk.node().start()
+    done = west.provision("nfc", "--job", job, "--files", stick)
+    assert (done["verdict"], done["unit"]) == ("authentic", 1)
+    (said,) = office.wait_for_lines(1)
+    assert (said["uuid"], said["sequence"]) == (node.uuid, 1)
+    office.signal(15)
+    assert office.end().code == 0
+    node.stop()
+    # the office is away: its request is a file
+    other = desk.node("other").start()
+    late = west.refuses("provision", "--job", job, "--files", stick, "--yes", "--timeout", 1, *nfc(desk), code=5)
+    assert late["code"] == "no-answer"
+    west.ask("build", other.uuid, "--profile", ANGLE)
+    asked = tmp_path / "request.jws"
+    assert west.ask("sign", other.uuid, "--by", "owner", "--job", job, "--output", asked, *nfc(desk))["request"]
+    assert owner.ask("signer", "once", asked, "--output", tmp_path / "signed.json")["sequence"] == 1
+    west.ask("write", other.uuid, "--image", tmp_path / "signed.json", *nfc(desk))
+    done = west.provision("nfc", "--job", job, "--files", stick)
+    assert (done["verdict"], done["attempt"]) == ("authentic", 2)
+
+
+def nfc(desk: Desk) -> list[str]:
+    return desk.links.over("nfc")
+
+
+def test_the_demo_of_a_line_ends_as_it_says(desk: Desk) -> None:
+    told = desk.start("--json", "demo", "--line").end().json
+    assert (told["passed"], told["refused"]) == (3, ["wrong-board", "one too many"])
+    assert told["evidence"] == {"passed": 4, "failed": 1}
+    assert [step["name"] for step in told["steps"]][-1] == "evidence"

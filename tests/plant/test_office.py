@@ -1,0 +1,324 @@
+"""An office signs for a line what it builds itself, for a board in the line's hands, within a job; and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NotAuthentic, PolicyRefused
+from teds_provision.plant.asking import NotAnswered, Refused
+from teds_provision.plant.jobs import take_job
+from teds_provision.plant.line import LineRun
+from teds_provision.plant.office import MOST_ANSWERS, answer
+from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message
+from teds_provision.protocol.plant import evidence as codec
+from teds_provision.protocol.plant.job import CalibrationRule
+from teds_provision.protocol.plant.signing import (
+    Answer,
+    SignRequest,
+    challenge,
+    open_answer,
+    open_request,
+    seal_answer,
+    seal_request,
+)
+from teds_provision.station.station import Station
+from teds_provision.store import Revocation
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.image import SECURITY, Image
+from tests.bench import Board
+
+from .owner import NOW, job_of
+from .stations import Plant
+from .test_jobs import board, build
+
+KAT = json.loads((Path(__file__).parents[1] / "vectors" / "profile" / "plant_kat.json").read_text())
+
+
+@dataclass
+class AtHand:
+    """An office on the same desk; ``away``: it does not answer. ``change`` is what somebody does to a request."""
+
+    station: Station
+    away: bool = False
+    asked: list[SignRequest] = field(default_factory=list)
+
+    def ask(self, request: SignRequest) -> bytes | None:
+        self.asked.append(request)
+        return None if self.away else answer(self.station, request.octets)
+
+
+@dataclass
+class Desk:
+    """An owner whose station `north` is the office, and a line without `sign`."""
+
+    plant: Plant
+    office: Station
+    line: Station
+    at_hand: AtHand
+
+    def run(self, calibrations: Path | None = None, **changes: Any) -> LineRun:
+        told: dict[str, Any] = {
+            "stations": {self.line.identity.fingerprint: 3},
+            "sign": self.office.identity.fingerprint,
+        }
+        document = job_of(self.office, **{**told, "registry": self.plant.roster.registry, **changes})
+        take_job(self.office, document)
+        return LineRun(self.line, take_job(self.line, document), calibrations=calibrations, office=self.at_hand)
+
+    def request(self, run: LineRun, one: Board) -> SignRequest:
+        """A good request for a board, as its line makes it, which nobody answers."""
+        self.at_hand.away = True
+        with pytest.raises(NotAnswered):
+            build(run, one)
+        self.at_hand.away = False
+        return self.at_hand.asked[-1]
+
+    def asks(self, request: SignRequest, by: Station | None = None, **more: Any) -> Answer:
+        """Have the office answer a request that a station signed as it stands."""
+        station = by or self.line
+        station.unlock()
+        octets = answer(self.office, seal_request(request, station.credentials().key), **more)
+        assert octets is not None
+        return open_answer(octets, lambda kid: self.office.point)
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    plant = Plant(tmp_path)
+    line = plant.member("west", "line")
+    plant.north.unlock()
+    line.unlock()
+    yield Desk(plant, plant.north, line, AtHand(plant.north))
+    plant.close()
+
+
+def proven(request: SignRequest, line: Station, one: Board, **changes: Any) -> SignRequest:
+    """The request changed, and the board asked again: what a station can do that has the board in its hands."""
+    new = replace(request, **changes)
+    blocks = new.image.unsigned_blocks()
+    asked = challenge(new.nonce, line.point, new.uuid, new.epoch, new.sequence, blocks)
+    return replace(new, proof=one.key.sign(prove_message(new.uuid, asked)))
+
+
+def test_a_line_without_sign_makes_authentic_boards_by_its_office(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    done = build(run, one)
+    assert done.verified.verdict == "authentic"
+    shown = security.decode(done.image.blocks[SECURITY])
+    assert shown.station_key == desk.office.point
+    (row,) = desk.line.plant.line.evidence(uuid=one.uuid)
+    assert codec.faults(codec.read(row.document), desk.office.identity.ca) == []
+    assert desk.office.pins.entry(one.uuid) is not None
+    assert run.job is not None
+    assert [unit.unit for unit in desk.office.plant.line.units(run.job.id)] == [1]
+
+
+def test_nothing_is_asked_twice_for_what_the_board_has(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    build(run, one)
+    assert build(run, one).verified.verdict == "authentic"
+    assert len(desk.at_hand.asked) == 1
+
+
+def test_an_office_that_is_away_costs_nothing_but_time(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    first = desk.request(run, one)
+    second = desk.request(run, one)
+    assert first.hash == second.hash, "the same request again: no second datasheet is made"
+    done = build(run, one)
+    assert (done.verified.verdict, len({request.hash for request in desk.at_hand.asked})) == ("authentic", 1)
+    assert security.decode(done.image.blocks[SECURITY]).sequence == 1
+
+
+def test_the_same_request_gets_the_same_answer_octet_for_octet(desk: Desk) -> None:
+    request = desk.request(desk.run(), board(1))
+    first = answer(desk.office, request.octets)
+    assert first == answer(desk.office, request.octets)
+    assert len(list(desk.office.plant.line.sign_requests(request.job, request.uuid, "in"))) == 1
+
+
+def test_calibrations_come_along_and_are_fitted_by_the_office(desk: Desk, tmp_path: Path) -> None:
+    one = board(1)
+    file = tmp_path / f"{one.uuid.hex()}.csv"
+    file.write_text("raw, value\n0, 0\n16384, 6.283185307\n")
+    rule = CalibrationRule("list", by_uuid={one.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
+    run = desk.run(tmp_path, calibration=rule)
+    assert build(run, one).verified.verdict == "authentic"
+    request = desk.at_hand.asked[-1]
+    other = proven(request, desk.line, one, nonce=bytes(16), calibration=b"raw, value\n0, 0\n16384, 7\n")
+    assert desk.asks(other).refused == "job"
+
+
+def _meta(image: Image) -> Image:
+    return image.with_block((0, 12), frame(bytes.fromhex("0304000c0101040100050d") + b"boom strain 7"))
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda r: {"image": _meta(r.image)}, "differs"),
+        (lambda r: {"image": Image(r.uuid, dict(list(r.image.blocks.items())[1:]))}, "differs"),
+        (lambda r: {"image": r.image.with_block((1, 5), frame(bytes.fromhex("030400050101")))}, "differs"),
+        (lambda r: {"name": "another"}, "differs"),
+        (lambda r: {"job": "11111111-2222-4333-8444-555555555555"}, "job"),
+        (lambda r: {"sequence": 65_536}, "sequence"),
+        (lambda r: {"calibration": b"raw, value\n0, 0\n"}, "job"),
+    ],
+)
+def test_a_station_with_the_board_in_its_hands_gets_nothing_that_the_office_did_not_make(
+    desk: Desk, change: Callable[[SignRequest], dict[str, Any]], word: str
+) -> None:
+    one = board(1)
+    request = desk.request(desk.run(), one)
+    told = desk.asks(proven(request, desk.line, one, **change(request)))
+    assert (told.refused, told.security) == (word, b"")
+    assert told.why
+    assert desk.office.plant.line.units(request.job) == []
+
+
+def test_without_the_board_nothing_is_signed(desk: Desk) -> None:
+    request = desk.request(desk.run(), board(1))
+    assert desk.asks(replace(request, epoch=request.epoch + 1)).refused == "proof"
+    assert desk.asks(replace(request, nonce=bytes(16))).refused == "proof"
+    mine = SoftwareKey(9)
+    made_up = replace(request, point=mine.point, key_signature=mine.sign(node_key_message(request.uuid, mine.point)))
+    assert desk.asks(made_up).refused == "proof"
+    assert desk.asks(replace(request, key_signature=bytes(64))).refused == "proof"
+
+
+def test_another_key_under_a_known_uuid_is_refused(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    build(run, one)
+    twin = Board(uuid=one.uuid)
+    request = desk.at_hand.asked[-1]
+    signed = twin.key.sign(node_key_message(twin.uuid, twin.key.point))
+    asked = replace(request, point=twin.key.point, key_signature=signed, nonce=bytes(16))
+    assert desk.asks(proven(asked, desk.line, twin)).refused == "other-key"
+
+
+def test_only_who_is_line_now_is_answered_with_a_signature(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    base = desk.plant.member("south", "base")
+    request = desk.request(run, one)
+    assert desk.asks(request, by=base).refused == "not-line"
+    assert answer(desk.office, seal_request(request, SoftwareKey(5))) is None, "nobody's"
+    assert answer(desk.office, seal_request(replace(request, to="0" * 64), desk.line.credentials().key)) is None
+    assert answer(desk.office, b"eyJ.x.y") is None
+
+
+def test_a_stolen_line_gets_nothing_after_its_removal(desk: Desk) -> None:
+    from teds_provision import plant
+
+    run, one = desk.run(), board(1)
+    request = desk.request(run, one)
+    assert desk.asks(request).security
+    desk.plant.change(plant.owner.without(desk.office, "west", "stolen", 0))
+    assert desk.asks(request).refused == "not-line", "not even what was answered before"
+
+
+def test_one_board_too_many_and_one_answer_too_many(desk: Desk) -> None:
+    run = desk.run(count=1, stations={desk.line.identity.fingerprint: 1})
+    one = board(1)
+    request = desk.request(run, one)
+    for number in range(MOST_ANSWERS):
+        told = desk.asks(proven(request, desk.line, one, nonce=number.to_bytes(16, "big")))
+        assert told.sequence == number + 1
+    assert desk.asks(proven(request, desk.line, one, nonce=bytes(15) + b"\xff")).refused == "full"
+    assert desk.line.plant.line.count_units(request.job)[0] == 1
+    two = board(2)  # the line forgot how to count
+    signed = two.key.sign(node_key_message(two.uuid, two.key.point))
+    more = replace(request, image=Image(two.uuid, request.image.blocks), point=two.key.point, key_signature=signed)
+    assert desk.asks(proven(more, desk.line, two, epoch=1)).refused == "full"
+
+
+def test_a_revoked_board_and_a_job_that_is_over_are_refused(desk: Desk) -> None:
+    one = board(1)
+    request = desk.request(desk.run(), one)
+    assert desk.asks(proven(request, desk.line, one, nonce=bytes(16)), jobs=[]).refused == "job"
+    desk.office.policy.deny(Revocation(one.uuid, None, "stolen", ""))
+    assert desk.asks(request).refused == "revoked"
+
+
+def test_a_person_may_let_a_sequence_jump(desk: Desk) -> None:
+    one = board(1)
+    request = proven(desk.request(desk.run(), one), desk.line, one, sequence=70_000)
+    assert desk.asks(request).refused == "sequence"
+    assert desk.asks(request, jump=True).sequence == 70_001
+
+
+def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
+    """An answer of the line's own making, or to another request, or that says something else."""
+    run, one = desk.run(), board(1)
+    office = desk.at_hand
+
+    class Liar:
+        def __init__(self, lie: Callable[[SignRequest], bytes]) -> None:
+            self.lie = lie
+
+        def ask(self, request: SignRequest) -> bytes | None:
+            return self.lie(request)
+
+    def forged(request: SignRequest) -> bytes:
+        return seal_answer(Answer(request.hash, 1, b"\0" * 40), desk.line.credentials().key)
+
+    def other(request: SignRequest) -> bytes:
+        return seal_answer(Answer("0" * 64, 1, b"\0" * 40), desk.office.credentials().key)
+
+    def nonsense(request: SignRequest) -> bytes:
+        return seal_answer(Answer(request.hash, 1, b"\0" * 40), desk.office.credentials().key)
+
+    for lie in (forged, other, nonsense):
+        run.office = Liar(lie)
+        with pytest.raises(NotAuthentic):
+            build(run, one)
+    run.office = office
+    assert build(run, one).verified.verdict == "authentic"
+
+
+def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    assert run.job is not None
+    desk.office.plant.line.set_job_state(run.job.id, "closed")
+    with pytest.raises(Refused, match=r"\(job\)"):
+        build(run, one)
+    desk.office.plant.line.set_job_state(run.job.id, "open")
+    assert build(run, one).verified.verdict == "authentic"
+
+
+def test_who_has_not_sign_is_no_office(desk: Desk) -> None:
+    request = desk.request(desk.run(), board(1))
+    with pytest.raises(PolicyRefused, match="role sign"):
+        answer(desk.line, request.octets)
+
+
+def test_the_known_request_and_answer_are_read(desk: Desk) -> None:
+    documents, points = (
+        KAT["documents"],
+        {key["fingerprint"]: bytes.fromhex(key["point"]) for key in KAT["keys"].values()},
+    )
+    request = open_request(documents["sign-request"]["jws"].encode(), points.get)
+    assert request.hash == documents["sign-request"]["H"]
+    told = KAT["sign_request"]
+    values = {(int(one[:4], 16), int(one[4:6], 16)): bytes.fromhex(one[6:]) for one in told["values_108"]}
+    hashed = b"TEDS1 sign request\0" + request.nonce + request.line + request.uuid
+    hashed += request.epoch.to_bytes(4, "big") + request.sequence.to_bytes(4, "big")
+    hashed += b"".join(c.to_bytes(2, "big") + bytes([a]) + digest for (c, a), digest in values.items())
+    assert hashed.hex() == told["hashed"]
+    assert hashlib.sha256(hashed).hexdigest() == told["challenge"]
+    answered = open_answer(documents["signed"]["jws"].encode(), points.get)
+    assert (answered.of, answered.sequence) == (request.hash, 1)
+
+
+def test_a_request_from_the_future_waits(desk: Desk) -> None:
+    request = desk.request(desk.run(), board(1))
+    late = replace(request, created=NOW + timedelta(hours=25))
+    assert answer(desk.office, seal_request(late, desk.line.credentials().key)) is None

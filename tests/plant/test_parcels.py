@@ -1,0 +1,279 @@
+"""Keys that travel by themselves: whom a share reaches, what comes in without a question, what waits for a person."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from teds_provision.handover import outgoing
+from teds_provision.plant import parcels
+from teds_provision.plant.post import Parcel
+from teds_provision.protocol.plant.roster import Share
+from teds_provision.station.station import Station
+from tests.plant.handing import Plant, board_of
+
+ROLES = {"north": "keeper sign line base", "south": "base", "west": "line"}
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    made = Plant(tmp_path, *ROLES)
+    made.trusted()
+    yield made
+    made.close()
+
+
+def everything(plant: Plant, *to: str, forget: bool = False) -> Share:
+    return Share(("all", ""), tuple(plant[name].fingerprint for name in to), forget)
+
+
+def now(days: float = 0) -> datetime:
+    return datetime.now(UTC) + timedelta(days=days)
+
+
+def sync(plant: Plant, *names: str, at: datetime | None = None) -> None:
+    for name in names:
+        parcels.take_in(plant[name], plant.post, plant.views(name), at or now())
+        parcels.send_out(plant[name], plant.post, plant.views(name), at or now())
+
+
+def holds(station: Station, uuid: bytes) -> list[tuple[int, str]]:
+    return [(key.epoch, key.source) for key in station.keys.of(uuid)]
+
+
+def waits(station: Station) -> list[str]:
+    return [row.detail for row in station.plant.parcels.parcels("in", "waiting")]
+
+
+def test_a_key_goes_to_who_shares_it_and_its_receipt_comes_back(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west", "south")
+    assert holds(plant["south"], board.uuid) == [(1, "import")]
+    assert parcels.waiting_out(plant["west"]) == 1
+    sync(plant, "west")
+    assert parcels.waiting_out(plant["west"]) == 0
+    assert plant.post.there == {}
+    assert [holder.fingerprint for holder in plant["west"].keys.holders(board.uuid)] == [plant["south"].fingerprint]
+
+
+def test_nothing_goes_round_in_circles(plant: Plant) -> None:
+    plant.roster(ROLES | {"west": "line base"}, everything(plant, "north", "south", "west"))
+    board = board_of(plant["west"], os.urandom(10))
+    for _ in range(3):
+        sync(plant, "west", "north", "south")
+    assert [len(holds(plant[name], board.uuid)) for name in ROLES] == [1, 1, 1]
+    assert plant.post.there == {}
+    sent = [one for name in ROLES for one in plant[name].handovers.all() if one.direction == "out"]
+    assert len(sent) == 2
+
+
+def test_a_group_is_the_senders_own_or_a_keepers(plant: Plant) -> None:
+    plant.roster(ROLES, Share(("group", "cell 3"), (plant["south"].fingerprint,)))
+    own, keepers, strangers = (board_of(plant["west"], os.urandom(10)) for _ in range(3))
+    for name, board in (("west", own), ("north", keepers), ("south", strangers)):
+        with plant[name].transaction():
+            plant[name].plant.tell("grouped", board.uuid, group="cell 3", member=True)
+    sync(plant, "west", "south")
+    assert [bool(holds(plant["south"], board.uuid)) for board in (own, keepers, strangers)] == [True, True, False]
+
+
+def test_who_forgets_keeps_nothing_once_all_have_it(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "north", "south", forget=True))
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west", "south", "west")
+    assert holds(plant["west"], board.uuid), "one of two has not receipted"
+    sync(plant, "north", "west")
+    assert holds(plant["west"], board.uuid) == []
+    assert holds(plant["south"], board.uuid)
+    sync(plant, "west", "north", "south")
+    assert plant.post.there == {}
+
+
+def test_a_copy_that_nobody_shares_waits_for_a_person(plant: Plant) -> None:
+    plant.roster(ROLES)
+    board = board_of(plant["west"], os.urandom(10))
+    station = plant["west"]
+    with station.lock("test"):
+        plan = outgoing.plan_export(station, outgoing.ExportOrder(("south",), (board.uuid,)))
+        parcels.send_export(station, plan, now())
+    sync(plant, "west", "south")
+    assert holds(plant["south"], board.uuid) == []
+    assert waits(plant["south"]) == [f"{board.uuid.hex()}: no share of the roster sends it here"]
+    assert plant.post.there == {}
+
+
+def test_a_move_waits_for_a_person_whatever_the_roster_shares(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    station = plant["west"]
+    with station.lock("test"):
+        order = outgoing.ExportOrder(("south",), (board.uuid,), "move")
+        parcels.send_export(station, outgoing.plan_export(station, order), now())
+    sync(plant, "west", "south")
+    assert waits(plant["south"]) == ["a move is a person's to take in"]
+
+
+def test_what_comes_before_its_senders_pages_waits_one_sync_then_for_a_person(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    plant.deaf = {"west"}
+    early, late = board_of(plant["west"], os.urandom(10)), None
+    sync(plant, "west", "south")
+    assert holds(plant["south"], early.uuid) == []
+    assert waits(plant["south"]) == []
+    plant.deaf = set()
+    sync(plant, "south")
+    assert holds(plant["south"], early.uuid)
+    plant.deaf = {"west"}
+    late = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west", "south", "south")
+    assert holds(plant["south"], late.uuid) == []
+    assert len(waits(plant["south"])) == 1
+
+
+def test_a_node_on_which_keepers_do_not_agree_waits_and_holds_up_no_other(plant: Plant) -> None:
+    plant.roster(ROLES | {"south": "keeper base"}, everything(plant, "south"))
+    clear, disputed = (board_of(plant["west"], os.urandom(10)) for _ in range(2))
+    for name, key in (("north", "aa"), ("south", "bb")):
+        with plant[name].transaction():
+            plant[name].plant.tell("pinned", disputed.uuid, fingerprint=key * 32, assurance="tap")
+    sync(plant, "west", "south")
+    assert holds(plant["south"], clear.uuid)
+    assert holds(plant["south"], disputed.uuid) == []
+    assert "two keys" in waits(plant["south"])[0]
+
+
+def test_a_bundle_of_which_nothing_is_taken_is_refused_and_never_sent_again(plant: Plant) -> None:
+    plant.roster({**ROLES, "south": "base line"}, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    other = board_of(plant["south"], board.uuid)
+    assert other.key.point != board.key.point
+    sync(plant, "west", "south")
+    [row] = plant["west"].plant.parcels.parcels("out", "sent")
+    claims = plant.views("west")
+    with plant["west"].transaction():  # as the fold would have it
+        tables, told = plant["west"].plant.tables, plant["south"].plant.tables.outbox(100)
+        assert any('"refused"' in text and row.about in text for _, _, text in told)
+        from teds_provision.protocol.plant.claim import Claim
+
+        chain = tables.chain(plant["south"].fingerprint).chain
+        refused = {(row.about, plant["west"].fingerprint, "no")}
+        tables.put_claims(chain, {board.uuid: Claim(refused=refused).to_json()})
+    parcels.send_out(plant["west"], plant.post, claims, now())
+    assert parcels.waiting_out(plant["west"]) == 0
+    parcels.send_out(plant["west"], plant.post, claims, now(8))
+    assert plant.post.there == {}
+
+
+def test_a_copy_without_receipt_is_made_anew_after_seven_days(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west")
+    [lost] = list(plant.post.there)
+    plant.post.there.clear()
+    sync(plant, "west", at=now(6))
+    assert plant.post.there == {}
+    sync(plant, "west", at=now(8))
+    assert list(plant.post.there) != [lost]
+    sync(plant, "south", at=now(8))
+    assert holds(plant["south"], board.uuid)
+
+
+def test_a_move_without_receipt_goes_again_under_its_old_id(plant: Plant) -> None:
+    plant.roster(ROLES)
+    board = board_of(plant["west"], os.urandom(10))
+    station = plant["west"]
+    with station.lock("test"):
+        order = outgoing.ExportOrder(("south",), (board.uuid,), "move")
+        parcels.send_export(station, outgoing.plan_export(station, order), now())
+    sync(plant, "west")
+    [first] = station.plant.parcels.parcels("out", "sent")
+    sync(plant, "west", at=now(8))
+    [again] = station.plant.parcels.parcels("out", "sent")
+    assert (again.about, again.id != first.id) == (first.about, True)
+
+
+def test_what_the_post_takes_no_more_goes_with_a_later_sync(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    plant.post.full = True
+    sync(plant, "west")
+    plant.post.full = False
+    sync(plant, "west", "south")
+    assert holds(plant["south"], board.uuid)
+
+
+def test_nothing_goes_by_itself_once_the_roster_has_expired(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"), days=30)
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west", at=now(40))
+    assert plant.post.there == {}
+    sync(plant, "west")
+    parcels.take_in(plant["south"], plant.post, plant.views("south"), now(6))
+    assert holds(plant["south"], board.uuid)
+
+
+def test_a_removed_station_gets_nothing(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board_of(plant["west"], os.urandom(10))
+    plant.post.full = True
+    sync(plant, "west")
+    plant.post.full = False
+    plant.roster({"north": "keeper", "west": "line"}, removed={"south": (0, "")})
+    sync(plant, "west")
+    assert plant.post.there == {}
+
+
+def test_junk_and_what_is_for_others_is_thrown_away_and_told(plant: Plant) -> None:
+    plant.roster(ROLES)
+    station = plant["south"]
+    for octets in (b"junk", b"{}", b'{"a": 1}', b"", b"a.b.c", os.urandom(100)):
+        plant.post.send(Parcel(os.urandom(4).hex(), station.fingerprint, octets, "2027-01-01T00:00:00Z"))
+    sync(plant, "south")
+    assert plant.post.there == {}
+    assert [alarm.code for alarm in station.plant.tables.alarms()] == ["parcel"]
+
+
+def test_the_same_parcel_again_gives_the_same_receipt(plant: Plant) -> None:
+    plant.roster(ROLES, everything(plant, "south"))
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west")
+    [parcel] = list(plant.post.there.values())
+    sync(plant, "south")
+    plant.post.there[parcel.id] = parcel  # a cut between import and taking it away, or an administrator
+    sync(plant, "south", "west", "west")
+    assert plant.post.there == {}
+    assert len(holds(plant["south"], board.uuid)) == 1
+
+
+def test_another_holder_shares_for_a_maker_that_was_removed(plant: Plant) -> None:
+    plant.roster(ROLES | {"west": "line base"}, everything(plant, "north"))
+    board = board_of(plant["west"], os.urandom(10))
+    sync(plant, "west", "north", "west")
+    north = plant["north"]
+    [key] = north.keys.of(board.uuid)
+    north._store.activate_key(board.uuid, key.key_id)  # proven in a session
+    plant.roster({"north": "base", "south": "base"}, everything(plant, "south"), removed={"west": (1, "ab" * 32)})
+    sync(plant, "north")
+    sync(plant, "south")
+    assert holds(plant["south"], board.uuid) == [(1, "import")]
+
+
+def test_a_job_travels_sealed_and_comes_out_as_it_was_signed(plant: Plant) -> None:
+    from teds_provision.protocol.plant import document
+
+    plant.roster(ROLES)
+    members = {"format": document.JOB.format, "id": "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"}
+    signed = document.seal(members, plant["north"].vault.identity(), document.JOB)
+    parcels.enqueue(plant["north"], "job", plant["west"].fingerprint, signed)
+    sync(plant, "north")
+    [parcel] = plant.post.there.values()
+    assert b"teds-job" not in parcel.octets
+    sync(plant, "west")
+    [(row, octets)] = parcels.received(plant["west"], "job")
+    assert (row.peer, octets) == (plant["north"].fingerprint, signed)
+    assert plant.post.there == {}

@@ -1,0 +1,207 @@
+"""``registry`` as its keepers use it: three stations, each command a process, and a stick between them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.bench import PASSPHRASE
+from tests.cli.shell import Outcome, spawn
+from tests.plant.stations import certified, owner
+
+UUID = "8d4d9da65281f7000000"
+KEY = "ab" * 32
+
+
+class Desk:
+    """Homes of stations under one owner, and a stick."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.stick = folder, folder / "stick"
+        self.stick.mkdir()
+        north = owner(folder / "north")
+        for name in ("south", "west"):
+            certified(folder / name, name, north).close()
+        north.close()
+
+    def run(self, station: str, *words: object) -> Outcome:
+        return spawn("--home", self.folder / station, *words, passphrase=PASSPHRASE)
+
+    def ask(self, station: str, *words: object, code: int = 0) -> dict[str, object]:
+        done = self.run(station, "--json", *words)
+        assert done.code == code, (done.code, done.out, done.err)
+        answer: dict[str, object] = json.loads(done.out)
+        return answer
+
+    def sync(self, *stations: str, code: int = 0) -> dict[str, object]:
+        return [self.ask(station, "registry", "sync", "--files", self.stick, code=code) for station in stations][-1]
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path)
+
+
+def joined(desk: Desk) -> None:
+    made = desk.ask("north", "registry", "create", "--name", "plant Augsburg", "--yes")
+    assert made["version"] == 1
+    for name, roles in (("south", ["base"]), ("west", ["line", "sign"])):
+        asked = desk.folder / f"{name}.request"
+        told = desk.ask(name, "registry", "request", "--output", asked)
+        assert str(told["role"]) == f"teds_{str(told['fingerprint'])[:16]}"
+        words = [word for one in roles for word in ("--role", one)]
+        desk.ask("north", "registry", "add", asked, *words, "--yes")
+    desk.ask("north", "registry", "connect", "--files", desk.stick, "--yes")
+    desk.sync("north")
+    for name in ("south", "west"):
+        assert desk.ask(name, "registry", "connect", "--files", desk.stick, "--yes")["version"] == 3
+
+
+def test_three_stations_join_and_see_the_same(desk: Desk) -> None:
+    joined(desk)
+    desk.ask("north", "whitelist", "add", UUID, "--fingerprint", KEY)
+    desk.sync("north", "south", "west", "north", "south", "west")
+    seen = [desk.ask(name, "registry", "status") for name in ("north", "south", "west")]
+    assert len({json.dumps(one["heads"]) for one in seen}) == 1
+    assert {one["roster"] for one in seen} == {3}
+    listed = desk.ask("south", "whitelist", "list")["whitelist"]
+    assert isinstance(listed, list)
+    assert [(one["uuid"], one["assurance"]) for one in listed] == [(UUID, "registry")]
+    events = desk.ask("west", "registry", "log", UUID)["events"]
+    assert isinstance(events, list)
+    assert [(one["act"], one["station"]) for one in events] == [("pinned", "north")]
+    (node,) = desk.ask("west", "nodes", "--plant")["nodes"]  # type: ignore[misc]
+    assert node["uuid"] == UUID
+    assert node["says"]["pinned_by"] == {"north": KEY}
+    assert node["conflicts"] == []
+    assert UUID in desk.run("west", "nodes", "--plant", "8d4d").out
+    assert desk.run("west", "registry", "log").out.count("pinned") == 1
+    shown = desk.run("west", "registry", "status")
+    assert "plant Augsburg" in shown.out
+    assert "here" in shown.out
+
+
+def test_a_removed_station_is_told_so_and_the_others_go_on(desk: Desk) -> None:
+    joined(desk)
+    desk.ask("west", "whitelist", "add", UUID, "--fingerprint", KEY)
+    desk.sync("west", "north")
+    refused = desk.run("north", "registry", "remove", "west", "--stolen", "--yes")
+    assert refused.code == 2
+    assert "--last" in refused.err
+    desk.ask("north", "registry", "remove", "west", "--stolen", "--last", 1, "--yes")
+    desk.sync("north")
+    told = desk.ask("west", "registry", "sync", "--files", desk.stick, code=6)
+    assert told["error"]["code"] == "not-member"  # type: ignore[index]
+    assert desk.ask("west", "registry", "status", code=6)["members"]
+    desk.sync("south")
+    refused = desk.run("south", "trust", "remove", "north", "--yes")
+    assert refused.code == 6
+
+
+def test_members_are_trusted_and_the_roster_alone_says_so(desk: Desk) -> None:
+    joined(desk)
+    desk.sync("south")
+    listed = desk.ask("south", "trust", "list")["trusted"]
+    assert isinstance(listed, list)
+    assert {(one["name"], one["source"]) for one in listed} == {("north", "roster"), ("west", "roster")}
+
+
+def test_a_roster_is_drafted_here_and_signed_where_the_ca_key_is(desk: Desk) -> None:
+    joined(desk)
+    draft, signed = desk.folder / "roster.draft", desk.folder / "roster.signed"
+    desk.ask("south", "registry", "role", "west", "line", "--draft", draft)
+    refused = desk.run("south", "registry", "sign", draft, "--output", signed, "--yes")
+    assert refused.code == 3
+    desk.ask("north", "registry", "sign", draft, "--output", signed, "--yes")
+    assert desk.ask("north", "registry", "status")["roster"] == 4
+    assert signed.read_bytes().count(b".") == 2
+
+
+def test_the_doctor_sees_the_registry_and_none_where_none_was_joined(desk: Desk) -> None:
+    def found(station: str) -> list[tuple[str, str]]:
+        checks = json.loads(desk.run(station, "--json", "doctor").out)["checks"]
+        return [(one["result"], one["why"]) for one in checks if one["name"] == "registry"]
+
+    assert found("south") == []
+    joined(desk)
+    assert any("never" in why for _, why in found("south"))
+    desk.sync("south")
+    assert {result for result, _ in found("south")} == {"ok"}
+
+
+def test_who_joined_none_is_told_how(desk: Desk) -> None:
+    for words in (["status"], ["sync", "--files", desk.stick], ["log"], ["seen"], ["renew"]):
+        done = desk.run("south", "registry", *words)
+        assert done.code == 6
+        assert "registry connect" in done.err
+
+
+def test_a_station_that_the_roster_does_not_name_cannot_join(desk: Desk) -> None:
+    desk.ask("north", "registry", "create", "--name", "plant", "--yes")
+    desk.ask("north", "registry", "sync", "--files", desk.stick)
+    done = desk.run("south", "registry", "connect", "--files", desk.stick, "--yes")
+    assert done.code == 3
+    assert "registry request" in done.err
+
+
+def test_a_station_of_another_ca_is_not_added(desk: Desk, tmp_path: Path) -> None:
+    owner(tmp_path / "stranger", "stranger").close()
+    desk.ask("north", "registry", "create", "--name", "plant", "--yes")
+    asked = tmp_path / "stranger.request"
+    desk.ask("stranger", "registry", "request", "--output", asked)
+    done = desk.run("north", "registry", "add", asked, "--role", "base", "--yes")
+    assert done.code == 6
+    assert "not certified" in done.err
+
+
+def test_a_second_request_is_the_same_and_a_plan_changes_nothing(desk: Desk) -> None:
+    first, second = desk.folder / "1.request", desk.folder / "2.request"
+    desk.ask("south", "registry", "request", "--output", first)
+    desk.ask("south", "registry", "request", "--output", second)
+    assert first.read_bytes() == second.read_bytes()
+    assert desk.ask("north", "registry", "create", "--name", "plant", "--dry-run")["plan"] is True
+    assert desk.run("north", "registry", "status").code == 6
+
+
+def test_leaving_is_asked_for_and_said(desk: Desk) -> None:
+    joined(desk)
+    assert desk.run("south", "registry", "disconnect").code == 6
+    desk.ask("south", "registry", "disconnect", "--yes")
+    assert desk.run("south", "registry", "status").code == 6
+    assert desk.ask("south", "registry", "connect", "--files", desk.stick, "--yes")["version"] == 3
+
+
+def test_a_fork_stops_the_copy_and_a_person_resumes(desk: Desk) -> None:
+    joined(desk)
+    desk.sync("west")
+    shutil.copytree(desk.folder / "west", desk.folder / "copy")
+    desk.ask("copy", "whitelist", "add", UUID, "--fingerprint", KEY)
+    desk.sync("copy")
+    desk.ask("west", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
+    told = desk.ask("west", "registry", "sync", "--files", desk.stick, code=4)
+    assert told["error"]["code"] == "fork"  # type: ignore[index]
+    assert desk.ask("west", "registry", "status", code=4)["alarms"]
+    assert desk.ask("west", "registry", "resume", "--files", desk.stick, "--yes")["done"] == 1
+    desk.sync("west")
+
+
+def test_a_home_rebuilt_from_a_backup_takes_its_own_pages_back(desk: Desk) -> None:
+    joined(desk)
+    copy = desk.folder / "west.backup"
+    made = desk.ask("west", "backup", copy)
+    assert made
+    desk.ask("west", "whitelist", "add", UUID, "--fingerprint", KEY)
+    desk.sync("west", "north")
+    home = (desk.folder / "west" / "registry-home").read_text()
+    shutil.rmtree(desk.folder / "west")
+    desk.ask("west", "restore", copy, "--yes")
+    assert (desk.folder / "west" / "registry-home").read_text() != home
+    desk.ask("west", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
+    told = desk.sync("west")
+    assert "before its backup" in str(told["told"])
+    assert desk.ask("west", "registry", "status")["unsent"] == 0
+    desk.sync("north")
+    assert len(desk.ask("north", "registry", "log", "--station", "west")["events"]) == 2  # type: ignore[arg-type]

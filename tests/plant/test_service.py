@@ -1,0 +1,114 @@
+"""The service that follows a registry: woken by what others push, and unharmed by a registry that is gone."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.demo.cluster import Cluster
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.plant import PlantWatch
+from teds_provision.ncap.web.metrics import text
+from teds_provision.plant import membership, reaching
+from teds_provision.plant.schema import member_sql
+from teds_provision.plant.sync import sync
+from teds_provision.protocol.plant.document import open_request
+from teds_provision.station.station import Station
+from tests.pace import until
+from tests.plant.handing import board_of
+from tests.plant.test_synced_by_database import Office
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture
+def office(tmp_path: Path, cluster: Cluster) -> Iterator[Office]:
+    made = Office(tmp_path, cluster)
+    made.member("south", "base")
+    yield made
+    made.plant.close()
+
+
+def by_url(office: Office, station: Station) -> Station:
+    """Joined by the database's URL and the login of its own request, as `registry connect` does it."""
+    from dataclasses import replace
+
+    asked = open_request(membership.request(station))
+    office.database.sql(member_sql(asked.fingerprint, asked.login))
+    record = station.plant.joined
+    assert record is not None
+    station.plant.tables.put_plant(replace(record, url=office.database.url))
+    return station
+
+
+def synced(station: Station) -> None:
+    post = reaching.post_of(station)
+    assert post is not None
+    sync(station, post)
+    post.close()
+
+
+def watching(station: Station) -> tuple[PlantWatch, list[dict[str, Any]], list[float]]:
+    live, told, changed = Live(), list[dict[str, Any]](), list[float]()
+    live.told = told.append
+    return PlantWatch(station, live, lambda: changed.append(time.monotonic())), told, changed
+
+
+def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(office: Office) -> None:
+    north, south = by_url(office, office.north), by_url(office, office.plant.stations[1])
+    synced(north)
+    watch, told, changed = watching(south)
+    watch.start()
+    try:
+        until(lambda: any(one["state"] == "synced" for one in told), told)
+        until(lambda: watch._listener is not None and watch._listener._connection is not None)
+        time.sleep(0.2)
+        board = board_of(north, os.urandom(10))
+        before = len(changed)
+        synced(north)
+        pushed = time.monotonic()
+        until(lambda: len(changed) > before, "it was not woken", 30)
+        assert changed[before] - pushed < 10, "only by the minute"
+        assert north.fingerprint in south.plant.tables.claims_of([board.uuid])[board.uuid]
+        status = watch.status()
+        assert status is not None
+        assert [one["name"] for one in status["stations"]] == ["north", "south"]
+        assert (status["state"], status["unsent"]) == ("synced", 0)
+        lines = text({"version": "1", "station": {"name": "south"}, "links": [], "measurements": [], "sinks": [],
+                      "budget": {"used": 0}, "clients": 0}, status)  # fmt: skip
+        assert "teds_registry_alarms 0\n" in lines
+        assert "teds_registry_age_seconds " in lines
+    finally:
+        watch.stop()
+
+
+def test_a_registry_that_is_gone_is_told_once_and_stops_nothing(office: Office, cluster: Cluster) -> None:
+    south = by_url(office, office.plant.stations[1])
+    cluster.psql(f"alter database {office.database.name} allow_connections false")
+    watch, told, _ = watching(south)
+    watch.start()
+    try:
+        until(lambda: any(one["state"] == "unreachable" for one in told), told)
+        watch._wake.set()
+        time.sleep(0.3)
+        assert [one["state"] for one in told] == ["unreachable"]
+    finally:
+        watch.stop()
+
+
+def test_an_alarm_is_told(office: Office) -> None:
+    from teds_provision.store.tables.plant import Alarm
+
+    south = by_url(office, office.plant.stations[1])
+    south.plant.tables.put_alarm(Alarm("junk", office.north.fingerprint, 1, "something is there"))
+    watch, told, _ = watching(south)
+    watch.start()
+    try:
+        until(lambda: any(one["state"] == "alarm" for one in told), told)
+    finally:
+        watch.stop()

@@ -1,0 +1,87 @@
+"""The fold over a store's rows comes to what the pure functions say, in whatever pieces and order pages arrive."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from teds_provision import plant
+from teds_provision.plant.folding import judge, put_roster, recount, take_pages, views
+from teds_provision.protocol.plant.page import open_page
+from teds_provision.protocol.plant.roster import Roster, open_roster, seal_roster
+from teds_provision.station.station import Station
+from tests.bench import make_station
+from tests.plant.plants import CA, NODES, REGISTRY, Reader, roster_of
+from tests.plant.test_fold import DIGEST, DIGEST2, chatter
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    made = make_station(tmp_path / "home")
+    made.unlock()
+    yield made
+    made.close()
+
+
+def held(station: Station, roster: Roster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a roster of the test's CA count in a station of another one."""
+    from teds_provision.store.tables.plant import PlantRecord
+
+    monkeypatch.setattr(type(station.identity), "ca", property(lambda self: CA.point))
+    station.plant.tables.put_plant(PlantRecord(REGISTRY, mac=station.seals.note("plant", REGISTRY)))
+    put_roster(station, open_roster(seal_roster(roster, CA), CA.point))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
+    station: Station, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    speakers = chatter(seed)
+    gone = speakers[seed % len(speakers)]
+    first = roster_of(speakers)
+    second = roster_of([one for one in speakers if one is not gone], [(gone, gone.head)], version=2)
+    held(station, first, monkeypatch)
+    chance = random.Random(seed)
+    waiting = [open_page(octets, REGISTRY, first.point_of) for one in speakers for octets in one.pages]
+    half = len(waiting) // 2
+    while waiting:  # a page comes when one before it is here, as a sync asks for them
+        chance.shuffle(waiting)
+        for page in list(waiting):
+            names = station.plant.tables.page_names(station.plant.tables.chain(page.station).chain)
+            if page.n == 1 or any(n == page.n - 1 for n, _, _ in names):
+                roster = station.plant.roster
+                assert roster is not None
+                take_pages(station, roster, [page])
+                waiting.remove(page)
+                break
+        if len(waiting) == half:
+            put_roster(station, second)
+        if chance.random() < 0.3:
+            judge(station)
+    judge(station)
+    roster = station.plant.roster
+    assert roster is not None
+    oracle = Reader(roster, [octets for one in speakers for octets in one.pages])
+    seen = views(station, roster, NODES)
+    from teds_provision.protocol.plant.fold import Own
+
+    for uuid in NODES:
+        due = oracle.view(uuid, Own(station.fingerprint))
+        assert seen[uuid] == due
+        entry = station.pins.entry(uuid)
+        assert (entry.fingerprint if entry is not None else None) == (None if due.bans else due.pin)
+        assert (station.policy.revocation(uuid) is not None) == bool(due.bans)
+        assert {name for _, name, _ in station.plant.tables.conflicts(uuid)} == set(due.conflicts)
+    rules = station.plant.signer_rules()
+    assert rules is not None
+    for one in speakers:
+        for digest in (DIGEST, DIGEST2):
+            found = rules.signing(CA.point, one.key.point, bytes.fromhex(digest))
+            assert found == oracle.signing(one.fingerprint, digest)
+    for one in speakers:  # said anew, nothing changes
+        recount(station, station.plant.tables.chain(one.fingerprint), roster)
+    assert views(station, roster, NODES) == seen
+    assert plant.folding.heads_digest(station)[1] == sum(counts.newest[0] > 0 for counts in oracle.counting.values())

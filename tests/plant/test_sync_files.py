@@ -1,0 +1,227 @@
+"""Two and three stations of one owner, and a stick that is carried between them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision import plant
+from teds_provision.errors import LinkFailure, PolicyRefused
+from teds_provision.plant.folding import heads_digest, views
+from teds_provision.plant.sync import Fork, NotMember, resume
+from teds_provision.station.station import Station
+from teds_provision.store import WhitelistEntry
+from tests.plant.stations import Plant, ask
+
+UUID = bytes.fromhex("8d4d9da65281f7000000")
+KEY = "ab" * 32
+
+
+@pytest.fixture
+def plants(tmp_path: Path) -> Iterator[Plant]:
+    made = Plant(tmp_path)
+    yield made
+    made.close()
+
+
+def pin(station: Station, uuid: bytes = UUID, key: str = KEY) -> None:
+    station.pins.put(WhitelistEntry(uuid, key, assurance="tap"))
+
+
+def alarms(station: Station) -> list[str]:
+    return [one.code for one in station.plant.tables.alarms()]
+
+
+def test_what_one_station_says_reaches_all_and_all_see_the_same(plants: Plant) -> None:
+    south, west = plants.member("south", "base"), plants.member("west", "line", "sign")
+    pin(west)
+    plants.round()
+    plants.round()
+    assert len({heads_digest(station) for station in plants.stations}) == 1
+    for station in (plants.north, south):
+        roster = station.plant.roster
+        assert roster is not None
+        assert views(station, roster, [UUID])[UUID].pins == {west.fingerprint: KEY}
+        assert not alarms(station)
+
+
+def test_a_keepers_pin_goes_on_the_whitelist_of_all_and_off_when_he_takes_it_back(plants: Plant) -> None:
+    south = plants.member("south", "base")
+    pin(plants.north)
+    plants.round()
+    entry = south.pins.entry(UUID)
+    assert entry is not None
+    assert (entry.fingerprint, entry.assurance) == (KEY, "registry")
+    assert plants.north.pins.remove(UUID)
+    plants.round()
+    assert south.pins.entry(UUID) is None
+
+
+def test_a_pin_of_ones_own_stays_whatever_a_keeper_says(plants: Plant) -> None:
+    south = plants.member("south", "base")
+    pin(south, key="cd" * 32)
+    pin(plants.north)
+    plants.round()
+    entry = south.pins.entry(UUID)
+    assert entry is not None
+    assert entry.fingerprint == "cd" * 32
+    assert [name for _, name, _ in south.plant.tables.conflicts(UUID)] == ["other pin"]
+
+
+def test_a_second_sync_with_nothing_new_does_nothing(plants: Plant) -> None:
+    plants.member("south", "base")
+    plants.round()
+    done = plants.sync(plants.north)
+    assert (done.pushed, done.fetched, done.rosters) == (0, 0, [])
+
+
+def test_a_removed_station_hears_of_it_and_is_asked_for_nothing_more(plants: Plant) -> None:
+    west = plants.member("west", "line", "sign")
+    plants.round()
+    plants.change(
+        plant.owner.without(plants.north, "west", "lost", plants.north.plant.tables.chain(west.fingerprint).counted[0])
+    )
+    plants.sync(plants.north)
+    with pytest.raises(NotMember, match="removed"):
+        plants.sync(west)
+
+
+def test_a_folder_of_another_registry_gives_nothing(plants: Plant, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    stranger = Plant(tmp_path / "other")
+    stranger.sync(stranger.north)
+    shutil.copytree(stranger.stick, plants.stick, dirs_exist_ok=True)
+    done = plants.sync(plants.north)
+    assert done.fetched == 0
+    stranger.close()
+
+
+def test_a_stick_that_is_not_plugged_in_is_said(plants: Plant) -> None:
+    with pytest.raises(LinkFailure, match="no folder"):
+        plants.sync(plants.north, plants.folder / "nothing")
+
+
+def test_junk_ends_nothing_and_is_asked_for_again(plants: Plant) -> None:
+    west = plants.member("west", "line", "sign")
+    pin(west)
+    plants.sync(west)
+    page = plants.stick / west.fingerprint / "1.jws"
+    good = page.read_bytes()
+    page.write_bytes(good[:-5] + b"AAAAA")
+    plants.sync(plants.north)
+    assert alarms(plants.north) == ["junk"]
+    page.write_bytes(good)
+    plants.sync(plants.north)
+    assert alarms(plants.north) == []
+    assert plants.north.plant.tables.chain(west.fingerprint).counted[0] == 1
+
+
+def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
+    west = plants.member("west", "line", "sign")
+    pin(west)
+    plants.sync(west)
+    west.close()
+    shutil.copytree(plants.folder / "west", plants.folder / "copy")
+    west = Station.open(plants.folder / "west", ask=ask)
+    copy = Station.open(plants.folder / "copy", ask=ask)
+    pin(copy, bytes(10))
+    plants.sync(copy)
+    pin(west, bytes([1] * 10))
+    with pytest.raises(Fork, match="copy of it"):
+        plants.sync(west)
+    assert west.plant.tables.unsent() >= 1
+    assert resume(west, plant.files.FilesPost(plants.stick)) == 1
+    plants.sync(west)
+    plants.sync(plants.north)
+    roster = plants.north.plant.roster
+    assert roster is not None
+    said = views(plants.north, roster, [bytes(10), bytes([1] * 10)])
+    assert all(view.pins for view in said.values())
+    assert "two-histories" not in alarms(plants.north)
+    west.close()
+    copy.close()
+
+
+def test_two_histories_on_two_sticks_are_found_where_they_meet(plants: Plant) -> None:
+    west = plants.member("west", "line", "sign")
+    pin(west)
+    plants.sync(west)
+    west.close()
+    shutil.copytree(plants.folder / "west", plants.folder / "copy")
+    other = plants.folder / "other stick"
+    shutil.copytree(plants.stick, other)
+    west, copy = (Station.open(plants.folder / name, ask=ask) for name in ("west", "copy"))
+    pin(west, bytes([1] * 10))
+    pin(copy, bytes([2] * 10))
+    plants.sync(west)
+    plants.sync(copy, other)
+    plants.sync(plants.north)
+    plants.sync(plants.north, other)
+    assert alarms(plants.north) == ["two-histories"]
+    chain = plants.north.plant.tables.chain(west.fingerprint)
+    assert chain.counted[0] == 1, "the part that both share goes on counting"
+    roster = plants.north.plant.roster
+    assert roster is not None
+    seen = views(plants.north, roster, [UUID, bytes([1] * 10)])
+    assert seen[UUID].pins
+    assert not seen[bytes([1] * 10)].pins
+    west.close()
+    copy.close()
+
+
+def test_a_home_that_a_backup_rebuilt_takes_its_pages_back_before_it_says_more(plants: Plant) -> None:
+    west = plants.member("west", "line", "sign")
+    pin(west)
+    plants.sync(west)
+    west.close()
+    shutil.copytree(plants.folder / "west", plants.folder / "yesterday")
+    west = Station.open(plants.folder / "west", ask=ask)
+    pin(west, bytes([1] * 10))
+    plants.sync(west)
+    west.close()
+    back = Station.open(plants.folder / "yesterday", ask=ask)
+    back.unlock()
+    back.plant.begin_restored()
+    pin(back, bytes([2] * 10))
+    plants.sync(back)
+    assert not back.plant.restored
+    assert back.plant.tables.chain(back.fingerprint).counted[0] == 3
+    assert not alarms(back)
+    back.close()
+
+
+def test_a_rebuilt_home_waits_where_somebody_has_seen_more_of_it(plants: Plant) -> None:
+    west = plants.member("west", "line", "sign")
+    pin(west)
+    plants.sync(west)
+    west.close()
+    shutil.copytree(plants.folder / "west", plants.folder / "yesterday")
+    west = Station.open(plants.folder / "west", ask=ask)
+    old = plants.folder / "old stick"
+    shutil.copytree(plants.stick, old)
+    pin(west, bytes([1] * 10))
+    plants.sync(west)
+    plants.sync(plants.north)
+    pin(plants.north, bytes([3] * 10))
+    plants.sync(plants.north)
+    west.close()
+    shutil.copytree(plants.stick / plants.north.fingerprint, old / plants.north.fingerprint, dirs_exist_ok=True)
+    back = Station.open(plants.folder / "yesterday", ask=ask)
+    plants.sync(back, old)  # it hears what north has seen of it
+    back.unlock()
+    back.plant.begin_restored()
+    with pytest.raises(PolicyRefused, match="has seen page 2"):
+        plants.sync(back, old)
+    plants.sync(back)
+    assert not back.plant.restored
+    back.close()
+
+
+def test_a_person_names_the_branch_or_the_roster_does(plants: Plant) -> None:
+    chain = replace(plants.north.plant.tables.chain("f" * 64), accepted=(3, "a" * 64))
+    plants.north.plant.tables.put_chain(chain)
+    assert plants.north.plant.tables.chain("f" * 64) == chain

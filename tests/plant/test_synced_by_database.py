@@ -1,0 +1,192 @@
+"""Stations that sync through a real PostgreSQL: pages, rosters, keys, and what the way does to them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision import plant as plant_room
+from teds_provision.demo.cluster import Cluster
+from teds_provision.errors import NotAuthentic, RegistryFailure
+from teds_provision.plant.postgres import PostgresPost, Registry, parameters
+from teds_provision.plant.schema import member_sql, mend_sql, registry_sql
+from teds_provision.plant.scram import verifier
+from teds_provision.plant.sync import Synced, sync
+from teds_provision.protocol.plant.roster import Share
+from teds_provision.station.station import Station
+from teds_provision.store import TrustRecord
+from tests.plant.handing import board_of
+from tests.plant.postgres import Database
+from tests.plant.relay import relay
+from tests.plant.stations import Plant
+
+pytestmark = pytest.mark.system
+
+
+class Office:
+    """A plant whose stations sync through a database of its own."""
+
+    def __init__(self, folder: Path, cluster: Cluster) -> None:
+        self.plant = Plant(folder)
+        self.database = Database(cluster, f"plant_{os.urandom(4).hex()}", self.plant.roster.registry)
+        cluster.psql(f"create database {self.database.name}")
+        self.database.sql(registry_sql(self.database.registry))
+        self.secrets: dict[str, bytes] = {}
+        self.north = self.known(self.plant.north)
+
+    def known(self, station: Station) -> Station:
+        self.secrets[station.fingerprint] = secret = os.urandom(32)
+        self.database.sql(member_sql(station.fingerprint, verifier(secret)))
+        return station
+
+    def member(self, name: str, *roles: Any) -> Station:
+        made = self.known(self.plant.member(name, *roles))
+        for one, other in ((made, self.north), (self.north, made)):
+            if other.fingerprint not in one.policy.station_points():
+                one.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+        return made
+
+    def post(self, station: Station, **more: Any) -> PostgresPost:
+        told = parameters(self.database.url, station.fingerprint, self.secrets[station.fingerprint])
+        return PostgresPost(Registry(told | more), "the registry", station.fingerprint)
+
+    def sync(self, *stations: Station) -> Synced:
+        done = Synced()
+        for station in stations:
+            post = self.post(station)
+            done = sync(station, post)
+            post.close()
+        return done
+
+
+@pytest.fixture
+def office(tmp_path: Path, cluster: Cluster) -> Iterator[Office]:
+    made = Office(tmp_path, cluster)
+    yield made
+    made.plant.close()
+
+
+def roster_with(office: Office, share: Share) -> None:
+    office.plant.change(plant_room.owner.shared(office.north, share))
+
+
+def test_pages_and_rosters_reach_everybody(office: Office) -> None:
+    south = office.member("south", "base")
+    board = board_of(office.north, os.urandom(10))
+    office.sync(office.north, south)
+    assert south.plant.tables.chains()[office.north.fingerprint].counted == (
+        office.north.plant.tables.chains()[office.north.fingerprint].counted
+    )
+    assert office.north.fingerprint in south.plant.tables.claims_of([board.uuid])[board.uuid]
+    west = office.member("west", "line")
+    office.sync(office.north, south)
+    assert south.plant.roster is not None
+    assert south.plant.roster.member(west.fingerprint) is not None
+
+
+def test_nothing_new_is_one_round_trip(office: Office) -> None:
+    south = office.member("south", "base")
+    office.sync(office.north, south, office.north, south)
+    with relay(office.database.cluster.port) as way:
+        post = office.post(south, port=way.port)
+        post.registry()
+        before = way.sent
+        done = sync(south, post)
+        assert (done.pushed, done.fetched, done.told) == (0, 0, [])
+        assert way.sent - before == 1
+        post.close()
+
+
+def test_a_shared_key_arrives_and_its_receipt_returns(office: Office) -> None:
+    south = office.member("south", "base")
+    roster_with(office, Share(("all", ""), (south.fingerprint,)))
+    office.sync(office.north, south)
+    board = board_of(office.north, os.urandom(10))
+    office.sync(office.north)
+    assert office.sync(south).parcels_in == 1
+    assert [key.epoch for key in south.keys.of(board.uuid)] == [1]
+    assert office.sync(office.north).parcels_in == 1
+    assert office.database.sql("select count(*) from registry.parcel") == [["0"]]
+    assert plant_room.parcels.waiting_out(office.north) == 0
+
+
+def test_a_database_that_was_lost_is_filled_by_its_members(office: Office, cluster: Cluster) -> None:
+    south = office.member("south", "base")
+    board_of(office.north, os.urandom(10))
+    office.sync(office.north, south)
+    before = office.database.sql("select n, jws from registry.page order by n, jws")
+    cluster.psql(f"drop database {office.database.name} with (force)")
+    cluster.psql(f"create database {office.database.name}")
+    office.database.sql(registry_sql(office.database.registry))
+    for station in (office.north, south):
+        office.known(station)
+    told = office.sync(office.north).told + office.sync(south).told
+    assert any("rolled back" in line for line in told)
+    assert office.database.sql("select n, jws from registry.page order by n, jws")[: len(before)] == before
+    assert office.database.sql("select count(distinct jws) from registry.roster") == [["1"]]
+
+
+def test_a_database_of_yesterday_is_brought_up_to_today(office: Office) -> None:
+    south = office.member("south", "base")
+    office.sync(office.north, south)
+    board_of(office.north, os.urandom(10))
+    office.sync(office.north)
+    newest = office.north.plant.tables.chains()[office.north.fingerprint].counted[0]
+    office.database.sql(mend_sql(office.north.fingerprint, newest))  # as if it had not come yet
+    assert any("rolled back" in line for line in office.sync(office.north).told)
+    assert [alarm.code for alarm in office.north.plant.tables.alarms()] == ["rolled-back"]
+    office.sync(south)
+    assert south.plant.tables.chains()[office.north.fingerprint].counted[0] >= newest
+
+
+def test_rows_that_a_stolen_login_wrote_stop_the_push_until_they_are_mended(office: Office) -> None:
+    office.sync(office.north)
+    post = office.post(office.north)
+    post.registry()
+    n, digest = post._look.heads[office.north.fingerprint]
+    post.append(office.north.fingerprint, n + 1, digest, "", b"h." + b"x" * 200 + b".s")
+    board_of(office.north, os.urandom(10))
+    with pytest.raises(NotAuthentic, match="its key did not sign") as refused:
+        office.sync(office.north)
+    assert f"--mend north {n + 1}" in refused.value.hint
+    office.database.sql(mend_sql(office.north.fingerprint, n + 1))
+    assert office.sync(office.north).pushed == 1
+    post.close()
+
+
+def test_a_database_without_room_is_told_and_nothing_is_lost(office: Office) -> None:
+    office.database.sql(
+        "create function registry.no_room() returns trigger language plpgsql as $$ begin"
+        " raise exception 'could not extend file: No space left on device' using errcode = '53100'; end $$;"
+        " create trigger no_room before insert on registry.page execute function registry.no_room()"
+    )
+    board_of(office.north, os.urandom(10))
+    with pytest.raises(RegistryFailure, match="full"):
+        office.sync(office.north)
+    office.database.sql("drop trigger no_room on registry.page")
+    assert office.sync(office.north).pushed > 0
+    assert office.north.plant.tables.unsent() == 0
+
+
+def test_a_sync_that_is_cut_anywhere_is_followed_by_the_same_sync(office: Office) -> None:
+    south = office.member("south", "base")
+    roster_with(office, Share(("all", ""), (south.fingerprint,)))
+    board = board_of(office.north, os.urandom(10))
+    with relay(office.database.cluster.port) as way:
+        for after in range(2, 14):
+            for station in (office.north, south):
+                post = office.post(station, port=way.port)
+                way.cut_after = way.sent + after
+                with suppress(RegistryFailure):
+                    sync(station, post)
+                way.cut_after = 0
+                post.close()
+    office.sync(office.north, south, office.north)
+    assert [key.epoch for key in south.keys.of(board.uuid)] == [1]
+    assert office.database.sql("select count(*) from registry.parcel") == [["0"]]
+    assert office.database.sql("select count(*) = max(n) from registry.page group by station") == [["t"], ["t"]]
