@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from teds_provision.measure import (
         blocks,
         buses,
+        capturing,
         clock,
         grid,
         hearing,
@@ -16,16 +17,19 @@ if TYPE_CHECKING:
         keeper,
         lookout,
         planning,
+        recordings,
         request,
         rest,
         runner,
         running,
         sampling,
+        settled,
         sightings,
         sinks,
         sources,
         topic_actuators,
         trusting,
+        zeroing,
     )
 else:
     __getattr__ = lazy(__name__)

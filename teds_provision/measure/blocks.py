@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from teds_provision.teds import Units
+    from teds_provision.teds.calibration.model import Calibration
 
 Kind = Literal["sensor", "event", "actuator"]
 MOST_TOLD = 3  # reasons that one line tells
@@ -48,11 +49,16 @@ class ChannelFacts:
     calibrated: str | None = None
     due: str | None = None
     overdue: bool = False
-    fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty where it is unsigned
+    fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty where nobody signed it
     sample_form: str = ""  # of the raw value: uint16, float32 …
     period: float | None = None  # seconds between samples as measured; None for events
     unsigned: bool = False  # nobody has signed the datasheet: there are raw values alone
+    unverified: bool = False  # nobody has signed it, and values are calibrated by it all the same: a person's word
     quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
+    deviation: float | None = None  # standard deviation in `unit`, where the profile knows one
+    own_period: float | None = None  # seconds between samples as the datasheet has it (SPeriod)
+    frame: str = ""  # coordinate frame of its values; {node} in it stands for the node's part of its topics
+    calibration: Calibration | None = None
     vector: tuple[int, ...] = ()  # channels of the vector group that it is in, axis by axis; empty where in none
 
     chosen: tuple[tuple[int, str], ...] | None = None  # names of its topics by channel (0: the node's part), if newer
@@ -100,6 +106,11 @@ class Block:
     run: int = 0  # number of the run of the stream in its session
     clock: int | None = None  # which setting of the host's clock `time` follows; None: the present one
 
+    @property
+    def keys(self) -> tuple[tuple[str, int], ...]:
+        """(uuid, channel number) of each column."""
+        return tuple((self.uuid, number) for number in self.channels)
+
 
 @dataclass(frozen=True)
 class GroupRows:
@@ -117,6 +128,11 @@ class GroupRows:
     value: NDArray[Any]  # (n, c) float64
     age: NDArray[Any]  # (n, c) float64, seconds
     test_pattern: bool = False
+
+    @property
+    def keys(self) -> tuple[tuple[str, int], ...]:
+        """(uuid, channel number) of each column."""
+        return self.channels
 
 
 @dataclass(frozen=True)
@@ -158,7 +174,7 @@ class StationFacts:
     """Who measures: what a file's header, a topic's prefix and a metadata message say of the station.
 
     ``names`` maps (uuid, channel) to the topic that the user chose, channel 0 to the node's part of it;
-    ``frame_ids`` maps a uuid to a frame. ``scalar_rate`` limits topics of one value (Hz), 0 leaves them out.
+    ``scalar_rate`` limits topics of one value (Hz), 0 leaves them out.
     ``nodes`` maps a uuid to the node's name, of every node that this station knows: topics are unique among them all.
     ``each_node``: nodes come and go, and each has an array topic of its own in place of the group's.
     ``instance`` tells the measurements of one station apart, which may run side by side; "" where there is one alone.
@@ -170,7 +186,6 @@ class StationFacts:
     started: float = 0.0  # unix seconds
     clock: str = "host's wall clock, node ticks mapped to it"
     names: Mapping[tuple[str, int], str] = field(default_factory=dict)
-    frame_ids: Mapping[str, str] = field(default_factory=dict)
     scalar_rate: float = 10.0
     test_pattern: bool = False
     nodes: Mapping[str, str] = field(default_factory=dict)
@@ -192,6 +207,14 @@ class ClockSet:
         """For people and the notes of a recording."""
         way = "forward" if self.by > 0 else "back"
         return f"The system's clock was put {way} by {abs(self.by):.3f} s: earlier times follow the old clock."
+
+
+@dataclass(frozen=True)
+class Note:
+    """Words of a recorder about its recording (a full disk, a clock that was set), at unix time ``at``."""
+
+    at: float
+    text: str
 
 
 @dataclass(frozen=True)

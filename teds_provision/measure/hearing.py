@@ -6,6 +6,7 @@ taken away; what comes for nobody is dropped.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -27,6 +28,7 @@ REST = 0.003  # seconds that frames gather on one bus: to be woken for each of t
 GATHER = 0.012  # seconds that messages wait to be opened and calibrated together: of a tick's 20 ms to its sink
 HEARD_OUT = 0.25  # seconds for the last message that is wanted to come and to be looked at
 MOST_HELD = 50_000  # frames: some seconds of a full bus
+MOST_EARLY = 512  # frames of a stream that came before the reply to its Subscribe was looked at
 _MASK = 0x1FFF0000
 _STREAM = 0x18FF  # of an identifier: node and stream
 
@@ -48,6 +50,8 @@ class HeardStream:
     wrong_pattern: int = 0
     samples: int = 0
     bound: float | None = None
+    early: deque[Frame] = field(default_factory=deque)
+    """Frames that came before it was registered; the hearing thread takes them first."""
     _came: deque[tuple[bytes, int]] = field(default_factory=deque)
     _since: float = 0.0
 
@@ -58,8 +62,17 @@ class HeardStream:
         self._last_instant = 0 if plan.subscribe.kind == Kind.FREE else plan.span - plan.subscribe.period
         self._test_pattern = plan.subscribe.test_pattern
 
-    def take(self, segment: int, frame: Frame) -> None:
+    def take(self, frame: Frame) -> None:
         """A frame of this stream."""
+        self._take_early()
+        self._take(frame)
+
+    def _take_early(self) -> None:
+        while self.early:
+            self._take(self.early.popleft())
+
+    def _take(self, frame: Frame) -> None:
+        segment = frame.identifier >> 8 & 7
         octets = self.assembly.take(segment, frame.data)
         if octets is not None:
             self.whole(octets, int((frame.at or time.monotonic()) * 1e9))
@@ -86,6 +99,7 @@ class HeardStream:
 
     def flush(self, now: float) -> None:
         """Open and hand on what has waited for GATHER."""
+        self._take_early()
         if self._came and now - self._since >= GATHER:
             self.finish()
 
@@ -140,11 +154,20 @@ class HeardStream:
         self.deliver(block)
 
 
+@dataclass
+class Early:
+    """Frames of a stream that was asked for at ``since`` (monotonic) and is not registered yet."""
+
+    since: float = field(default_factory=time.monotonic)
+    frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=MOST_EARLY))
+
+
 class Hearing:
     """The listening thread of one link that carries data; a kind of link says in :meth:`_hear` how it hears."""
 
     def __init__(self, place: str) -> None:
         self._streams: dict[tuple[int, int], HeardStream] = {}
+        self._early: dict[tuple[int, int], Early] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self.lost_frames = 0
@@ -155,8 +178,17 @@ class Hearing:
 
     def register(self, node: int, stream: int, heard: HeardStream) -> None:
         """Hear a stream of the node at this address; in place of the one before."""
+        key = (node, stream)
         with self._lock:
-            self._streams = {**self._streams, (node, stream): heard}
+            if key in self._early:
+                heard.early = self._early[key].frames
+            self._streams = {**self._streams, key: heard}
+            self._early.pop(key, None)
+
+    def expect(self, node: int, stream: int) -> None:
+        """Keep the frames of a stream that is asked for: on a busy machine they come before its reply is looked at."""
+        with self._lock:
+            self._early[node, stream] = Early()
 
     def forget(self, node: int, stream: int) -> HeardStream | None:
         """Hear it no more, and hand on what is left of it."""
@@ -164,6 +196,7 @@ class Hearing:
             streams = dict(self._streams)
             heard = streams.pop((node, stream), None)
             self._streams = streams
+            self._early.pop((node, stream), None)
         if heard is not None:
             heard.finish()
         return heard
@@ -209,22 +242,24 @@ class CanHearing(Hearing):
         return frame.identifier & _MASK == DATA and frame.identifier >> 13 & 7 == self._own & 7
 
     def _hear(self) -> None:
-        with self._port.bus().listen(self._wanted, most=MOST_HELD) as ear:
+        with self._port.bus().listen(self._wanted, most=MOST_HELD) as listener:
             self.failure = None
             looked = time.monotonic()
             while not self._stop.is_set():
                 # All that wait first: a thread that fell behind calibrates more at once, and catches up.
-                touched = {frame.identifier & _STREAM: self._take(frame) for frame in ear.get_all(SLICE)}
+                touched = {frame.identifier & _STREAM: self._take(frame) for frame in listener.get_all(SLICE)}
                 for heard in touched.values():
                     if heard is not None and heard.due:
                         heard.finish()
-                looked = self._flush(looked, ear.lost)
+                looked = self._flush(looked, listener.lost)
                 time.sleep(REST)
 
     def _take(self, frame: Frame) -> HeardStream | None:
         # Whoever is registered has a good address, and other stations' frames do not come here.
-        identifier = frame.identifier
-        heard = self._streams.get((identifier & 0xFF, identifier >> 11 & 3))
+        key = (frame.identifier & 0xFF, frame.identifier >> 11 & 3)
+        heard = self._streams.get(key)
         if heard is not None:
-            heard.take(identifier >> 8 & 7, frame)
+            heard.take(frame)
+        elif (early := self._early.get(key)) is not None and (frame.at or math.inf) >= early.since:
+            early.frames.append(frame)
         return heard

@@ -44,7 +44,7 @@ def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
         return WrittenUnit(channel.si_unit, channel.units, 1.0, 0.0)
     unit = parse_unit(text)
     if unit.units != channel.units:
-        words = " or ".join(dict.fromkeys((channel.unit.text, channel.si_unit)))
+        words = " or ".join(dict.fromkeys((channel.shown.text, channel.unit.text, channel.si_unit)))
         raise BadData(
             f"{text} is no unit of channel {channel.number}, whose values are in {channel.si_unit}.",
             hint=f"Use {words}.",
@@ -70,7 +70,7 @@ class HeldActuator:
         """The data set for a value in :attr:`unit`; raises PolicyRefused (6) beyond the limits of the datasheet."""
         one = self._interpreter
         own = one.unit.from_si(self.unit.to_si(value))
-        beyond = one.beyond(own)
+        beyond = one.beyond(own, self.unit)
         if beyond:
             raise PolicyRefused(beyond, hint="The limits of the signed datasheet are kept.")
         return one.encode(own)

@@ -26,6 +26,7 @@ from teds_provision.errors import (
     PolicyRefused,
     TedsProvisionError,
 )
+from teds_provision.links.ports import Abandons
 from teds_provision.measure.blocks import Command, NodeReport, State
 from teds_provision.measure.buses import Bus, Buses
 from teds_provision.measure.clock import AT_FIRST, HostClock
@@ -37,7 +38,15 @@ from teds_provision.measure.running.patience import Patience
 from teds_provision.measure.running.streams import NodeStreams, added
 from teds_provision.measure.sightings import Sighting
 from teds_provision.measure.topic_actuators import TopicActuators
-from teds_provision.measure.trusting import LEASE_EACH, LONGEST_LEASE, Standing, Trusted, claim, open_trusted
+from teds_provision.measure.trusting import (
+    LEASE_EACH,
+    LONGEST_LEASE,
+    Standing,
+    Trusted,
+    claim,
+    open_trusted,
+    open_unverified,
+)
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
@@ -48,6 +57,8 @@ from teds_provision.teds.sheet import Channel
 _log = logging.getLogger(__name__)
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
+WORKED_ON, TELL, LONGEST_WORK = 0.05, 0.5, 60.0
+"""Seconds between looks whether a command works on the node, until that is told, and until it is taken to hang."""
 LOOK = 0.2  # seconds between looks at how it does
 LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
@@ -84,6 +95,7 @@ class NodeKeeper:
         self._stop = threading.Event()
         self._anew = threading.Event()
         self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
+        self._elsewhere = 0.0  # when it answered at another place
         self._lost_at = 0.0
         self._proven = True  # whether what failed last did so in a session
         self._patience = Patience(None)
@@ -92,6 +104,7 @@ class NodeKeeper:
         self._lease, self._claimed = request.lease, [0]
         self._driven: TopicActuators | None = None
         self._told = ""
+        self._comes_back = False  # it is let go for a while, and its room is kept for it
         self._why = ""  # why it was asked to end, for its last report
         self._thread = self._new_thread()
 
@@ -104,18 +117,28 @@ class NodeKeeper:
             self._thread.join()
             self._stop.clear()
             self.done.clear()
-            self._why, self.error = "", None
+            self._why, self.error, self._comes_back = "", None, False
             self._thread = self._new_thread()
         self._thread.start()
+
+    def give_room_up(self) -> None:
+        """It does not come back."""
+        if self._comes_back:
+            self._comes_back = False
+            for bus in self._buses.all():
+                bus.share.leave(self.uuid)
 
     @property
     def begun(self) -> bool:
         """Whether it was ever started."""
         return self._thread.ident is not None
 
-    def stop(self, why: str = "") -> None:
-        """Ask it to end in order: Stop, Idle, Close; its last report says ``why``."""
-        self._why = why
+    def stop(self, why: str = "", *, comes_back: bool = False) -> None:
+        """Ask it to end in order: Stop, Idle, Close; its last report says ``why``.
+
+        ``comes_back``: its room on the bus stays its own until it is started again, or :meth:`give_room_up`.
+        """
+        self._why, self._comes_back = why, comes_back
         self._stop.set()
         self._anew.set()
 
@@ -164,8 +187,9 @@ class NodeKeeper:
             self._common_start.gone(self.uuid)
             if self._request.require is not None:
                 self._request.require.gone(self.uuid)
-            for bus in self._buses.all():
-                bus.share.gone(self.uuid)
+            if not self._comes_back:
+                for bus in self._buses.all():
+                    bus.share.leave(self.uuid)
             self.done.set()
             self.ready.set()
 
@@ -193,34 +217,52 @@ class NodeKeeper:
             return Bug(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
         return None
 
+    def _let_others_finish(self) -> None:
+        """Wait while a command of this station works on the node: a claim in the middle would spoil what it does."""
+        passed, since, told = 0.0, time.monotonic(), False
+        while passed < LONGEST_WORK and self._station.turn(self.uuid).is_taken and not self._stop.wait(WORKED_ON):
+            passed = time.monotonic() - since
+            if passed > TELL and not told:
+                told = True
+                self._say("waiting", why="a command of this station works on it")
+
     def _once(self) -> None:
+        self._let_others_finish()
         seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._request.timeout, self._patience.left), 1))
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self.sighting = sighting
         self.bus = self._buses.of(sighting)
         for other in self._buses.all():
             if other is not self.bus:
-                other.share.gone(self.uuid)
+                other.share.leave(self.uuid)
         try:
             self._in_session(self.bus, sighting)
         except NoRoom:
             raise
         except BaseException:
             self._lost_at = time.monotonic()
+            self._buses.sightings.let_announce(self.uuid)
             self._buses.sightings.wrong(sighting)
             raise
 
     def _in_session(self, bus: Bus, sighting: Sighting) -> None:
         standing = Standing(self._station, self.uuid)
+        self._announced = self._elsewhere = 0.0
+        self._buses.sightings.on_announce(sighting, self._heard_announce, self._seen_elsewhere)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
+            if isinstance(node.contact.link, Abandons):
+                node.contact.link.hopeless = self._is_gone
             try:
-                trusted = open_trusted(self._station, node, by=self._request.by, unsigned=self._request.unsigned)
+                trusted = (
+                    open_unverified(self._station, node, by=self._request.by)
+                    if self._request.unverified
+                    else open_trusted(self._station, node, by=self._request.by, unsigned=self._request.unsigned)
+                )
             finally:
                 self._proven = node.sealed
             if self._request.require is not None:
                 self._request.require.offer(self.uuid, trusted.sheet, self._stop)
             self.trusted, self._announced = trusted, 0.0
-            self._buses.sightings.on_announce(sighting, self._heard_announce)
             answers = False
             try:
                 self._measure(bus, trusted, sighting.address)
@@ -255,7 +297,12 @@ class NodeKeeper:
 
     def _actuators(self, trusted: Trusted) -> list[Channel]:
         """Actuators that set points may come for: of a signed datasheet on the whitelist, with a way to raw values."""
-        if trusted.unsigned or not self._request.actuators or self._station.pins.entry(self.uuid) is None:
+        if (
+            trusted.unsigned
+            or trusted.unverified
+            or not self._request.actuators
+            or self._station.pins.entry(self.uuid) is None
+        ):
             return []
         wanted = self._request.channels
         return [
@@ -362,6 +409,8 @@ class NodeKeeper:
             elif rest is not None:
                 with self.turn:
                     rest = rest if rest.step() else None
+                if rest is None:
+                    self._events.read(self.uuid)
             if self.streams.clock.lie and not lied:
                 lied = True
                 self._say("running", why=f"its clock lies: {self.streams.clock.lie}")
@@ -377,6 +426,17 @@ class NodeKeeper:
         self._lease = self._lease_now()
         for number in self._claimed:
             claim(trusted, number, lease=self._lease)
+
+    def _is_gone(self) -> bool:
+        """Whether it is of no use to wait for its answer: it is silent, or was since it was seen at another place."""
+        now, since = time.monotonic(), self._elsewhere
+        if since and now - since > max(LOOK_FOR_DATA, self.streams.every() or 0.0):
+            return not self.streams.heard_since(since)
+        return bool(self.streams.silent(now))
+
+    def _seen_elsewhere(self) -> None:
+        self._elsewhere = time.monotonic()
+        self._heard_announce()
 
     def _heard_announce(self) -> None:
         self._announced = self._announced or time.monotonic()
@@ -397,7 +457,7 @@ class NodeKeeper:
             elif now - since > LOOK_FOR_DATA:
                 self._announced = 0.0
                 self._anew.set()
-                raise LinkFailure("The node has started anew, or has another address.")
+                raise LinkFailure("The node has started anew, or answers elsewhere now.")
             return False
         doubted = now - since >= ANNOUNCED
         if doubted:
@@ -411,8 +471,9 @@ class NodeKeeper:
             self._driven = None
         self._buses.sightings.let_announce(self.uuid)
         self.streams.stop(bus, trusted if answers else None, address)
-        with bus.share.lock:
-            bus.share.taken.pop(self.uuid, None)
+        if not self._comes_back:
+            with bus.share.lock:
+                bus.share.taken.pop(self.uuid, None)
         if answers:
             with suppress(TedsProvisionError, SessionLost):
                 trusted.node.send(idle(0), "to let go")

@@ -139,12 +139,12 @@ class Lookout(Asking):
 
     def _watch(self) -> None:
         """Ask, and hear announcements, until the bus fails."""
-        with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as ear:
+        with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as listener:
             gone = self._sightings.gone
             self._ask()
             pace, soon = Pace(time.monotonic(), first=SOON), math.inf
             while not self._stop.is_set():
-                soon = min(soon, self._heard(ear.get(LOOK)))
+                soon = min(soon, self._heard(listener.get(LOOK)))
                 missing = self._sightings.missing()
                 if missing and self._sightings.gone != gone:
                     soon = SOON  # one that goes does not wait for the pause that another one's absence has come to
@@ -220,12 +220,15 @@ class Lookout(Asking):
             self._sightings.note(twice_text(uuid, addresses))
 
     def ask(self, address: int, seconds: float) -> None:
-        """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkFailure."""
-        self._ask_one(address, seconds)
+        """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkFailure.
 
-    def _ask_one(self, address: int, seconds: float) -> None:
+        An Announce from there ends it: the look-out asks because of that itself.
+        """
+        self._ask_one(address, seconds, until_announced=True)
+
+    def _ask_one(self, address: int, seconds: float, *, until_announced: bool = False) -> None:
         try:
-            identity = self.port.identify(address, seconds=seconds)
+            identity = self.port.identify(address, seconds=seconds, until_announced=until_announced)
         except AddressConflict:
             self._sightings.conflict(self.port.place, address)
             return
@@ -260,10 +263,10 @@ class AirHearing(Hearing):
         return heard
 
     def _hear(self) -> None:
-        with self._air.listen() as ear:
+        with self._air.listen() as listener:
             looked = time.monotonic()
             while not self._stop.is_set():
-                came = ear(SLICE)
+                came = listener(SLICE)
                 read = read_ble_frame(came.octets) if came is not None else None
                 if came is not None and read is not None:
                     heard = self._streams.get((came.connection, read[0]))

@@ -8,6 +8,7 @@ measured at all is no matter of the expression: a node must have a key here, and
 from __future__ import annotations
 
 import re
+from collections.abc import Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
@@ -17,6 +18,7 @@ from teds_provision.measure.planning import BusTime, plan_node, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.station.groups import ALL
 from teds_provision.station.station import Station
+from teds_provision.steps.reading import verdict_of
 from teds_provision.teds.fits import Requirement, judge, met, parse_fits
 from teds_provision.teds.sheet import Sheet
 
@@ -89,6 +91,38 @@ class Match:
         if met(self.fits, judged):
             return ""
         return next((one.why.rstrip(".") for one in judged), "its datasheet is not known")
+
+
+@dataclass(frozen=True)
+class Unsigned:
+    """Every node that describes itself, which nobody has signed: ``ncap run --adopt --unverified``."""
+
+    text: str = "unverified"
+
+    def why_not(self, station: Station, uuid: bytes) -> str:
+        """As :meth:`Match.why_not`."""
+        if station.measurements.detection != "transparent":
+            return "detection is not transparent"
+        judged = verdict_of(station, uuid)
+        if judged is None:
+            return "its datasheet was not read in a session"
+        if judged.origin == "plain" or judged.verified.verdict != "unsigned":
+            return f"its datasheet is {judged.verified.verdict}"
+        image = station.nodes.datasheet(uuid)
+        return "" if image is not None and Sheet.of(image).channels else "it brings no datasheet of its own"
+
+
+@dataclass(frozen=True)
+class Of:
+    """The nodes of a list that grows: those that were adopted while they were measured."""
+
+    uuids: Set[bytes]
+    text: str = "adopted"
+
+    def why_not(self, station: Station, uuid: bytes) -> str:
+        """As :meth:`Match.why_not`."""
+        judged = verdict_of(station, uuid) if uuid in self.uuids else None
+        return "" if judged is not None and judged.verified.verdict == "authentic" else "it was not adopted here"
 
 
 def why_not_measured(station: Station, uuid: bytes) -> str:

@@ -112,6 +112,12 @@ class BusShare:
             self.wanted.pop(uuid, None)
             self.lock.notify_all()
 
+    def leave(self, uuid: bytes) -> None:
+        """As :meth:`gone`, and what it takes is free."""
+        with self.lock:
+            self.taken.pop(uuid, None)
+        self.gone(uuid)
+
     def _kept(self, uuid: bytes, room: float) -> float:
         """What is kept for others of ``room``: whoever wants less than an equal part gets it, the rest share evenly."""
         coming = [self.wanted.get(key, MOST_LOAD) for key in self.expected - {uuid} - self.taken.keys()]

@@ -89,6 +89,7 @@ class MeasurementRequest:
     dead_man: int = DEAD_MAN
     patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
     unsigned: bool = False  # whether raw values of a node are wanted whose datasheet nobody has signed
+    unverified: bool = False  # only nodes whose datasheet nobody has signed, calibrated by it and marked so
     require: Requirements | None = None
     newcomers: bool = False  # nodes come and go: no room is kept for one that is away, and its first error ends it
     by: str = "measure"  # the command that a reading of the datasheet is put down to
@@ -101,3 +102,4 @@ class Events:
     block: Callable[[Block], None]
     facts: Callable[[Sequence[ChannelFacts]], None]
     report: Callable[[NodeReport], None]
+    read: Callable[[bytes], None] = lambda _uuid: None  # the rest of its datasheet, behind the measurement

@@ -43,6 +43,7 @@ class Watcher:
     report: Callable[[NodeReport], None] = lambda _report: None
     sink: Callable[[Sink], None] = lambda _sink: None
     note: Callable[[str], None] = lambda _text: None
+    read: Callable[[bytes], None] = lambda _uuid: None  # a node's datasheet was read whole behind its measurement
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Measurement:
         self.buses.expect(self.uuids)
         if self.request.require is not None:
             self.request.require.expect(self.uuids)
-        events = self._events = Events(self._block, self._describe, self._report)
+        events = self._events = Events(self._block, self._describe, self._report, self._read)
         self.keepers = [
             NodeKeeper(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
@@ -259,7 +260,7 @@ class Measurement:
         keeper = self._keeper(uuid)
         if keeper is None or not keeper.begun:
             return True
-        keeper.stop(why)
+        keeper.stop(why, comes_back=True)
         return keeper.done.wait(seconds)
 
     def take_back(self, uuid: bytes) -> None:
@@ -332,11 +333,15 @@ class Measurement:
             sink.report(report)
         self.watcher.report(report)
 
+    def _read(self, uuid: bytes) -> None:
+        self.watcher.read(uuid)
+
     # -- the end -------------------------------------------------------------------------------------------------------
 
     def _end(self) -> None:
         self._ending = True
         for keeper in self.keepers:
+            keeper.give_room_up()
             keeper.stop()
         end = time.monotonic() + ENDING
         for keeper in self.keepers:

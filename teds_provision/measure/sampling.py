@@ -17,6 +17,7 @@ from teds_provision.measure.trusting import Trusted, claim, exchange_clock
 from teds_provision.protocol.operation.commands import MOST_SAMPLE_CHANNELS, Sampled, idle, sample
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Sheet
+from teds_provision.teds.units import WrittenUnit
 
 LEASE = 5
 ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
@@ -24,7 +25,10 @@ ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMe
 
 @dataclass(frozen=True)
 class Sample:
-    """One value; ``value`` and ``uncertainty`` in ``unit`` (SI), None where not valid or not stated."""
+    """One value; ``value`` and ``uncertainty`` in ``unit`` (SI), None where not valid or not stated.
+
+    ``shown`` is the unit in which people see it.
+    """
 
     channel: int
     name: str
@@ -35,11 +39,23 @@ class Sample:
     valid: bool
     time: float
     why: str = ""
+    shown: WrittenUnit | None = None
 
     def as_json(self) -> dict[str, Any]:
         """As `sample --json` has it."""
         told = {key: getattr(self, key) for key in ("channel", "name", "value", "unit", "raw", "uncertainty", "valid")}
+        if self.shown is not None:
+            told["shown"] = shown_json(self.value, self.uncertainty, self.shown)
         return {**told, "time": self.time, **({"why": self.why} if self.why else {})}
+
+
+def shown_json(value: float | None, uncertainty: float | None, unit: WrittenUnit) -> dict[str, Any]:
+    """A value and its uncertainty, both in SI, as people see them: ``{"value", "unit", "uncertainty"}``."""
+    return {
+        "value": None if value is None else unit.from_si(value),
+        "unit": unit.text,
+        "uncertainty": None if uncertainty is None else abs(unit.difference_from_si(uncertainty)),
+    }
 
 
 def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
@@ -122,4 +138,5 @@ def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int
         valid=valid,
         time=stamp,
         why=why,
+        shown=channel.shown,
     )

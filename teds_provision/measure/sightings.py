@@ -43,9 +43,10 @@ class Sighting:
 
     def contact(self) -> Contact:
         """A line to it."""
+        link, trace, bus = self.port.link(self.address), self.port.trace, self.port.place
         if isinstance(self.port, BlePort):
-            return Contact(self.identity, self.port.link(self.address), connection=self.address, trace=self.port.trace)
-        return Contact(self.identity, self.port.link(self.address), address=self.address, trace=self.port.trace)
+            return Contact(self.identity, link, connection=self.address, trace=trace, bus=bus)
+        return Contact(self.identity, link, address=self.address, trace=trace, bus=bus)
 
 
 Place = tuple[str, int]
@@ -63,7 +64,7 @@ class Sightings:
     _seen: dict[bytes, dict[Place, Sighting]] = field(default_factory=dict)
     _wrong: dict[bytes, dict[Place, float]] = field(default_factory=dict)
     _conflicts: dict[Place, float] = field(default_factory=dict)
-    _announced: dict[bytes, tuple[Place, Callable[[], None]]] = field(default_factory=dict)
+    _announced: dict[bytes, tuple[Place, Callable[[], None], Callable[[], None]]] = field(default_factory=dict)
     _missing: dict[bytes, int] = field(default_factory=dict)
     _unseen: set[bytes] = field(default_factory=set)  # those that somebody waited for, and that were not seen since
     _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
@@ -71,14 +72,18 @@ class Sightings:
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
     def saw(self, sighting: Sighting) -> None:
-        """Take what a look-out saw."""
+        """Take what a look-out saw; who keeps this node at another place is told."""
+        place = (sighting.port.place, sighting.address)
         with self._turn:
             self._unseen.discard(sighting.uuid)
             places = self._seen.pop(sighting.uuid, {})  # who was seen last stands last
-            places[sighting.port.place, sighting.address] = sighting
+            places[place] = sighting
             self._seen[sighting.uuid] = places
             self._forget_the_oldest()
             self._turn.notify_all()
+            kept = self._announced.get(sighting.uuid)
+        if kept is not None and kept[0] != place:
+            kept[2]()
         self.news(sighting)
 
     def conflict(self, place: str, address: int) -> None:
@@ -90,10 +95,15 @@ class Sightings:
             self._turn.notify_all()
         self.note(conflict_text(address))
 
-    def on_announce(self, sighting: Sighting, tell: Callable[[], None]) -> None:
-        """Call ``tell``, which returns at once, when something announces itself as this node, or from its address."""
+    def on_announce(
+        self, sighting: Sighting, tell: Callable[[], None], moved: Callable[[], None] | None = None
+    ) -> None:
+        """Call ``tell``, which returns at once, when something announces itself as this node, or from its address.
+
+        ``moved`` (else ``tell``): when it answers at another place. Both are hints: anyone can send them.
+        """
         with self._turn:
-            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), tell)
+            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), tell, moved or tell)
 
     def let_announce(self, uuid: bytes) -> None:
         """Tell no more of it."""
@@ -105,7 +115,7 @@ class Sightings:
         with self._turn:
             told = [
                 tell
-                for uuid, (where, tell) in self._announced.items()
+                for uuid, (where, tell, _) in self._announced.items()
                 if where == (place, announce.address) or (where[0] == place and uuid_crc(uuid) == announce.crc)
             ]
         for tell in told:

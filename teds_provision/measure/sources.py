@@ -44,11 +44,11 @@ def sole_user(station: Station, ports: Sequence[CanPort], command: str) -> Itera
 
 
 @contextmanager
-def beside(station: Station, links: LinkSettings, command: str) -> Iterator[LinkSettings]:
+def beside(station: Station, links: LinkSettings, command: str, *, shared: bool = True) -> Iterator[LinkSettings]:
     """Have short sessions from the source address of ``links``, beside others who do; over a reader there is none.
 
-    Gives the links with the address in them: the next free one where none was named and a measurement has it. Raises
-    StoreLocked (7) where a measurement has the one that was named.
+    Gives the links with the address in them: the next free one where none was named and a measurement has it, or, not
+    ``shared``, anybody. Raises StoreLocked (7) where a measurement has the one that was named.
     """
     if links.via != "can":
         yield links
@@ -58,7 +58,9 @@ def beside(station: Station, links: LinkSettings, command: str) -> Iterator[Link
         for place in links.places:
             where = place.removeprefix("can:")
             spec = parse_spec(where)
-            _, source = _enter(stack, station, spec, command, shared=True)
+            mark, source = _enter(stack, station, spec, command, shared=shared)
+            if not shared:
+                mark.share()  # the sessions of this very command are no others
             word = "" if spec.source_named else f"{'&' if '?' in where else '?'}source=0x{source:02X}"
             wheres.append(where + word)
         yield replace(links, can=tuple(wheres))
@@ -96,8 +98,8 @@ def _require_alone(port: CanPort) -> None:
     def ours(frame: Frame) -> bool:
         return frame.identifier & _MASK == DATA and frame.identifier >> 13 & 7 == own
 
-    with bus.listen(ours, most=64) as ear:
-        if ear.get(LISTENING) is None:
+    with bus.listen(ours, most=64) as listener:
+        if listener.get(LISTENING) is None:
             return
     until = time.monotonic() + SIGN_OF_LIFE
     while time.monotonic() < until:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 from teds_provision.errors import BadData, PolicyRefused
@@ -16,12 +17,16 @@ from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.protocol.operation import commands
 from teds_provision.protocol.operation.commands import Operation
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
+from teds_provision.station.shown_units import channel_profiles, shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.board_type import operate
-from teds_provision.steps.verify import require_authentic
-from teds_provision.steps.verify_node import look_in_session
+from teds_provision.steps.read import read_image
+from teds_provision.steps.reading import keep
+from teds_provision.steps.verify import known_of, require_authentic
+from teds_provision.steps.verify_node import Looked, look_in_session
 from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.profile import ChannelProfile
 from teds_provision.teds.sheet import Channel, Kind, Sheet
 
 # From a signed datasheet to the facts that go with every value.
@@ -43,7 +48,7 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         kind=_WORDS.get(channel.kind or Kind.SENSOR, "sensor"),
         unit=channel.si_unit,
         units=channel.units,
-        shown_unit=channel.unit.text,
+        shown_unit=channel.shown.text,
         low=_known(channel.low),
         high=_known(channel.high),
         uncertainty=_known(channel.stated_uncertainty),
@@ -52,9 +57,18 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         overdue=channel.overdue(datetime.now(UTC)),
         fingerprint=fingerprint,
         sample_form=channel.sample.name if channel.sample else "",
+        own_period=_known(channel.period),
+        calibration=channel.calibration,
         period=None if channel.kind == Kind.EVENT_SENSOR else period,
         vector=next((group for group in sheet.meta.vectors if channel.number in group), ()),
     )
+
+
+def _deviation(of_type: ChannelProfile | None, channel: Channel) -> float | None:
+    """Standard deviation in SI units; a profile of another unit than the datasheet's says nothing of it."""
+    if of_type is None or of_type.units != channel.units or of_type.calibration.standard_deviation is None:
+        return None
+    return _known(of_type.unit.difference_to_si(of_type.calibration.standard_deviation))
 
 
 def _known(number: float) -> float | None:
@@ -72,6 +86,8 @@ class Trusted:
 
     ``digest`` is what Operate takes (16 octets), ``fingerprint`` the SHA-256 of the Security TEDS in hex.
     ``unsigned``: nobody has signed the datasheet; there are raw values alone, and nothing is moved.
+    ``profiles`` are the channels of its type, ``frames`` those that somebody chose (0: for the whole node).
+    ``unverified``: nobody has signed it either, and values are calibrated by it by a person's word; nothing is moved.
     ``kept``: all but its Security TEDS was read before the node's last start; values come from the signed copy.
     """
 
@@ -81,6 +97,9 @@ class Trusted:
     name: str
     unsigned: bool = False
     kept: bool = False
+    profiles: Mapping[int, ChannelProfile] = field(default_factory=dict)
+    frames: Mapping[int, str] = field(default_factory=dict)
+    unverified: bool = False
 
     @property
     def uuid(self) -> str:
@@ -99,8 +118,13 @@ class Trusted:
             kind = facts_of(self.sheet, channel, name=self.name, fingerprint="", period=period).kind
             bare = ChannelFacts(self.uuid, self.name, channel.number, channel.name, kind, period=period, unsigned=True)
             return replace(bare, siblings=siblings)
+        if self.unverified:  # its own name: whatever the store calls it is for the datasheet that somebody signs
+            known = facts_of(self.sheet, channel, name=self.sheet.meta.name, fingerprint="", period=period)
+            return replace(known, siblings=siblings, unverified=True)
         known = facts_of(self.sheet, channel, name=self.name, fingerprint=self.fingerprint, period=period)
-        return replace(known, siblings=siblings)
+        of_type = self.profiles.get(channel.number)
+        frame = self.frames.get(channel.number) or self.frames.get(0) or (of_type.frame if of_type else "")
+        return replace(known, siblings=siblings, frame=frame, deviation=_deviation(of_type, channel))
 
     def channel(self, number: int) -> Channel:
         """A channel of the datasheet; raises BadData where there is none."""
@@ -117,7 +141,33 @@ def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: boo
     Raises PolicyRefused (no key, banned), NotAuthentic and Unproven (the datasheet), LinkFailure.
     """
     require_session(station, node)
+    return trusted_from(station, node, look_in_session(station, node, by=by), unsigned=unsigned)
+
+
+def open_unverified(station: Station, node: Conversation, *, by: str) -> Trusted:
+    """Open a session with a node whose datasheet nobody has signed, all of it read in a session since its last start.
+
+    The session says that it is this node's; that it is right, nobody says. Raises PolicyRefused where somebody signed
+    it, and what :func:`open_trusted` raises.
+    """
+    require_session(station, node)
     looked = look_in_session(station, node, by=by)
+    if looked.verified.verdict == "authentic":
+        raise PolicyRefused("Its datasheet is signed now.")
+    if looked.verified.verdict != "unsigned":
+        require_authentic(looked.verified)
+    image = looked.image
+    if looked.kept:  # its Security TEDS names no digest of the others: what was read before the start says nothing
+        c, image = node.c, read_image(node)
+        verified = keep(station, node, image, by=by, known=known_of(station, node.uuid, node.proven), c=c).verified
+        if verified.verdict != "unsigned":
+            require_authentic(verified)
+    digest = hashlib.sha256(image.security or b"").hexdigest()
+    return Trusted(node, Sheet.of(image), digest, "", unverified=True)
+
+
+def trusted_from(station: Station, node: Conversation, looked: Looked, *, unsigned: bool = False) -> Trusted:
+    """The node in its session, by what was seen there; raises as :func:`open_trusted` does."""
     image = looked.image
     bare = unsigned and looked.verified.verdict == "unsigned"
     if not bare:
@@ -125,7 +175,9 @@ def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: boo
     record = station.nodes.get(node.uuid)
     name = record.name if record is not None and record.name else ""
     digest = hashlib.sha256(image.security or b"").hexdigest()
-    return Trusted(node, Sheet.of(image), digest, name, bare, looked.kept)
+    sheet = Sheet.of(image).shown_in(shown_units(station, node.uuid))
+    frames = {number: one for (uuid, number), one in station.measurements.frames.items() if uuid == node.uuid}
+    return Trusted(node, sheet, digest, name, bare, looked.kept, channel_profiles(station, node.uuid), frames)
 
 
 def require_whitelisted(station: Station, uuid: bytes) -> None:

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import asdict
+from contextlib import closing
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from teds_provision.links.can.isotp import Frame
+from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone, Wall
-from teds_provision.measure.hearing import GATHER, HeardStream
+from teds_provision.measure.hearing import GATHER, CanHearing, HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.protocol.operation.can_frames import Assembly
+from teds_provision.protocol.operation.can_frames import Assembly, DataAddress, cut
 from teds_provision.protocol.operation.datagram import Sealer, stream_key
 from teds_provision.protocol.operation.stream_commands import Kind, Subscribed
 from teds_provision.protocol.operation.subscription import Plan, Receiver
@@ -35,16 +40,18 @@ HOST = HostClock(WALL)
 class Scene:
     """A stream of two channels, n = 3 at 1 kHz, whose node's clock stood at 1 s when the host's stood at ``base``."""
 
-    def __init__(self, kind: Kind = Kind.PERIODIC, period: int = MS, *, real: int = MS) -> None:
+    def __init__(
+        self, kind: Kind = Kind.PERIODIC, period: int = MS, *, real: int = MS, ago: int = 3600, fd: bool = True
+    ) -> None:
         self.real = real  # period of a sensor that runs free
         self.plan = Plan.of(0, ((1, 2), (2, 2)), n=3, period=period, kind=kind)
-        self.base = time.monotonic_ns() - 3600 * SECOND
+        self.base = time.monotonic_ns() - ago * SECOND
         clock = ClockMap()
         clock.exchange(Exchange(self.base, self.base + 2000, SECOND + 500, SECOND + 1500, 1, 20))
         self.clock, self.blocks = clock, list[Block]()
         receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
         interpreter = StreamInterpreter(SHEET, self.plan, 1, clock, HOST, Monotone())
-        assembly = Assembly(self.plan.length, fd=True)
+        assembly = Assembly(self.plan.length, fd=fd)
         self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
         self._sealer = Sealer(stream_key(KEY, 1))
 
@@ -154,3 +161,33 @@ def test_a_period_of_the_block_is_one_of_the_nodes_clock_mapped() -> None:
             scene.heard.finish()
     for block in scene.blocks:
         assert block.time == pytest.approx(WALL.unix(scene.clock.host(block.tick)), abs=1e-6)
+
+
+class Silent(CanHearing):
+    """A bus on which nothing comes but what the test hands over."""
+
+    def _hear(self) -> None:
+        self._stop.wait(1.0)
+
+
+def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
+    """On a busy machine the first message comes before the reply to Subscribe is looked at."""
+    scene = Scene(ago=-60, fd=False)
+    port = SimpleNamespace(spec=SimpleNamespace(source=0xF1), place="can:x")
+    with closing(Silent(cast(CanPort, port))) as hearing:
+        frames = [
+            Frame(DataAddress(0xF1, 0, piece.segment, 0x21).identifier, piece.data, at=scene.arrival(counter) / 1e9)
+            for counter in range(2)
+            for piece in cut(scene.message(counter), fd=False)
+        ]
+        old = replace(frames[0], at=time.monotonic() - 1.0)  # of a stream of the session before
+        half = len(frames) // 2
+        hearing.expect(0x21, 0)
+        for frame in (old, *frames[:half]):
+            assert hearing._take(frame) is None
+        hearing.register(0x21, 0, scene.heard)
+        for frame in frames[half:]:
+            assert hearing._take(frame) is scene.heard
+        scene.heard.finish()
+    counts = scene.heard.receiver.counts
+    assert (counts.good, counts.lost, counts.bad, scene.heard.assembly.wrong) == (2, 0, 0, 0)

@@ -181,7 +181,8 @@ class Bus:
         self.says: dict[int, Any] = {int(name[1:]): what for name, what in says.items()}
         self.questions: list[tuple[int, float]] = []
 
-    def identify(self, address: int, *, seconds: float) -> Identity | None:
+    def identify(self, address: int, *, seconds: float, until_announced: bool) -> Identity | None:
+        assert until_announced == (seconds < 3.0), "the last question is waited for to its end"
         self.questions.append((address, seconds))
         said = self.says.get(address)
         if isinstance(said, list):

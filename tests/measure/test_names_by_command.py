@@ -45,6 +45,24 @@ def test_topics_are_listed_chosen_and_made_again(hall: Hall) -> None:
     assert made.items() <= topics(hall).items()
 
 
+def frame_of(hall: Hall, uuid: str) -> str | None:
+    [found] = [one["frame"] for one in hall.station.ask("names", "list")["names"] if one["uuid"] == uuid]
+    return None if found is None else str(found)
+
+
+def test_frames_are_listed_chosen_and_taken_back(hall: Hall) -> None:
+    a = hall.nodes["a"].uuid
+    hall.station.ask("names", "frame", a, 0, "left_arm")
+    hall.station.ask("names", "frame", a, 1, "left_arm/tip")
+    assert frame_of(hall, a) == "left_arm/tip"
+    hall.station.ask("names", "frame", a, 1, "")
+    assert frame_of(hall, a) == "left_arm", "that of the whole node"
+    hall.station.ask("names", "frame", a, 0, "")
+    assert frame_of(hall, a) is None
+    hall.station.refuses("names", "frame", a, 1, "no frame", code=2)
+    hall.station.refuses("names", "frame", a, 9, "tip", code=3)
+
+
 def test_what_cannot_be_a_topic_is_refused(hall: Hall) -> None:
     a, g = hall.nodes["a"].uuid, hall.nodes["g"].uuid
     for wrong in ("1st", "a__b", "a b", "end_", "", "a//b"):

@@ -27,6 +27,7 @@ from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest, Requirements
 from teds_provision.measure.runner import Ended, Measurement, Watcher
 from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
+from teds_provision.measure.sinks.wide import WIDE
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
@@ -38,7 +39,10 @@ AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole
 
 def whole_path(spec: str) -> str:
     """The words for a sink as they can be kept: a file's path from the root on, whatever folder comes next time."""
-    return spec if spec.partition(":")[0] in _SERVICES else str(Path(spec).absolute())
+    if spec.partition(":")[0] in _SERVICES:
+        return spec
+    wide = WIDE if spec.startswith(WIDE) else ""
+    return wide + str(Path(spec.removeprefix(wide)).absolute())
 
 
 _SERVICES = frozenset({"ros1", "ros2", "mqtt", "mqtts"})

@@ -100,6 +100,7 @@ class NodeStreams:
     def subscribe(self, bus: Bus, trusted: Trusted, plan: Plan, address: int, *, ahead: float = 0.0) -> None:
         """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
+        bus.hearing.expect(address, number)
         payload = trusted.node.send(plan.command(), "to stream")
         with self.mapping:
             reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()), after=self._run)

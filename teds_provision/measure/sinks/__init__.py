@@ -18,6 +18,7 @@ from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.measure.sinks.ros.sourced import ros2_sink
 from teds_provision.measure.sinks.text import JsonLinesSink, TextSink
+from teds_provision.measure.sinks.wide import WIDE, WideSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 else:
     __getattr__ = lazy(__name__)
 
+TEXT = frozenset({".csv", ".txt"})
 FILES: dict[str, Callable[[Path], Sink]] = {
     ".csv": TextSink,
     ".txt": TextSink,
@@ -41,16 +43,19 @@ SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
 
 
 def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
-    """The sink of a spec, not yet opened: a file name, ``ros1[:URL]``, ``ros2[:DOMAIN]``, ``mqtt://HOST[:PORT]``.
+    """The sink of a spec, not yet opened: a file, ``wide:FILE``, ``ros1[:URL]``, ``ros2[:DOMAIN]``, ``mqtt://HOST``.
 
     ``commands`` takes set points that come by the sink; None where no actuator may be moved. Raises UsageFailure.
     """
     service = spec.partition(":")[0]
     if service in SERVICES:
         return SERVICES[service](spec, commands)
+    if spec.startswith(WIDE) and Path(spec).suffix.lower() in TEXT:
+        return WideSink(Path(spec.removeprefix(WIDE)))
     path = Path(spec)
     if path.suffix.lower() not in FILES:
         raise UsageFailure(
-            f"No sink writes {spec!r}.", hint=f"Name a file that ends in {', '.join(FILES)}, or {', '.join(SERVICES)}."
+            f"Unsupported format: {spec!r}.",
+            hint=f"Name a file that ends in {', '.join(FILES)}, or {', '.join(SERVICES)}.",
         )
     return FILES[path.suffix.lower()](path)

@@ -12,13 +12,14 @@ import errno
 import fcntl
 import os
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from teds_provision.errors import StoreFailure, TedsProvisionError
 from teds_provision.files import sync_folder
-from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, Note, StationFacts
 from teds_provision.measure.sinks.base import Item, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.lines import iso
 
@@ -157,6 +158,28 @@ class FileSink(ThreadedSink):
             self._parts.append(path)
             return part
         raise TedsProvisionError(f"There are {PARTS} parts of {self._path} already.", hint="Name another file.")
+
+    def copy(
+        self, entries: Iterable[Item | Note], facts: tuple[ChannelFacts, ...], station: StationFacts
+    ) -> list[Path]:
+        """Write what was recorded before, on the caller's thread: nothing is waited for, and an error ends it.
+
+        Gives the files, whole and closed. Raises OSError, and TedsProvisionError where the first cannot be made.
+        """
+        self._prepare(facts, station)
+        try:
+            self._begin()
+            for entry in entries:
+                if isinstance(entry, Note):
+                    self._note(entry.at, entry.text)
+                else:
+                    self._take(entry)
+            self._close_part()
+        finally:
+            part, self._part = self._part, None
+            if part is not None:
+                part.abandon()
+        return self._parts
 
     # -- what a full disk and the system's clock do ------------------------------------------------------------------
 

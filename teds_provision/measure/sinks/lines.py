@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport
+from teds_provision.teds.calibration.plain import calibration_as_json
 
 
 def iso(seconds: float) -> str:
@@ -38,6 +39,7 @@ def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:
         field.name: getattr(facts, field.name) for field in dataclasses.fields(facts) if field.name not in _WITHIN
     }
     fields["vector"] = list(facts.vector) or None
+    fields["calibration"] = None if facts.calibration is None else calibration_as_json(facts.calibration)
     return {
         name: plain(value) for name, value in fields.items() if value is not None and value is not False and value != ""
     }
@@ -69,7 +71,28 @@ def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> I
             line["test_pattern"] = True
         if known.unsigned:
             line["unsigned"] = True
+        if known.unverified:
+            line["unverified"] = True
         yield line
+
+
+def row_lines(rows: GroupRows, facts: Mapping[tuple[str, int], ChannelFacts]) -> Iterator[dict[str, Any]]:
+    """The same for each channel of a grid, which has neither sample numbers nor raw values."""
+    times = [round(instant, 6) for instant in rows.time.tolist()]
+    for column, (uuid, number) in enumerate(rows.channels):
+        known = facts.get((uuid, number)) or ChannelFacts(uuid, "", number, "")
+        values = rows.value[:, column].tolist()
+        yield {
+            "event": "data",
+            "uuid": uuid,
+            "channel": number,
+            "name": known.name,
+            "unit": known.unit,
+            "time": times,
+            "value": [plain(one) for one in values],
+            "uncertainty": known.uncertainty,
+            "valid": [math.isfinite(one) for one in values],
+        }
 
 
 def status_line(report: NodeReport) -> dict[str, Any]:

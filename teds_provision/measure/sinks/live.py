@@ -8,6 +8,8 @@ messages per second and says when that is more than what one process bears.
 |---|---|---|
 | ``/<station>/<group>`` | sensor_msgs/JointState (name, position = value) | each row of the grid |
 | ``/<station>/<group>/age`` | sensor_msgs/JointState (name, position = age in seconds) | each row |
+| ``/<station>/joint_states`` | the same of all joints, for ros2_control | each row, where there is a joint |
+| ``/<station>/joint_commands`` | the same, subscribed | where there is a joint that may be moved |
 | ``/<station>/<node>/array`` and ``/age`` | the same of one node, where nodes come and go | each row of its grid |
 | ``/<station>/<node>/<channel>`` | by :mod:`meaning` | at the scalar rate |
 | ``/<station>/<node>/imu`` and the like | by :mod:`vectors` | at the scalar rate |
@@ -23,7 +25,7 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +41,7 @@ from teds_provision.measure.blocks import (
     why_invalid,
 )
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
+from teds_provision.measure.sinks.joints import INTERFACES, Joint, joints_of, state_of
 from teds_provision.measure.sinks.lines import facts_as_json
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import (
@@ -54,6 +57,7 @@ from teds_provision.measure.sinks.vectors import (
 
 NODE = "teds_provision"
 BUDGET = 5000  # messages a second that one process bears (docs/ros.md)
+STATES, COMMANDS = "joint_states", "joint_commands"  # topics of the station
 ROWS = 1000  # rows a second of an array, at most; a recorder takes all of them
 OK, WARN, ERROR, STALE = range(4)  # of diagnostic_msgs/DiagnosticStatus
 JOINT_STATE, STRING, DIAGNOSTICS = "sensor_msgs/JointState", "std_msgs/String", "diagnostic_msgs/DiagnosticArray"
@@ -74,9 +78,8 @@ class Status:
 class _Scalars:
     """Scalar topics of one stream, and when they are due."""
 
-    channels: list[tuple[int, str, Meaning, float]]  # column, topic, meaning, variance
-    compounds: list[tuple[str, Compound]]  # topic, message
-    frame: str
+    channels: list[tuple[int, str, Meaning, str, float]]  # column, topic, meaning, frame, variance
+    compounds: list[tuple[str, Compound, str]]  # topic, message, frame
     due: float = 0.0
 
 
@@ -95,6 +98,9 @@ class TopicSink(ThreadedSink):
         self._reports: dict[str, NodeReport] = {}
         self._arrays: dict[tuple[tuple[str, int], ...], float] = {}  # time of the last row that went out
         self._labels: dict[tuple[tuple[str, int], ...], list[str]] = {}
+        self._joints: list[Joint] = []
+        self._newest: dict[tuple[str, int], float] = {}  # of what joints need
+        self._described: set[str] = set()  # nodes whose datasheet is on a topic
         self._sent = 0
         self._second = 0.0
         self.refused_commands = 0
@@ -104,7 +110,15 @@ class TopicSink(ThreadedSink):
         """Make a topic known before its first message, so that whoever waits for it is there in time."""
 
     @abstractmethod
-    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
+    def _array(
+        self,
+        topic: str,
+        stamp: float,
+        names: Sequence[str],
+        values: Sequence[float],
+        velocity: Sequence[float] = (),
+        effort: Sequence[float] = (),
+    ) -> None:
         """One JointState; NaN where there is no value."""
 
     @abstractmethod
@@ -120,12 +134,20 @@ class TopicSink(ThreadedSink):
         """A String that late comers get too."""
 
     @abstractmethod
+    def _retire(self, topic: str) -> None:
+        """Take back a topic that :meth:`_latched` made: who comes from now on finds nothing there."""
+
+    @abstractmethod
     def _parameter(self, name: str, value: object) -> None:
         """Facts for a parameter server, where there is one."""
 
     @abstractmethod
     def _listen(self, topic: str, uuid: str, channel: int) -> None:
         """Subscribe to set points of an actuator; each goes to :meth:`_command`."""
+
+    @abstractmethod
+    def _listen_joints(self, topic: str) -> None:
+        """Subscribe to JointState of set points; each goes to :meth:`_joint_command`."""
 
     @abstractmethod
     def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
@@ -171,7 +193,13 @@ class TopicSink(ThreadedSink):
             return []
         changed = [one for one in item if self._facts.get(one.key) != one]
         self._facts.update((one.key, one) for one in changed)
+        before = {uuid: self._topics.of_node(uuid, "teds") for uuid in self._described}
         self._topics.learn(changed)
+        for uuid, topic in before.items():
+            if topic != self._topics.of_node(uuid, "teds"):  # under another name: nobody may find the old sheet
+                self._described.discard(uuid)
+                self._retire(topic)
+        self._joints = joints_of(self._facts.values(), self._topics)
         self._labels.clear()
         self._scalars.clear()
         return changed
@@ -182,11 +210,17 @@ class TopicSink(ThreadedSink):
         for array in () if self._station.test_pattern else map(self._array_topic, sorted(whole)):
             for topic in (array, f"{array}/age"):
                 self._advertise(topic, JOINT_STATE)
+        self._joints = joints_of(self._facts.values(), self._topics)
+        if self._joints and not self._station.test_pattern:
+            self._advertise(self._topics.of_station(STATES), JOINT_STATE)
+            if self._commands is not None:
+                self._listen_joints(self._topics.of_station(COMMANDS))
         by_node: dict[str, list[ChannelFacts]] = {one.uuid: [] for one in facts}
         for one in self._facts.values():
             if one.uuid in by_node:
                 by_node[one.uuid].append(one)
         for uuid, channels in by_node.items():
+            self._described.add(uuid)
             self._latched(self._topics.of_node(uuid, "teds"), json.dumps(self._metadata(uuid, channels)))
             for one in channels:
                 self._parameter(self._topics.channel(*one.key), facts_as_json(one))
@@ -201,7 +235,10 @@ class TopicSink(ThreadedSink):
             "clock": self._station.clock,
             "test_pattern": self._station.test_pattern,
             "variance": VARIANCE_NOTE,
-            "channels": [{**facts_as_json(one), "topic": self._topics.channel(*one.key)} for one in channels],
+            "channels": [
+                {**facts_as_json(replace(one, frame=self._frame(one))), "topic": self._topics.channel(*one.key)}
+                for one in channels
+            ],
         }
 
     def _block(self, block: Block) -> None:
@@ -222,17 +259,19 @@ class TopicSink(ThreadedSink):
 
     def _publish(self, block: Block, scalars: _Scalars) -> None:
         """The last instant of a block: each channel that stands alone, and what several make together."""
+        if self._joints:
+            self._newest |= dict(zip(block.keys, block.value[-1].tolist(), strict=True))
         stamp = float(block.time[-1])
-        for column, topic, meaning, variance in scalars.channels:
+        for column, topic, meaning, frame, variance in scalars.channels:
             value = float(block.value[-1, column])
             if math.isfinite(value):
-                self._scalar(topic, meaning, stamp, scalars.frame, meaning.field_value(value), variance)
+                self._scalar(topic, meaning, stamp, frame, meaning.field_value(value), variance)
                 self._went(1)
         values = dict(zip(block.channels, block.value[-1].tolist(), strict=True)) if scalars.compounds else {}
-        for topic, compound in scalars.compounds:
+        for topic, compound, frame in scalars.compounds:
             fields = compound.fields(values)
             if fields is not None:
-                self._fields(topic, compound.type, stamp, scalars.frame, fields)
+                self._fields(topic, compound.type, stamp, frame, fields)
                 self._went(len(compound.parts))
 
     def _scalars_of(self, block: Block) -> _Scalars:
@@ -241,9 +280,15 @@ class TopicSink(ThreadedSink):
         for column, facts in enumerate(known):
             if not is_range(facts):
                 topic = self._topics.channel(block.uuid, facts.number)
-                channels.append((column, topic, meaning_of(facts), variance_of(facts)))
-        compounds = [(self._compound_topic(block.uuid, one), one) for one in compounds_of(known)]
-        return _Scalars(channels, compounds, self._station.frame_ids.get(block.uuid, ""))
+                channels.append((column, topic, meaning_of(facts), self._frame(facts), variance_of(facts)))
+        frames = {one.number: self._frame(one) for one in known}
+        compounds = [
+            (self._compound_topic(block.uuid, one), one, frames[one.parts[0][1]]) for one in compounds_of(known)
+        ]
+        return _Scalars(channels, compounds)
+
+    def _frame(self, facts: ChannelFacts) -> str:
+        return facts.frame.replace("{node}", self._topics.node(facts.uuid))
 
     def _compound_topic(self, uuid: str, one: Compound) -> str:
         return self._topics.of_node(uuid, one.name) if one.name else self._topics.channel(uuid, one.parts[0][1])
@@ -267,9 +312,30 @@ class TopicSink(ThreadedSink):
                 continue
             last = stamp
             self._array(topic, stamp, names, rows.value[k].tolist())
+            if self._joints:
+                self._joint_states(stamp, dict(zip(rows.channels, rows.value[k].tolist(), strict=True)))
             self._array(f"{topic}/age", stamp, names, rows.age[k].tolist())
             self._went(int(np.isfinite(rows.value[k]).sum()), messages=2)
         self._arrays[rows.channels] = last
+
+    def _joint_states(self, stamp: float, values: Mapping[tuple[str, int], float]) -> None:
+        self._newest |= values
+        mine = [one for one in self._joints if any((one.uuid, number) in values for number in one.state.values())]
+        names, *states = state_of(mine, self._newest)
+        if names:
+            self._array(self._topics.of_station(STATES), stamp, names, *states)
+            self._went(0)
+
+    def _joint_command(self, names: Sequence[str], *values: Sequence[float]) -> None:
+        """Set points of joints came: positions, velocities, efforts; from any thread. Unknown names are refused."""
+        given = dict(zip(INTERFACES, values, strict=True))
+        joints = {one.name: one for one in self._joints}
+        for place, name in enumerate(names):
+            joint = joints.get(name)
+            if joint is not None and place < len(given[joint.command]):
+                self._command(joint.uuid, joint.actuator, float(given[joint.command][place]))
+            else:
+                self.refused_commands += 1
 
     def _went(self, values: int, messages: int = 1) -> None:
         self._sent += messages
@@ -290,6 +356,9 @@ class TopicSink(ThreadedSink):
         for uuid in sorted({one.uuid for one in self._facts.values() if one.unsigned}):
             name = f"{self._topics.node(uuid)}: datasheet"
             found.append(Status(WARN, name, "nobody has signed it: raw values alone, which reach no topic", uuid))
+        for uuid in sorted({one.uuid for one in self._facts.values() if one.unverified}):
+            name = f"{self._topics.node(uuid)}: datasheet"
+            found.append(Status(WARN, name, "unverified: nobody has signed it, and values are calibrated by it", uuid))
         for one in self._facts.values():
             if one.overdue:
                 name = f"{self._topics.node(one.uuid)}: calibration of {one.label}"

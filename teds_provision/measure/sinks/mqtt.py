@@ -208,16 +208,17 @@ class MqttSink(ThreadedSink):
             if one.unsigned:  # raw values alone, which are none of anything: no sensor to show
                 continue
             node = f"{self._topics.station}/{self._topics.node(one.uuid)}"
+            marked = " (unverified)" if one.unverified else ""
             device = {
                 "identifiers": [one.uuid],
-                "name": one.node or one.uuid,
+                "name": f"{one.node or one.uuid}{marked}",
                 "manufacturer": "IEEE 1451 transducer",
                 "sw_version": f"teds-provision {__version__}",
             }
             unit = self._units.get(one.key)
             sign = short_unit(unit.text) if unit else one.unit
             words = {
-                "name": one.label,
+                "name": f"{one.label}{marked}",
                 "unique_id": f"{one.uuid}_{one.number}",
                 "state_topic": node,
                 "value_template": f"{{{{ value_json.{self._field(one)} }}}}",
@@ -247,6 +248,8 @@ class MqttSink(ThreadedSink):
             values = {"time": round(float(block.time[-1]), 6), **newest}
             if any(facts.unsigned for facts in known):
                 values["unsigned"] = True
+            if any(facts.unverified for facts in known):
+                values["unverified"] = True
             if self._connected.is_set():
                 self._publish(f"{self._topics.station}/{self._topics.node(block.uuid)}", values)
                 self._count(written=len(newest))

@@ -33,6 +33,14 @@ def is_topic(text: str) -> bool:
     return all(TOKEN.match(part) and "__" not in part for part in text.strip("/").split("/"))
 
 
+FRAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z")
+
+
+def is_frame(text: str) -> bool:
+    """Whether a text can be a coordinate frame (``frame_id``), of a person or a file."""
+    return len(text) <= LONGEST and FRAME.match(text) is not None
+
+
 class Topics:
     """Names of all nodes and channels of one station: no two topics are equal, whatever names there are.
 
@@ -54,6 +62,7 @@ class Topics:
         self._channels: dict[str, dict[int, str]] = {}  # of each node: name of each channel as it calls itself
         self._known = {uuid: slug(name) for uuid, name in station.nodes.items()}  # what each node is called itself
         self._strangers: dict[str, str] = {}
+        self._unverified: dict[str, str] = {}  # nobody signed what they say: a namespace of their own
         self._nodes: dict[str, str] = {}
         self._made: dict[str, dict[int, str]] = {}
         self._name_nodes()
@@ -62,8 +71,12 @@ class Topics:
         """Facts of channels; a node that the station does not know gives way to those that it does."""
         strangers = len(self._strangers)
         for one in facts:
-            if one.uuid not in self._known:
-                self._strangers[one.uuid] = slug(one.node)
+            if one.unverified:
+                self._name_unverified(one.uuid, slug(one.node))
+            else:
+                self._unverified.pop(one.uuid, None)
+                if one.uuid not in self._known:
+                    self._strangers[one.uuid] = slug(one.node)
             if one.chosen is not None:
                 self._choose(one.uuid, one.chosen)
             channels = self._channels.setdefault(one.uuid, {})
@@ -71,6 +84,14 @@ class Topics:
             self._made.pop(one.uuid, None)
         if len(self._strangers) != strangers:
             self._name_nodes()
+
+    def _name_unverified(self, uuid: str, name: str) -> None:
+        """Whoever came first keeps its name: one that nobody vouches for renames no other."""
+        own = name or f"n{uuid[:8]}"
+        if self._unverified.get(uuid, "").startswith(own):
+            return
+        taken = {other for key, other in self._unverified.items() if key != uuid}
+        self._unverified[uuid] = next(one for one in (own, f"{own}_{uuid[:8]}", f"{own}_{uuid}") if one not in taken)
 
     def _choose(self, uuid: str, chosen: Iterable[tuple[int, str]]) -> None:
         """Names that somebody chose while the node was not measured; nobody else's change by it."""
@@ -106,12 +127,14 @@ class Topics:
         return f"{name}_{uuid[:8]}" if another else name
 
     def node(self, uuid: str) -> str:
-        """Part of the node: ``arm``, ``n8d4d9da6``."""
+        """Part of the node: ``arm``, ``n8d4d9da6``; ``unverified/arm``, whatever somebody chose for the signed one."""
+        if uuid in self._unverified:
+            return f"{UNVERIFIED}/{self._unverified[uuid]}"
         return self._chosen.get((uuid, 0)) or self._nodes.get(uuid) or f"n{uuid[:8]}"
 
     def channel(self, uuid: str, number: int) -> str:
         """Whole topic of a channel: ``/bench/arm/angle``."""
-        if (uuid, number) in self._chosen:
+        if (uuid, number) in self._chosen and uuid not in self._unverified:
             return f"/{self._chosen[uuid, number]}"
         if uuid not in self._made:
             self._made[uuid] = self._make(uuid)
@@ -121,7 +144,8 @@ class Topics:
         """Names of a node's channels that nobody chose one for."""
         prefix = f"/{self.station}/{self.node(uuid)}/"
         channels = self._channels.get(uuid, {})
-        own = {number: name for number, name in channels.items() if (uuid, number) not in self._chosen}
+        apart = uuid in self._unverified
+        own = {number: name for number, name in channels.items() if apart or (uuid, number) not in self._chosen}
         mine = [topic.removeprefix(prefix) for topic in self._whole if topic.startswith(prefix)]
         taken = {*mine, *(topic.removesuffix("/cmd") for topic in mine)}
         wishes = {number: (slug(name) or f"ch{number}",) for number, name in own.items()}
@@ -134,7 +158,12 @@ class Topics:
 
     def of_group(self, group: str) -> str:
         """The array of a group: ``/bench/hand``; of a measurement without one ``/bench/all``."""
-        return f"/{self.station}/{slug(group) or 'all'}"
+        name = slug(group) or "all"
+        return f"/{self.station}/{name}{'_group' if name in _JOINTS else ''}"
+
+    def of_station(self, what: str) -> str:
+        """A topic of the whole station: ``/bench/joint_states``."""
+        return f"/{self.station}/{what}"
 
     def require_free(self, uuid: str, channel: int, name: str) -> None:
         """Raise UsageFailure where a name that is to be chosen is, or would be taken for, another one's."""
@@ -143,7 +172,7 @@ class Topics:
             other = next(
                 (one for one in {**self._known, **self._strangers} if one != uuid and self.node(one) == name), ""
             )
-            if other or name in _NOT_NODES:
+            if other or name in _NOT_NODES or name.partition("/")[0] == UNVERIFIED:
                 raise _taken(name, f"node {other}" if other else "something else")
             return
         topic = f"/{name}"
@@ -164,7 +193,9 @@ class Topics:
         return len(parts) == 1 or bool(_NOT_CHANNELS.fullmatch(parts[-1])) or parts[-1] == "cmd"
 
 
-_NOT_NODES: Final = frozenset({"all", "reports", "status", "unverified"})
+UNVERIFIED: Final = "unverified"
+_JOINTS: Final = frozenset({"joint_states", "joint_commands"})
+_NOT_NODES: Final = frozenset({"all", "reports", "status", UNVERIFIED}) | _JOINTS
 """Parts of topics of the station itself: no node is called so."""
 _NOT_CHANNELS: Final = re.compile(r"(array|teds|state|status|age|cmd|(stream|imu|magnetic_field|wrench)(_[0-9]+)?)")
 """Parts of topics that stand beside the channels of a node (live.py, vectors.py, mcap/recording.py, mqtt.py)."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
@@ -28,6 +29,8 @@ FORMULA = ("=", "+", "-", "@")  # a cell that begins so would be computed by a s
 
 class TextSink(FileSink):
     """Recorder of text; see the module."""
+
+    layout = "text 1"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -74,16 +77,23 @@ class TextSink(FileSink):
     def _header(self) -> None:
         known = [self.facts[key] for key in sorted(self.facts)]
         self._columns = {one.key: place for place, one in enumerate(known)}
-        self._templates, self._states = {}, {}
+        self._templates = {}
+        heads = heads_of(known)
+        columns = ["time", "uuid", "index", "clock_error", "note", *heads, *(f"{name} raw" for name in names_of(known))]
+        self._preamble(known, columns)
+
+    def _preamble(self, known: Sequence[ChannelFacts], columns: Sequence[str]) -> None:
+        self._states = {}
         station = self.station
-        self._line(f"# teds-provision measurement, text 1; times are unix seconds, clock: {station.clock}")
+        clock = printable(station.clock)
+        self._line(f"# teds-provision measurement, {self.layout}; times are unix seconds, clock: {clock}")
         self._line(f"# station: {printable(station.name)}; group: {printable(station.group) or 'none'}")
         self._line(f"# started: {iso(station.started)}; part {len(self.files)}")
         if station.test_pattern:
             self._line("# TEST PATTERN: no line of this file is a measurement")
         for one in known:
             self._line("# channel: " + json.dumps(facts_as_json(one)))
-        self._line(self._comma.join(map(self._cell, _heads(known))))
+        self._line(self._comma.join(map(self._cell, columns)))
 
     def _cell(self, text: str) -> str:
         """A name from a datasheet as a cell: quoted where needed, never a formula of a spreadsheet.
@@ -140,9 +150,15 @@ class TextSink(FileSink):
         for number in block.channels:
             place = self._columns[block.uuid, number]
             cells[place], cells[width + place] = "%.12g", raw
-        unsigned = any(self.facts[block.uuid, number].unsigned for number in block.channels)
-        note = "test pattern" if block.test_pattern else "unsigned datasheet" if unsigned else ""
+        note = "test pattern" if block.test_pattern else note_of([self.facts[block.uuid, n] for n in block.channels])
         return self._comma.join(["%.6f", block.uuid, "%d", "%.3g", note, *cells]) + "\n"
+
+
+def note_of(facts: Sequence[ChannelFacts]) -> str:
+    """What stands beside values that nobody vouches for, "" for others."""
+    if any(one.unverified for one in facts):
+        return "unverified datasheet"
+    return "unsigned datasheet" if any(one.unsigned for one in facts) else ""
 
 
 def counted(report: NodeReport) -> str:
@@ -160,10 +176,18 @@ def _raw_values(block: Block) -> list[list[Any]]:
     return rows
 
 
-def _heads(known: Sequence[ChannelFacts]) -> list[str]:
+def names_of(known: Sequence[ChannelFacts]) -> list[str]:
+    """``NODE/CHANNEL`` of each channel; those of one name get their UUID and number behind it."""
     names = [f"{one.node or one.uuid}/{one.label}" for one in known]
-    values = [f"{name} [{one.unit}]" if one.unit else name for name, one in zip(names, known, strict=True)]
-    return ["time", "uuid", "index", "clock_error", "note", *values, *(f"{name} raw" for name in names)]
+    count = Counter(names)
+    return [
+        name if count[name] == 1 else f"{name} {one.uuid}:{one.number}" for name, one in zip(names, known, strict=True)
+    ]
+
+
+def heads_of(known: Sequence[ChannelFacts]) -> list[str]:
+    """Columns of values: the name of each channel, and its unit where it has one."""
+    return [f"{name} [{one.unit}]" if one.unit else name for name, one in zip(names_of(known), known, strict=True)]
 
 
 # JSON lines: the first says who measures what, then the events of ``measure --json``, one line each.

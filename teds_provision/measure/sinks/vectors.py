@@ -24,11 +24,15 @@ from teds_provision.teds.units import units_of
 
 # Which ROS message fits a channel: by unit and meaning, else a plain number.
 #
-# REP 103: SI units and radians. A variance of 0 means "unknown" in sensor_msgs. The uncertainty of a datasheet (OError)
-# is a worst case; (OError / √3)² is its variance if every error inside is equally likely, which the metadata say.
+# REP 103: SI units and radians. A variance of 0 means "unknown" in sensor_msgs. Where a profile knows the standard
+# deviation, its square is the variance. The uncertainty of a datasheet (OError) is a worst case; (OError / √3)² is its
+# variance if every error inside is equally likely, which the metadata say.
 
 KELVIN = 273.15  # 0 °C
-VARIANCE_NOTE = "variance = (uncertainty / sqrt 3)^2: every error within the worst case equally likely"
+VARIANCE_NOTE = (
+    "variance = deviation^2 where the profile knows a standard deviation, else (uncertainty / sqrt 3)^2: every error "
+    "within the worst case equally likely"
+)
 _KELVIN = units_of(kelvins=1)
 _STRESS = units_of(meters=-1, kilograms=1, seconds=-2)
 _LUX = units_of(meters=-2, candelas=1, steradians=1)
@@ -70,7 +74,9 @@ def meaning_of(facts: ChannelFacts) -> Meaning:
 
 
 def variance_of(facts: ChannelFacts) -> float:
-    """Variance for sensor_msgs; 0 where the datasheet does not say."""
+    """Variance for sensor_msgs; 0 where neither profile nor datasheet says."""
+    if facts.deviation:
+        return facts.deviation**2
     return facts.uncertainty**2 / 3 if facts.uncertainty else 0.0
 
 

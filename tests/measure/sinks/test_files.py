@@ -418,12 +418,13 @@ def test_a_file_whose_recorder_writes_is_refused(tmp_path: Path, name: str) -> N
 def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(tmp_path: Path) -> None:
     with pytest.raises(TedsProvisionError, match="folder"):
         open_sink(str(tmp_path / "no" / "run.csv")).open([ANGLE], STATION)
-    with pytest.raises(UsageFailure, match="No sink"):
+    with pytest.raises(UsageFailure, match="Unsupported format"):
         open_sink("run.xlsx")
 
 
 RECORDER = """
 import sys, time, resource
+sys.dont_write_bytecode = True
 sys.path.insert(0, {root!r})
 from dataclasses import replace
 from pathlib import Path

@@ -17,10 +17,14 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.sinks.joints import joints_of
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, Status, TopicSink
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning, compounds_of, is_range, meaning_of, variance_of
-from teds_provision.teds.units import parse_units
+from teds_provision.teds.calibration.formula import evaluate
+from teds_provision.teds.calibration.model import Calibration, CalibrationInput
+from teds_provision.teds.calibration.plain import calibration_from_json
+from teds_provision.teds.units import parse_unit, parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, fill
 
 ROS_TOPIC = re.compile(r"/[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
@@ -222,6 +226,8 @@ class Carrier(TopicSink):
         super().__init__("carrier", None if commands is None else commands.append)
         self.arrays: list[tuple[str, float, list[str], list[float]]] = []
         self.scalars: list[tuple[str, str, float, float]] = []
+        self.frames: set[str] = set()
+        self.joints: list[tuple[list[str], list[float], list[float], list[float]]] = []
         self.compounds: list[tuple[str, str, Mapping[str, FieldValue]]] = []
         self.words: dict[str, str] = {}
         self.parameters: dict[str, object] = {}
@@ -232,23 +238,42 @@ class Carrier(TopicSink):
     def _advertise(self, topic: str, kind: str) -> None:
         self.advertised.append((topic, kind))
 
-    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
-        self.arrays.append((topic, stamp, list(names), list(values)))
+    def _array(
+        self,
+        topic: str,
+        stamp: float,
+        names: Sequence[str],
+        values: Sequence[float],
+        velocity: Sequence[float] = (),
+        effort: Sequence[float] = (),
+    ) -> None:
+        if topic.endswith("joint_states"):
+            self.joints.append((list(names), list(values), list(velocity), list(effort)))
+        else:
+            self.arrays.append((topic, stamp, list(names), list(values)))
 
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
         self.scalars.append((topic, meaning.type, value, variance))
+        self.frames.add(frame)
 
     def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
         self.compounds.append((topic, kind, fields))
+        self.frames.add(frame)
 
     def _latched(self, topic: str, words: str) -> None:
         self.words[topic] = words
+
+    def _retire(self, topic: str) -> None:
+        del self.words[topic]
 
     def _parameter(self, name: str, value: object) -> None:
         self.parameters[name] = value
 
     def _listen(self, topic: str, uuid: str, channel: int) -> None:
         self.listens.append((topic, uuid, channel))
+
+    def _listen_joints(self, topic: str) -> None:
+        self.listens.append((topic, "", 0))
 
     def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
         self.statuses = list(statuses)
@@ -287,6 +312,70 @@ def test_an_invalid_value_has_no_scalar_message_and_is_nan_in_the_array() -> Non
     assert (stamp, names) == (1.0, ["arm/angle", "hand/force"])
     assert values[0] == 1.0
     assert np.isnan(values[1])
+
+
+def test_each_channel_has_its_own_frame_and_the_deviation_of_its_profile() -> None:
+    tip = replace(ANGLE, frame="{node}_tip", deviation=0.002)
+    base = [replace(one, frame="base") for one in axes("m/s^2", 4)]
+    sink = carried([block([[1, 2, 3, 4]], channels=(1, 4, 5, 6))], facts=[tip, *base])
+    assert sink.frames == {"arm_tip", "base"}
+    [angle] = [one for one in sink.scalars if one[0] == "/bench/arm/angle"]
+    assert angle[3] == pytest.approx(0.002**2), "the standard deviation goes before the worst case"
+
+
+def gripper() -> list[ChannelFacts]:
+    """An opening that is commanded and measured, and the force of the grip."""
+    opening = replace(FORCE, unit="m", units=parse_units("m"))
+    return [
+        replace(opening, number=1, name="opening set point", kind="actuator"),
+        replace(opening, number=2, name="opening"),
+        replace(FORCE, number=3, name="grip force", units=parse_units("N")),
+    ]
+
+
+def test_a_gripper_is_a_joint_whose_state_goes_out_and_whose_set_points_come_in() -> None:
+    keys = ((HAND, 2), (HAND, 3))
+    rows = GroupRows("crane", keys, np.array([1.0, 2.0]), np.array([[0.05, 4.0], [np.nan, 5.0]]), np.zeros((2, 2)))
+    came: list[Command] = []
+    sink = carried([rows], facts=[ANGLE, *gripper()], commands=came)
+    assert sink.joints == [(["hand"], [0.05], [], [4.0])], "without a position there is no state"
+    assert ("/bench/joint_states", "sensor_msgs/JointState") in sink.advertised
+    assert ("/bench/joint_commands", "", 0) in sink.listens
+    sink._joint_command(["stranger", "hand"], [9.0, 0.02], [], [])
+    sink._joint_command(["hand"], [], [1.0], [])
+    sink._joint_command(["hand"], [float("nan")], [], [])
+    assert [(one.uuid, one.channel, one.value) for one in came] == [(HAND, 1, 0.02)]
+    assert sink.refused_commands == 3
+
+
+def test_sensors_alone_are_no_joint_and_nobody_guesses_whose_they_are() -> None:
+    topics = Topics(STATION)
+    assert joints_of([ANGLE, FORCE], topics) == []
+    second = replace(gripper()[0], number=4, name="thumb")
+    joints = joints_of([*gripper(), second], topics)
+    assert [(one.actuator, dict(one.state)) for one in joints] == [(1, {}), (4, {})]
+    assert len({one.name for one in joints}) == 2
+
+
+def test_the_datasheet_is_on_a_topic_whole() -> None:
+    curve = Calibration(
+        1, "linear", (CalibrationInput(1, 1, (0.0, 65535.0), (0.0,)),), (0.5, 0.25), parse_unit("degree")
+    )
+    facts = replace(ANGLE, units=parse_units("rad"), own_period=1e-4, deviation=0.002, calibration=curve)
+    sheet = json.loads(carried([], facts=[facts]).words["/bench/arm/teds"])
+    [told] = sheet["channels"]
+    assert (told["low"], told["high"], told["unit"], told["uncertainty"]) == (0.0, 6.283185, "rad", 0.0087)
+    assert (told["deviation"], told["own_period"], told["due"]) == (0.002, 1e-4, "2027-03-01")
+    assert told["calibration"]["method"] == "linear"
+    assert told["calibration"]["coefficients"] == [0.5, 0.25]
+    again = calibration_from_json(told["calibration"], 1, parse_units("rad"))
+    assert evaluate(again, 100.0).value == evaluate(curve, 100.0).value
+
+
+def test_a_node_under_another_name_leaves_no_datasheet_under_the_old_one() -> None:
+    renamed = replace(ANGLE, chosen=((0, "left_arm"),))
+    sink = carried([[renamed]], facts=[replace(ANGLE, chosen=())])
+    assert list(sink.words) == ["/bench/left_arm/teds"]
 
 
 def test_an_unsigned_datasheet_is_told_in_diagnostics_and_metadata() -> None:

@@ -1,143 +1,217 @@
-"""ROS 2 by a sourced rclpy: played by a stand-in that checks names and types, for ROS 2 is not on this machine."""
+"""ROS 2 by the real rclpy, seen by another rclpy; and which of the two ways to ROS 2 is taken."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
 import queue
-import shlex
+import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
-from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport
+from teds_provision.errors import UsageFailure
+from teds_provision.measure.blocks import Command, NodeReport
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import sourced
 from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
 from teds_provision.measure.sinks.ros.sourced import RclpySink
-from tests.measure.sinks.parts import (
-    ANGLE,
-    ARM,
-    AXES,
-    DISTANCE,
-    GRIP,
-    HAND,
-    OIL,
-    STATION,
-    feed_robot,
-    kill_child,
-)
+from tests.measure.sinks.parts import ANGLE, ARM, AXES, DISTANCE, GRIP, HAND, OIL, STATION, feed_robot, kill_child
+from tests.measure.sinks.rclpy_scene import PYTHON, Domain, domain, needs_rclpy
 from tests.pace import until
 
-STANDIN = Path(__file__).with_name("rclpy_standin")
-STORE = get_typestore(Stores.ROS2_JAZZY)
+__all__ = ["domain"]
 
 
-@dataclass
-class Sourced:
-    """An environment in which a ROS 2 is sourced."""
-
-    folder: Path
-
-    def notes(self, event: str) -> list[dict[str, Any]]:
-        file = self.folder / "notes"
-        lines = file.read_text().splitlines(keepends=True) if file.exists() else []
-        return [
-            one for one in map(json.loads, (line for line in lines if line.endswith("\n"))) if one["event"] == event
-        ]
-
-    def last(self, topic: str) -> Any:
-        found = [one for one in self.notes("message") if one["topic"] == topic]
-        return STORE.deserialize_cdr(bytes.fromhex(found[-1]["octets"]), found[-1]["type"]) if found else None
-
-
-@pytest.fixture
-def ros(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sourced:
-    sourced._python.cache_clear()
-    python = tmp_path / "conda" / "bin" / "python3"  # a Python of its own, as RoboStack has one
-    python.parent.mkdir(parents=True)
-    python.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n')
-    python.chmod(0o755)
-    for name, value in {
-        "AMENT_PREFIX_PATH": "/opt/ros/jazzy", "CONDA_PREFIX": str(tmp_path / "conda"), "PYTHONPATH": str(STANDIN),
-        "STANDIN_NOTES": str(tmp_path / "notes"), "STANDIN_COMMANDS": str(tmp_path / "commands"),
-    }.items():  # fmt: skip
-        monkeypatch.setenv(name, value)
-    return Sourced(tmp_path)
-
-
-def test_without_a_sourced_ros_cyclone_dds_carries_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_rclpy_cyclone_dds_carries_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    monkeypatch.delenv(sourced.CHOSEN, raising=False)
     assert isinstance(open_sink("ros2"), Ros2Sink)
 
 
-def test_a_sourced_ros_without_rclpy_is_left_alone(ros: Sourced, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(ros.folder))
-    monkeypatch.setenv("CONDA_PREFIX", "")
+def test_a_sourced_ros_without_rclpy_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sourced._python.cache_clear()
+    for name, value in {"AMENT_PREFIX_PATH": "/opt/ros/jazzy", "PYTHONPATH": str(tmp_path), "CONDA_PREFIX": ""}.items():
+        monkeypatch.setenv(name, value)
     assert isinstance(open_sink("ros2"), Ros2Sink)
 
 
-def test_every_message_has_the_fields_and_types_of_ros_2(ros: Sourced) -> None:
+def test_a_python_that_was_named_and_has_no_rclpy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    monkeypatch.setenv(sourced.CHOSEN, sys.executable)
+    with pytest.raises(UsageFailure, match="cannot import rclpy"):
+        open_sink("ros2")
+
+
+def ports_of(process: int) -> list[str]:
+    """Local addresses of the UDP sockets of a process, as ``ss`` tells them: ``0.0.0.0%lo:7410``."""
+    told = subprocess.run(["ss", "-Hulpn"], capture_output=True, text=True, check=True).stdout
+    return [line.split()[3] for line in told.splitlines() if f"pid={process}," in line]
+
+
+@pytest.fixture(params=["rclpy", "Cyclone DDS"])
+def sink(request: pytest.FixtureRequest, domain: Domain, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A sink of each way, open, running, with what takes its set points."""
+    if request.param != "rclpy":
+        monkeypatch.delenv(sourced.CHOSEN)
     came: queue.Queue[Command] = queue.Queue()
-    sink = open_sink("ros2:7", came.put)
-    assert isinstance(sink, RclpySink)
-    bare = ChannelFacts("8d4d9da65281f7000003", "bare", 1, "angle", unsigned=True)
-    sink.open([ANGLE, OIL, GRIP, DISTANCE, *AXES, bare], STATION)
+    made = open_sink(f"ros2:{domain.number}", came.put)
+    assert isinstance(made, RclpySink if request.param == "rclpy" else Ros2Sink)
+    made.came = came  # type: ignore[attr-defined]
+    yield made
+    made.close()
+    assert made.stats.error == ""
+
+
+def open_and_feed(sink: Any, ready: Any, facts: Any = (ANGLE, OIL, GRIP, DISTANCE, *AXES)) -> int:
+    """Open it and feed it until ``ready``; how often that was."""
+    sink.open(list(facts), STATION)
     until(lambda: sink.stats.state == "running")
-    sink.report(NodeReport(ARM, "running", lost=2))
-    topics = ("angle", "range_finder", "imu")
-    k = 0
-    while not (all(ros.last(f"/bench/arm/{one}") for one in topics) and ros.last("/bench/crane")):
-        k += 1
-        assert k < 1200, sink.stats
+    for k in range(1, 1200):
         feed_robot(sink, k)
         time.sleep(0.05)
-    (ros.folder / "commands").write_text("/bench/hand/force/cmd 1.25\n")
-    command = came.get(timeout=60)
-    assert (command.uuid, command.channel, command.value) == (HAND, 2, 1.25)
-    until(lambda: ros.notes("outside"))
-    until(lambda: ros.last("/diagnostics"))
-    sink.describe([replace(ANGLE, calibrated="2026-09-01")])
-    until(lambda: ros.notes("parameter")[-1]["value"] and "2026-09-01" in str(ros.notes("parameter")))
-    sink.close()
-    assert sink.stats.error == ""
-    assert [one["domain"] for one in ros.notes("init")] == ["7"]
-    assert ros.last("/bench/hand/oil").temperature == pytest.approx(20.0)
-    assert ros.last("/bench/hand/oil").variance == pytest.approx(0.03)
-    array = ros.last("/bench/crane")
-    assert (list(array.name), array.position[0]) == (["arm/angle", "hand/oil"], 1.0)
-    assert np.isnan(array.position[1])
-    assert (array.header.stamp.sec, array.header.stamp.nanosec) == (12 + k, 250_000_000)
-    assert ros.last("/bench/arm/imu").linear_acceleration.z == pytest.approx(0.3)
-    assert ros.last("/bench/arm/range_finder").max_range == 8.0
-    levels = [status.level for status in ros.last("/diagnostics").status]
-    assert 1 in levels
-    latched = {one["topic"]: one["latched"] for one in ros.notes("publisher")}
-    assert latched["/bench/arm/teds"] is True
-    assert latched["/bench/arm/angle"] is False
-    assert json.loads(ros.last("/bench/arm/teds").data)["uuid"] == ARM
-    assert ros.notes("subscription") == [{"event": "subscription", "topic": "/bench/hand/force/cmd", "reliable": False}]
-    parameters = {one["name"]: one["value"] for one in ros.notes("parameter")}
-    assert parameters["bench.arm.angle.uuid"] == ARM
-    assert parameters["bench.arm.angle.calibrated"] == "2026-09-01"
-    assert parameters["bench.arm.axis_4.vector"] == [4.0, 5.0, 6.0]
-    assert all(one["successful"] is False for one in ros.notes("outside")), "facts are not set from outside"
-    assert ros.notes("shutdown")
+        if ready():
+            return k
+    raise AssertionError(sink.stats)
 
 
-def test_a_child_that_dies_is_started_anew(ros: Sourced) -> None:
-    sink = open_sink("ros2")
-    assert isinstance(sink, RclpySink)
-    sink.open([ANGLE], STATION)
-    until(lambda: sink.stats.state == "running")
-    kill_child(sink)
-    assert "rclpy died" in sink.stats.detail
-    until(lambda: sink.stats.state == "running")
-    until(lambda: len([one for one in ros.notes("publisher") if one["topic"] == "/bench/arm/teds"]) == 2)
-    sink.close()
-    assert sink.stats.error == ""
+class TestSeenByRclpy:
+    pytestmark = needs_rclpy
+
+    def test_a_foreign_node_gets_every_message_and_moves_an_actuator(self, domain: Domain, sink: Any) -> None:
+        peer = domain.peer()
+        topics = {
+            "/bench/crane": "sensor_msgs/JointState",
+            "/bench/hand/oil": "sensor_msgs/Temperature",
+            "/bench/arm/imu": "sensor_msgs/Imu",
+            "/bench/arm/range_finder": "sensor_msgs/Range",
+            "/bench/arm/angle": "std_msgs/Float64",
+            "/diagnostics": "diagnostic_msgs/DiagnosticArray",
+        }
+        for topic, kind in topics.items():
+            peer.hear(topic, kind, reliable=topic != "/bench/arm/angle")
+        sink.report(NodeReport(ARM, "running", lost=2))
+        open_and_feed(sink, lambda: all(peer.heard(topic) for topic in topics))
+        array = peer.heard("/bench/crane")[-1]
+        assert array["name"] == ["arm/angle", "hand/oil"]
+        assert array["position"][0] == 1.0
+        assert math.isnan(array["position"][1])
+        oil = peer.heard("/bench/hand/oil")[-1]
+        assert oil["temperature"] == pytest.approx(20.0)
+        assert oil["variance"] == pytest.approx(0.03)
+        assert peer.heard("/bench/arm/imu")[-1]["linear_acceleration"]["z"] == pytest.approx(0.3)
+        assert peer.heard("/bench/arm/range_finder")[-1]["max_range"] == 8.0
+        peer.graph(lambda one: bool(one["topics"].get("/bench/hand/force/cmd", {}).get("subscribers")))
+        until(
+            lambda: (
+                peer.tell(op="say", topic="/bench/hand/force/cmd", type="std_msgs/Float64", fields={"data": 1.25}),
+                time.sleep(0.2),
+                not sink.came.empty(),
+            )[2]
+        )
+        command = sink.came.get()
+        assert (command.uuid, command.channel, command.value) == (HAND, 2, 1.25)
+
+    def test_each_topic_has_one_publisher_which_is_the_same_node_both_ways(self, domain: Domain, sink: Any) -> None:
+        peer = domain.peer()
+        open_and_feed(sink, lambda: sink.stats.messages > 60)
+        graph = peer.graph(
+            lambda one: (
+                "/teds_provision_bench" in one["nodes"]
+                and {"/diagnostics", "/bench/arm/range_finder"} <= one["topics"].keys()
+                and not any("_UNKNOWN_" in text for text in map(str, one["topics"].values()))
+            )
+        )
+        ours = {
+            topic: one["publishers"] for topic, one in graph["topics"].items() if topic.startswith(("/bench", "/diag"))
+        }
+        ours.pop("/bench/hand/force/cmd", None)
+        for topic, publishers in ours.items():
+            durability = "TRANSIENT_LOCAL" if topic.endswith("/teds") else "VOLATILE"
+            assert publishers == [["/teds_provision_bench", "RELIABLE", durability]], topic
+
+    def test_who_comes_later_gets_the_datasheet_and_its_changes(self, domain: Domain, sink: Any) -> None:
+        sink.open([ANGLE], STATION)
+        until(lambda: sink.stats.state == "running")
+        peer = domain.peer()
+        peer.hear("/bench/arm/teds", "std_msgs/String", latched=True)
+        until(lambda: peer.heard("/bench/arm/teds"))
+        assert json.loads(peer.heard("/bench/arm/teds")[0]["data"])["channels"][0]["calibrated"] == "2026-03-01"
+        sink.describe([replace(ANGLE, calibrated="2026-09-01")])
+        until(lambda: "2026-09-01" in peer.heard("/bench/arm/teds")[-1]["data"])
+
+    @pytest.mark.skipif(not Path("/usr/bin/ss").exists(), reason="iproute2 is not installed")
+    def test_nobody_from_outside_reaches_its_ports(self, domain: Domain, sink: Any) -> None:
+        sink.open([ANGLE], STATION)
+        until(lambda: sink.stats.state == "running")
+        child = getattr(sink, "_child", None)
+        first = 7400 + 250 * domain.number
+        here = ports_of(child.pid if child else os.getpid())
+        mine = [one for one in here if first <= int(one.rpartition(":")[2]) < first + 250 or one.endswith(":7000")]
+        assert mine
+        assert all("%lo:" in one for one in mine), here
+
+    def test_facts_are_parameters_which_nobody_sets(self, domain: Domain) -> None:
+        sink = open_sink(f"ros2:{domain.number}")
+        sink.open([ANGLE, *AXES], STATION)
+        until(lambda: sink.stats.state == "running")
+        peer, node = domain.peer(), "/teds_provision_bench"
+        names = ["bench.arm.angle.uuid", "bench.arm.angle.calibrated", "bench.arm.axis_4.vector"]
+        until(
+            lambda: (
+                peer.tell(op="parameters", node=node, names=names),
+                time.sleep(0.3),
+                [one for one in peer.of("parameters") if len(one["values"]) == 3 and one["values"][2]["type"]],
+            )[2]
+        )
+        uuid, calibrated, vector = peer.of("parameters")[-1]["values"]
+        assert (uuid["string_value"], calibrated["string_value"]) == (ARM, "2026-03-01")
+        assert vector["double_array_value"] == [4.0, 5.0, 6.0]
+        peer.tell(op="set", node=node, name="bench.arm.angle.uuid", value="mine")
+        until(lambda: peer.of("set"))
+        assert peer.of("set")[0]["results"][0]["successful"] is False
+        sink.close()
+
+    def test_a_child_that_dies_is_started_anew_and_says_all_again(self, domain: Domain) -> None:
+        sink = open_sink(f"ros2:{domain.number}")
+        assert isinstance(sink, RclpySink)
+        sink.open([ANGLE], STATION)
+        until(lambda: sink.stats.state == "running")
+        kill_child(sink)
+        assert "rclpy died" in sink.stats.detail
+        until(lambda: sink.stats.state == "running")
+        peer = domain.peer()
+        peer.hear("/bench/arm/teds", "std_msgs/String", latched=True)
+        until(lambda: peer.heard("/bench/arm/teds"))
+        sink.close()
+        assert sink.stats.error == ""
+
+    def test_two_stations_of_one_name_are_both_heard(self, domain: Domain) -> None:
+        """ROS 2 lets two nodes have one name; topics tell them apart by their nodes' names."""
+        sinks = [open_sink(f"ros2:{domain.number}") for _ in range(2)]
+        for one, facts in zip(sinks, ([ANGLE], [replace(OIL, name="oil")]), strict=True):
+            one.open(facts, STATION)
+        until(lambda: all(one.stats.state == "running" for one in sinks))
+        peer = domain.peer()
+        for node in ("arm", "hand"):
+            peer.hear(f"/bench/{node}/teds", "std_msgs/String", latched=True)
+        until(lambda: peer.heard("/bench/arm/teds") and peer.heard("/bench/hand/teds"))
+        graph = peer.graph(lambda one: one["nodes"].count("/teds_provision_bench") == 2)
+        assert len(graph["topics"]["/bench/crane"]["publishers"]) == 2
+        for one in sinks:
+            one.close()
+            assert one.stats.error == ""
+
+    def test_messages_of_an_installation_without_them_are_asked_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+        monkeypatch.setenv(sourced.CHOSEN, str(PYTHON))
+        monkeypatch.setattr(sourced, "NEEDS", "rclpy, no_such_msgs.msg")
+        sourced._require_rclpy.cache_clear()
+        with pytest.raises(UsageFailure, match="its messages"):
+            open_sink("ros2")
+        sourced._require_rclpy.cache_clear()

@@ -157,7 +157,7 @@ class TestSeenByFastDds:
         assert words["channels"][0]["fingerprint"] == ANGLE.fingerprint, "a late comer gets the metadata"
         graph = decoded("ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo")
         [node] = graph.node_entities_info_seq
-        assert (node.node_namespace, node.node_name) == ("/bench", "teds_provision_bench")
+        assert (node.node_namespace, node.node_name) == ("/", "teds_provision_bench")
         assert len(node.writer_gid_seq) >= 6
         assert len(node.reader_gid_seq) == 1
         assert len(graph.gid.data) == (24 if release == "humble" else 16)

@@ -46,7 +46,18 @@ int32 sec
 uint32 nanosec
 """
 STRING = "string data\n"
-_LITTLE_ENDIAN = b"\x00\x01\x00\x00"  # how a CDR message begins
+QOS = "offered_qos_profiles"
+"""What rosbag2 keeps of each topic, for `ros2 bag play` to offer what the publisher offered: YAML, as from Iron on."""
+_NEVER = "{sec: 9223372036, nsec: 854775807}"
+_OFFERED = (
+    "- history: keep_last\n  depth: {depth}\n  reliability: reliable\n  durability: {durability}\n"
+    "  deadline: {never}\n  lifespan: {never}\n  liveliness: automatic\n  liveliness_lease_duration: {never}\n"
+    "  avoid_ros_namespace_conventions: false\n"
+)
+RELIABLE = _OFFERED.format(depth=100, durability="volatile", never=_NEVER)
+LATCHED = _OFFERED.format(depth=1, durability="transient_local", never=_NEVER)
+_HEAD = b"\x00\x01\x00\x00"  # how a CDR message begins
+LITTLE_ENDIAN = int.from_bytes(_HEAD, "little")
 
 
 class McapSink(FileSink):
@@ -136,9 +147,9 @@ class McapSink(FileSink):
 
     def _string(self, topic: str, words: str, at: float) -> None:
         if topic not in self._strings:
-            self._strings[topic] = self._out.channel(topic, self._schemas[""], {})
+            self._strings[topic] = self._out.channel(topic, self._schemas[""], {QOS: LATCHED})
         octets = words.encode() + b"\0"
-        data = _LITTLE_ENDIAN + struct.pack("<I", len(octets)) + octets
+        data = _HEAD + struct.pack("<I", len(octets)) + octets
         self._out.add_message(self._strings[topic], 0, int(at * 1e9), data)
 
     def _report(self, report: NodeReport) -> None:
@@ -161,7 +172,7 @@ class McapSink(FileSink):
                 for one, number in zip(known, block.channels, strict=True)
             ]
             topic = self._names.of_node(block.uuid, f"stream_{block.stream}")
-            metadata = {"uuid": block.uuid, "channels": json.dumps(labels)}
+            metadata = {QOS: RELIABLE, "uuid": block.uuid, "channels": json.dumps(labels)}
             number = self._out.channel(topic, self._schemas[TYPE], metadata)
             self._streams[key] = number, _plain(number, len(block.channels), integral)
         return self._streams[key]
@@ -220,15 +231,15 @@ def _as_texts(facts: dict[str, Any]) -> dict[str, str]:
 
 def _plain(channel: int, channels: int, integral: bool) -> np.ndarray:
     """An array of one message record without its numbers; those of a block are as many copies of it."""
-    row = np.zeros(1, dtype=_layout(channels, integral))
+    row = np.zeros(1, dtype=layout(channels, integral))
     row["code"], row["length"], row["channel"] = MESSAGE, row.dtype.itemsize - 9, channel
-    row["cdr"] = np.frombuffer(_LITTLE_ENDIAN, dtype="<u4")
+    row["cdr"] = LITTLE_ENDIAN
     row["clock_error"] = np.nan
     row["values"] = row["raws" if integral else "floats"] = channels
     return row
 
 
-def _layout(channels: int, integral: bool) -> np.dtype[Any]:
+def layout(channels: int, integral: bool) -> np.dtype[Any]:
     """A message record of SAMPLES as a packed structure: CDR aligns to 8 octets, counted behind its first four."""
     head: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
         ("code", "u1"),
@@ -253,6 +264,6 @@ def _layout(channels: int, integral: bool) -> np.dtype[Any]:
         ]  # fmt: skip
     else:
         tail = [("raws", "<u4"), ("floats", "<u4"), ("raw", "<f8", (channels,))]
-    layout = np.dtype(head + tail)
-    assert MESSAGE_HEAD.size == layout.fields["cdr"][1] if layout.fields else True
-    return layout
+    found = np.dtype(head + tail)
+    assert MESSAGE_HEAD.size == found.fields["cdr"][1] if found.fields else True
+    return found

@@ -321,9 +321,9 @@ class _Scan:
         self.chunk = None
 
     def _body(self, chunk: _Chunk) -> bytes:
-        unpacked = _unpacked(self.octets[chunk.offset + HEAD.size : chunk.begin], self.path)
-        assert unpacked is not None, "it was unpacked before"
-        return unpacked[0]
+        found = unpacked(self.octets[chunk.offset + HEAD.size : chunk.begin], self.path)
+        assert found is not None, "it was unpacked before"
+        return found[0]
 
     def _damage(self, what: str, at: int, after: int) -> None:
         self.damaged.append(Damage(what, at, after - at))
@@ -361,10 +361,10 @@ class _Scan:
 
     def _whole_chunk(self, at: int, content: bytes) -> _Chunk | None:
         """A chunk with its messages; None where its checksum does not hold, or it cannot be unpacked."""
-        unpacked = _unpacked(content, self.path)
-        if unpacked is None:
+        found = unpacked(content, self.path)
+        if found is None:
             return None
-        body, whole = unpacked
+        body, whole = found
         if not whole:
             self._spoiled.append(body)
             return None
@@ -495,22 +495,22 @@ def _fits(content: bytes) -> bool:
     return at + 8 <= len(content) and at + 8 + int.from_bytes(content[at : at + 8], "little") == len(content)
 
 
-def _unpacked(content: bytes, path: Path) -> tuple[bytes, bool] | None:
-    """The records in a chunk, and whether its checksum holds; None where it cannot be unpacked at all."""
+def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[bytes, bool] | None:
+    """The records in a chunk, and whether its checksum holds; None where it cannot be unpacked to ``most`` octets."""
     import zstandard
 
     if not _fits(content):
         return None
-    _, _, unpacked, checksum = CHUNK_HEAD.unpack_from(content)
+    _, _, size, checksum = CHUNK_HEAD.unpack_from(content)
     at = CHUNK_HEAD.size
     name_length = int.from_bytes(content[at : at + 4], "little")
     compression = content[at + 4 : at + 4 + name_length]
     packed = content[at + 4 + name_length + 8 :]
-    if unpacked > LARGEST_RECORD:
+    if size > most:
         return None
     if compression == b"zstd":
         try:
-            body = zstandard.ZstdDecompressor().decompress(packed, max_output_size=unpacked)
+            body = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
         except zstandard.ZstdError:
             return None
     elif compression == b"":
@@ -519,7 +519,7 @@ def _unpacked(content: bytes, path: Path) -> tuple[bytes, bool] | None:
         raise BadData(f"A chunk of {path} is compressed with lz4, which is not known here.")
     else:
         return None
-    return body, len(body) == unpacked and (not checksum or zlib.crc32(body) == checksum)
+    return body, len(body) == size and (not checksum or zlib.crc32(body) == checksum)
 
 
 def _parses(code: int, content: bytes) -> bool:

@@ -18,9 +18,11 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import count
 
 from teds_provision.measure.blocks import Block, GroupRows
 from teds_provision.measure.sinks.base import CommandTaker, Item
+from teds_provision.measure.sinks.joints import INTERFACES
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 
@@ -64,7 +66,9 @@ class ChildSink(TopicSink):
         self._ready = threading.Event()
         self._announced = False  # to this child
         self._heard = self._complaint = self._suffix = ""
-        self._numbers: dict[tuple[str, tuple[str, ...]], int] = {}
+        self._numbers: dict[str, int] = {}
+        self._count_up = count()
+        self._named: dict[str, tuple[str, ...]] = {}  # the names that the child has for a topic of arrays
         self._again = 0.0
         self._pause = BACK_OFF[0]
 
@@ -81,7 +85,7 @@ class ChildSink(TopicSink):
 
     def _start(self) -> None:
         self._stop(0.0)
-        self._numbers = {}
+        self._numbers, self._named = {}, {}
         self._announced = False
         self._complaint = ""
         self._ready.clear()
@@ -113,6 +117,8 @@ class ChildSink(TopicSink):
                 self._heard = f"waits for a ROS master at {words.get('master')}"
             elif words.get("event") == "command":
                 self._command(words["uuid"], words["channel"], float(words["value"]))
+            elif words.get("event") == "joints":
+                self._joint_command(words["names"], *([float(one) for one in words[kind]] for kind in INTERFACES))
         child.stdout.close()
 
     def _hear_complaints(self, child: subprocess.Popen[bytes]) -> None:
@@ -187,21 +193,32 @@ class ChildSink(TopicSink):
         except (BrokenPipeError, BlockingIOError):
             self._lost(f"{self._library} died")
 
-    def _number(self, topic: str, kind: str, *, latch: bool = False, names: Sequence[str] = ()) -> int:
-        key = topic, tuple(names)
-        if key not in self._numbers:
-            self._numbers[key] = len(self._numbers)
-            number = self._numbers[key]
-            self._send(op="topic", id=number, topic=topic, type=kind, latch=latch, names=list(names))
-            return number
-        return self._numbers[key]
+    def _number(self, topic: str, kind: str, *, latch: bool = False) -> int:
+        """The child's number of a topic, which has one publisher whatever goes out on it."""
+        if topic not in self._numbers:
+            self._numbers[topic] = next(self._count_up)
+            self._send(op="topic", id=self._numbers[topic], topic=topic, type=kind, latch=latch)
+        return self._numbers[topic]
 
     def _advertise(self, topic: str, kind: str) -> None:
         self._number(topic, kind)
 
-    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
-        number = self._number(topic, JOINT_STATE, names=names)
-        self._send(op="joint", id=number, t=stamp, v=[value if math.isfinite(value) else None for value in values])
+    def _array(
+        self,
+        topic: str,
+        stamp: float,
+        names: Sequence[str],
+        values: Sequence[float],
+        velocity: Sequence[float] = (),
+        effort: Sequence[float] = (),
+    ) -> None:
+        number = self._number(topic, JOINT_STATE)
+        if self._named.get(topic) != tuple(names):
+            self._named[topic] = tuple(names)
+            self._send(op="named", id=number, v=list(names))
+        more = {name: list(given) for name, given in (("vel", velocity), ("eff", effort)) if given}
+        row = [value if math.isfinite(value) else None for value in values]
+        self._send(op="joint", id=number, t=stamp, v=row, **more)
 
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
         number = self._number(topic, meaning.type)
@@ -213,11 +230,19 @@ class ChildSink(TopicSink):
     def _latched(self, topic: str, words: str) -> None:
         self._send(op="text", id=self._number(topic, STRING, latch=True), v=words)
 
+    def _retire(self, topic: str) -> None:
+        number = self._numbers.pop(topic, None)
+        if number is not None:
+            self._send(op="retire", id=number)
+
     def _parameter(self, name: str, value: object) -> None:
         self._send(op="param", key=name, value=value)
 
     def _listen(self, topic: str, uuid: str, channel: int) -> None:
         self._send(op="listen", topic=topic, uuid=uuid, channel=channel)
+
+    def _listen_joints(self, topic: str) -> None:
+        self._send(op="listen_joints", topic=topic)
 
     def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
         number = self._number("/diagnostics", DIAGNOSTICS)

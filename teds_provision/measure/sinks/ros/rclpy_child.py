@@ -1,4 +1,4 @@
-"""Runs on the Python of the ROS 2 that the user sourced, as a child of the sink: lines of JSON become rclpy messages.
+"""Runs on a Python that has rclpy, as a child of the sink: lines of JSON become rclpy messages.
 
 Nothing of this package is imported here, and nothing but rclpy and its messages beside the standard library. The lines
 are those of :mod:`ros1_child`. It ends when stdin closes. API of rclpy from Humble on: https://docs.ros.org/en/jazzy/p/rclpy/
@@ -9,11 +9,16 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import socket
 import sys
 import threading
 from typing import Any
 
+LO = b"lo"
+PORTS, FIRST_PORT = 250, 7400  # of a DDS domain; of domain 0
 HISTORY = 100  # messages that a reader may be behind: a burst of rows fits
+
+INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
 
 
 def say(**words: object) -> None:
@@ -34,6 +39,39 @@ def plain(value: Any) -> Any:
             return [float(one) for one in value]
         return value if kinds in ({str}, {bool}) else json.dumps(value)
     return value if isinstance(value, bool | int | float | str) else json.dumps(value)
+
+
+def ports_of(domain: int, count: int = PORTS) -> range:
+    """The first so many ports of a DDS domain; a participant has two of them."""
+    first = FIRST_PORT + PORTS * domain
+    return range(first, first + count)
+
+
+def keep_on_loopback(ports: range) -> None:
+    """Bind those ports on which this process listens to the loopback device.
+
+    Cyclone DDS and Fast DDS announce themselves on loopback alone where they are told to, but listen on every address:
+    anybody on the network could send them set points. Linux 5.7 and later let a process do so without privileges.
+    """
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            is_socket = os.readlink(f"/proc/self/fd/{name}").startswith("socket:")
+            one = socket.socket(fileno=os.dup(int(name))) if is_socket else None
+        except OSError:  # closed meanwhile
+            continue
+        if one is None:
+            continue
+        with one:
+            if one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM:
+                address, port = one.getsockname()
+                if address == "0.0.0.0" and port in ports:
+                    one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LO)
+
+
+def on_this_machine_alone() -> bool:
+    """Whether the environment keeps ROS 2 on this machine; ROS_LOCALHOST_ONLY is its older name."""
+    local = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() in ("LOCALHOST", "OFF")
+    return (local and not os.environ.get("ROS_STATIC_PEERS")) or os.environ.get("ROS_LOCALHOST_ONLY") == "1"
 
 
 class Bridge:
@@ -78,7 +116,10 @@ class Bridge:
         kind = self.type_of(line["type"])
         made = self.node.create_publisher(kind, line["topic"], self.qos(latched=line["latch"]))
         self.publishers[line["id"]] = made, kind
-        self.names[line["id"]] = line.get("names", [])
+
+    def retire(self, line: dict[str, Any]) -> None:
+        """Take a publisher back, and what it keeps for late comers with it."""
+        self.node.destroy_publisher(self.publishers.pop(line["id"])[0])
 
     def message(self, line: dict[str, Any]) -> tuple[Any, Any]:
         """The publisher of a line, and an empty message with its header."""
@@ -90,11 +131,16 @@ class Bridge:
             message.header.frame_id = line.get("frame", "")
         return publisher, message
 
+    def named(self, line: dict[str, Any]) -> None:
+        """What the values of the next rows are called."""
+        self.names[line["id"]] = line["v"]
+
     def joint(self, line: dict[str, Any]) -> None:
         """A row of a group."""
         publisher, message = self.message(line)
         message.name = self.names[line["id"]]
         message.position = [float("nan") if value is None else float(value) for value in line["v"]]
+        message.velocity, message.effort = line.get("vel", []), line.get("eff", [])
         publisher.publish(message)
 
     def value(self, line: dict[str, Any]) -> None:
@@ -164,6 +210,18 @@ class Bridge:
         kind, asked = self.type_of("std_msgs/Float64"), self.qos(latched=False, reading=True)
         self.listening[line["topic"]] = self.node.create_subscription(kind, line["topic"], came, asked)
 
+    def listen_joints(self, line: dict[str, Any]) -> None:
+        """Set points of joints, newest only; numbers as texts, for JSON has no NaN."""
+        if line["topic"] in self.listening:
+            return
+
+        def came(message: Any) -> None:
+            given = {name: [repr(float(one)) for one in getattr(message, name)] for name in INTERFACES}
+            say(event="joints", names=list(message.name), **given)
+
+        kind, asked = self.type_of("sensor_msgs/JointState"), self.qos(latched=False, reading=True)
+        self.listening[line["topic"]] = self.node.create_subscription(kind, line["topic"], came, asked)
+
 
 def main() -> None:
     """Be a node, carry lines."""
@@ -172,6 +230,9 @@ def main() -> None:
 
     rclpy.init()
     node = rclpy.create_node(sys.argv[1])
+    if on_this_machine_alone():
+        keep_on_loopback(ports_of(int(os.environ.get("ROS_DOMAIN_ID", "0"))))
+        keep_on_loopback(range(1, 10_000))  # Fast DDS has one more, 7000
     bridge = Bridge(rclpy, node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)

@@ -5,7 +5,8 @@ versions of everything. Out go lines of JSON too: ready, and set points of actua
 with exit code 3 when the master is gone or has been started anew, 4 when another program took the node's name (the
 parent then starts another one).
 
-Lines in: ``{"op": "topic", "id": 1, "topic": "/a", "type": "std_msgs/Float64", "latch": false, "names": […]}``,
+Lines in: ``{"op": "topic", "id": 1, "topic": "/a", "type": "std_msgs/Float64", "latch": false}``,
+``{"op": "named", "id": 1, "v": [names]}``,
 ``{"op": "joint", "id": 1, "t": seconds, "v": […]}``, ``{"op": "value", "id", "t", "field", "frame", "v", "var"}``,
 ``{"op": "text", "id", "v"}``, ``{"op": "status", "id", "t", "v": […]}``, ``{"op": "param", "key", "value"}``,
 ``{"op": "listen", "topic", "uuid", "channel"}``.
@@ -29,6 +30,8 @@ MEETING = 1.0  # seconds for subscribers that the master knows of to connect
 KNOWN = 0.3  # seconds for which the master's list of subscribers is believed
 BURST, PAUSE = 20, 0.002  # messages that go at once, and the pause after them: else they fall out of a queue
 LEAVING = 1.0  # seconds for the last messages to leave
+
+INTERFACES = ("position", "velocity", "effort")  # of sensor_msgs/JointState
 
 
 def say(**words: object) -> None:
@@ -155,7 +158,14 @@ class Bridge:
         kind, latch = self.type_of(line["type"]), line["latch"]
         made = self.rospy.Publisher(line["topic"], kind, queue_size=QUEUE, latch=latch)
         self.publishers[line["id"]] = Outlet(made, kind, 0 if latch else self.subscribers(line["topic"]))
-        self.names[line["id"]] = line.get("names", [])
+
+    def retire(self, line: dict[str, Any]) -> None:
+        """Take a publisher back, and what it keeps for late comers with it."""
+        self.publishers.pop(line["id"]).publisher.unregister()
+
+    def named(self, line: dict[str, Any]) -> None:
+        """What the values of the next rows are called."""
+        self.names[line["id"]] = line["v"]
 
     def joint(self, line: dict[str, Any]) -> None:
         """A row of a group."""
@@ -164,6 +174,7 @@ class Bridge:
         message.header.stamp = self.stamp(line["t"])
         message.name = self.names[line["id"]]
         message.position = [float("nan") if value is None else value for value in line["v"]]
+        message.velocity, message.effort = line.get("vel", []), line.get("eff", [])
         publisher.publish(message)
 
     def value(self, line: dict[str, Any]) -> None:
@@ -226,6 +237,18 @@ class Bridge:
             say(event="command", uuid=uuid, channel=channel, value=repr(message.data))
 
         kind = self.type_of("std_msgs/Float64")
+        self.listening[line["topic"]] = self.rospy.Subscriber(line["topic"], kind, came, queue_size=1)
+
+    def listen_joints(self, line: dict[str, Any]) -> None:
+        """Set points of joints, newest only; numbers as texts, for JSON has no NaN."""
+        if line["topic"] in self.listening:
+            return
+
+        def came(message: Any) -> None:
+            given = {name: [repr(float(one)) for one in getattr(message, name)] for name in INTERFACES}
+            say(event="joints", names=list(message.name), **given)
+
+        kind = self.type_of("sensor_msgs/JointState")
         self.listening[line["topic"]] = self.rospy.Subscriber(line["topic"], kind, came, queue_size=1)
 
 

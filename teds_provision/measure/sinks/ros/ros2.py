@@ -20,6 +20,7 @@ from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
+from teds_provision.measure.sinks.ros.rclpy_child import keep_on_loopback, ports_of
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ else:  # cyclonedds: an extra
 GRAPH = "rmw_dds_common/ParticipantEntitiesInfo"
 DISTRIBUTIONS = ("humble", "iron", "jazzy", "kilted", "lyrical", "rolling")
 HISTORY = 100  # messages that a reader may be behind: a burst of rows fits
+PARTICIPANTS = 10 + 2 * 31 + 2  # ports of a domain that 31 participants have
 NEWEST = 10  # set points that may wait here
 BLOCKING_MS = 10  # how long a slow reliable reader may hold up a write, at most
 LISTENING = 0.2  # seconds between looks whether the end has come
@@ -82,6 +84,7 @@ class Ros2Sink(TopicSink):
         try:
             if "CYCLONEDDS_URI" not in os.environ and self._domain not in _domains:
                 _domains[self._domain] = Domain(self._domain, THIS_MACHINE)
+                keep_on_loopback(ports_of(self._domain, PARTICIPANTS))
             self._participant = DomainParticipant(self._domain, qos=Qos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
             raise TedsProvisionError(
@@ -144,7 +147,7 @@ class Ros2Sink(TopicSink):
             return gid(data=list(entity.guid.bytes) + [0] * (8 if humble else 0))
 
         node = info(
-            node_namespace=f"/{self._topics.station}",
+            node_namespace="/",
             node_name=self._node,
             reader_gid_seq=[of(reader) for reader, _, _ in self._readers.values()],
             writer_gid_seq=[of(writer) for writer in self._writers.values()],
@@ -172,8 +175,16 @@ class Ros2Sink(TopicSink):
     def _advertise(self, topic: str, kind: str) -> None:
         self._writer(topic, kind)
 
-    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
-        message = self._types.JointState(self._header(stamp), names, values, [], [])
+    def _array(
+        self,
+        topic: str,
+        stamp: float,
+        names: Sequence[str],
+        values: Sequence[float],
+        velocity: Sequence[float] = (),
+        effort: Sequence[float] = (),
+    ) -> None:
+        message = self._types.JointState(self._header(stamp), names, values, list(velocity), list(effort))
         self._write(self._writer(topic, JOINT_STATE), message, len(values))
 
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
@@ -195,15 +206,24 @@ class Ros2Sink(TopicSink):
     def _latched(self, topic: str, words: str) -> None:
         self._write(self._writer(topic, STRING, latched=True), self._types.String(words), 0)
 
+    def _retire(self, topic: str) -> None:
+        if self._writers.pop(topic, None) is not None:  # it goes with its last reference
+            self._unshown = True
+
     def _parameter(self, name: str, value: object) -> None:
         """ROS 2 has no parameter server; the latched metadata holds the same facts."""
 
     def _listen(self, topic: str, uuid: str, channel: int) -> None:
+        self._read(topic, "std_msgs/Float64", uuid, channel)
+
+    def _listen_joints(self, topic: str) -> None:
+        self._read(topic, JOINT_STATE, "", 0)
+
+    def _read(self, topic: str, kind: str, uuid: str, channel: int) -> None:
         from cyclonedds.sub import DataReader
 
         if topic in self._readers:
             return
-        kind = "std_msgs/Float64"
         reader = DataReader(
             self._participant, self._topic(kind, f"rt{topic}"), qos=self._qos(kind, latched=False, reading=True)
         )
@@ -233,6 +253,8 @@ class Ros2Sink(TopicSink):
                     for message in reader.take(N=NEWEST):
                         if isinstance(message, self._types.Float64):
                             self._command(uuid, channel, float(message.data))
+                        elif isinstance(message, self._types.JointState):
+                            self._joint_command(message.name, message.position, message.velocity, message.effort)
             except DDSException:
                 time.sleep(LISTENING)
 

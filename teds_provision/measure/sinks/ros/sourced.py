@@ -1,8 +1,9 @@
-"""ROS 2 by the user's own rclpy, where a ROS 2 is sourced: its middleware, its settings, its parameter services.
+"""ROS 2 by rclpy: the one that the user sourced, or the one that is installed from PyPI beside this tool.
 
 ``source /opt/ros/jazzy/setup.bash`` sets AMENT_PREFIX_PATH. Then a Python that can import rclpy carries the topics in
-a child process; RMW_IMPLEMENTATION, ROS_DOMAIN_ID, ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE are the user's.
-Without one, Cyclone DDS does it (:mod:`ros2`).
+a child process, and RMW_IMPLEMENTATION, ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE are the user's. Without it the
+Python that TEDS_PROVISION_ROS_PYTHON names does so, or our own where rclpy is installed in it; that one stays on this
+machine unless the user's environment says otherwise. Where there is no rclpy, Cyclone DDS does it (:mod:`ros2`).
 """
 
 from __future__ import annotations
@@ -10,8 +11,13 @@ from __future__ import annotations
 import functools
 import os
 import shutil
+import sys
+import tempfile
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Final
 
+from teds_provision.errors import UsageFailure
 from teds_provision.measure.sinks.base import CommandTaker, Sink
 from teds_provision.measure.sinks.ros import child, rclpy_child
 from teds_provision.measure.sinks.ros.child import ChildSink
@@ -19,14 +25,24 @@ from teds_provision.measure.sinks.ros.ros2 import Ros2Sink, domain_of
 
 SYSTEM = "/usr/bin/python3"
 NEEDS = "rclpy, std_msgs.msg, sensor_msgs.msg, geometry_msgs.msg, diagnostic_msgs.msg"
+CHOSEN: Final = "TEDS_PROVISION_ROS_PYTHON"
+_REACH: Final = frozenset(
+    {"ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER"}
+    | {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI", "ZENOH_SESSION_CONFIG_URI"}
+)
+"""Whoever sets one of these has said who may hear."""
 
 
 def ros2_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
-    """The sink of ``ros2`` or ``ros2:DOMAIN``: by the sourced rclpy, else by Cyclone DDS. Raises UsageFailure."""
+    """The sink of ``ros2`` or ``ros2:DOMAIN``: by an rclpy, else by Cyclone DDS. Raises UsageFailure."""
     domain = domain_of(spec)
     sourced = os.environ.get("AMENT_PREFIX_PATH", "")
-    python = _python(sourced, os.environ.get("PYTHONPATH", "")) if sourced else None
-    return Ros2Sink(spec, commands) if python is None else RclpySink(python, domain, commands)
+    if sourced and (python := _python(sourced, os.environ.get("PYTHONPATH", ""))) is not None:
+        return RclpySink(python, domain, commands)
+    if (python := os.environ.get(CHOSEN, "")) or (find_spec("rclpy") is not None and (python := sys.executable)):
+        _require_rclpy(python)
+        return RclpySink(python, domain, commands, own=True)
+    return Ros2Sink(spec, commands)
 
 
 @functools.cache
@@ -38,15 +54,32 @@ def _python(_sourced: str, _paths: str) -> str | None:
     return next((one for one in dict.fromkeys(found) if one and child.imports(one, NEEDS, around)), None)
 
 
-class RclpySink(ChildSink):
-    """Carries the topics by rclpy under ``python``; ``domain`` as ROS_DOMAIN_ID has it."""
+@functools.cache
+def _require_rclpy(python: str) -> None:
+    if not child.imports(python, NEEDS, child.environment(sourced=False)):
+        raise UsageFailure(
+            f"{python} cannot import rclpy and its messages.",
+            hint="Install what docs/ros.md lists: ros-jazzy-rclpy[fastrtps] and four packages of messages.",
+        )
 
-    def __init__(self, python: str, domain: int, commands: CommandTaker | None = None) -> None:
+
+class RclpySink(ChildSink):
+    """Carries the topics by rclpy under ``python``; ``domain`` as ROS_DOMAIN_ID has it.
+
+    ``own``: it belongs to no ROS that the user sourced, so nothing leaves this machine unless his environment says so.
+    """
+
+    def __init__(self, python: str, domain: int, commands: CommandTaker | None = None, *, own: bool = False) -> None:
         super().__init__("ROS 2", "rclpy", commands)
-        self._python, self._domain = python, domain
+        self._python, self._domain, self._own = python, domain, own
 
     def _environment(self) -> dict[str, str]:
-        return child.environment(sourced=True) | {"ROS_DOMAIN_ID": str(self._domain)}
+        around = child.environment(sourced=not self._own) | {"ROS_DOMAIN_ID": str(self._domain)}
+        if self._own and not _REACH & around.keys():
+            around["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        if not ({"ROS_LOG_DIR", "ROS_HOME"} & around.keys() or os.access(around.get("HOME", ""), os.W_OK)):
+            around["ROS_LOG_DIR"] = tempfile.gettempdir()  # of a service without a home: rclpy dies without a place
+        return around
 
     def _program(self) -> list[str]:
         return [self._python, "-s", str(Path(rclpy_child.__file__))]

@@ -1,0 +1,216 @@
+"""A recording in another format: read by its reader, written by the recorder of the other format.
+
+The result gets its name when all of it is on the disk: until then it lies in a folder of our own beside it, which the
+next conversion to that name removes where a killed one left it. Nothing is written over.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import math
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from teds_provision.errors import UsageFailure
+from teds_provision.files import require_new, sync_folder
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
+from teds_provision.measure.grid import Grid
+from teds_provision.measure.recordings.columns import part_of
+from teds_provision.measure.recordings.opening import open_recording
+from teds_provision.measure.recordings.parquet import ParquetWriter
+from teds_provision.measure.recordings.source import Entry, Recording
+from teds_provision.measure.recordings.summary import Summary
+from teds_provision.measure.sinks import FILES, TEXT, as_sink_failure
+from teds_provision.measure.sinks.files import FileSink
+from teds_provision.measure.sinks.wide import WideSink
+
+PARQUET: Final = ".parquet"
+_PATIENCE: Final = 5.0  # seconds beside two periods: then a stream that brings nothing is not waited for
+_BURST: Final = 5000  # rows of a grid at a time
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What became of a recording: the files, oldest part first, and what went into them."""
+
+    recording: Recording
+    files: tuple[Path, ...]
+    summary: Summary
+
+
+def convert(source: Path, target: Path, *, wide: bool = False) -> Converted:
+    """Write a recording in the format of ``target``'s suffix. ``wide``: as rows of one grid (text and Parquet).
+
+    Of a recording that is still being written, or was cut off, what is whole by now is taken. Raises UsageFailure
+    (``target`` exists, no such format), NotFound, BadData, StoreFailure (disk).
+    """
+    suffix = target.suffix.lower()
+    if suffix not in FILES and suffix != PARQUET:
+        raise UsageFailure(f"No recording is written as {target.name!r}.", hint=f"Use {', '.join([*FILES, PARQUET])}.")
+    if wide and suffix not in TEXT and suffix != PARQUET:
+        raise UsageFailure("--wide is for text files and Parquet.", hint="Name a FILE.csv or FILE.parquet.")
+    require_new(target)
+    recording = open_recording(source)
+    if recording.wide and not (suffix in TEXT or suffix == PARQUET):
+        raise UsageFailure(
+            f"{source} is a grid: it has no raw values and no sample numbers for {suffix}.",
+            hint="Convert the recording that it was made of, or convert it to .csv or .parquet.",
+        )
+    wide = wide or recording.wide
+    summary = Summary()
+    try:
+        with _folder_for(target) as folder:
+            entries = _counted(recording, summary)
+            if wide and not recording.wide:
+                entries = _gridded(entries, recording)
+            if suffix == PARQUET:
+                made = _as_parquet(folder / target.name, entries, recording, wide=wide)
+            else:
+                sink = WideSink(folder / target.name) if wide else FILES[suffix](folder / target.name)
+                assert isinstance(sink, FileSink)
+                made = sink.copy(entries, tuple(recording.facts.values()), recording.station)
+            files = tuple(_published(path, target.parent) for path in made)
+            sync_folder(target.parent)
+    except OSError as error:
+        raise as_sink_failure(error, str(target)) from error
+    return Converted(recording, files, summary)
+
+
+def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, wide: bool) -> list[Path]:
+    """One file for each set of facts: with another datasheet the next one begins, as with CSV."""
+    known = dict(recording.facts)
+    made = [path]
+    writer = ParquetWriter(path, list(known.values()), recording.station, wide=wide)
+    try:
+        for entry in entries:
+            if isinstance(entry, tuple):
+                changed = {one.key: one for one in entry if known.get(one.key) != one}
+                if changed:
+                    known |= changed
+                    writer.finish()
+                    made.append(path.with_suffix(f".{len(made) + 1}{path.suffix}"))
+                    writer = ParquetWriter(made[-1], list(known.values()), recording.station, wide=wide)
+            writer.take(entry)
+        writer.finish()
+    finally:
+        writer.close()
+    for one in made:
+        _sync(one)
+    return made
+
+
+def _sync(path: Path) -> None:
+    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def _counted(recording: Recording, summary: Summary) -> Iterator[Entry]:
+    """The entries, each counted; a channel that no head named gets a place among the facts."""
+    for entry in recording.entries():
+        summary.take(entry)
+        if isinstance(entry, Block):
+            for number in entry.channels:
+                if (entry.uuid, number) not in recording.facts:
+                    recording.know(ChannelFacts(entry.uuid, "", number, ""))
+                    yield (recording.facts[entry.uuid, number],)
+        yield entry
+
+
+def _gridded(entries: Iterator[Entry], recording: Recording) -> Iterator[Entry]:
+    """The same as rows of one grid, of every sensor. A row is made when no stream can bring a value before it."""
+    facts = [one for _, one in sorted(recording.facts.items()) if one.kind != "actuator"]
+    periods = {one.key: one.period for one in facts if one.period}
+    grid = Grid(recording.station.group or "all", facts, patience=0.0)
+    waiting, newest = list[Block](), dict[tuple[str, int], tuple[float, float]]()
+    for entry in entries:
+        if isinstance(entry, Block):
+            waiting.append(entry)
+            slowest = max((periods.get(key, 0.0) for key in entry.keys), default=0.0)
+            newest[entry.uuid, entry.stream] = float(entry.time[-1]), 2 * slowest + _PATIENCE
+        elif entry:
+            yield entry
+        elif newest:
+            now = max(time for time, _ in newest.values())
+            until = min(time for time, keeps in newest.values() if time >= now - keeps)
+            waiting, rows = _rows_until(until, waiting, grid)
+            yield from rows
+    yield from _rows_until(math.inf, waiting, grid)[1]
+
+
+def _rows_until(until: float, waiting: list[Block], grid: Grid) -> tuple[list[Block], list[GroupRows]]:
+    """The blocks that are left, and the rows that are due; times without any value are left out."""
+    made: list[GroupRows] = []
+    while waiting and (begin := min(float(one.time[0]) for one in waiting)) <= until:
+        end = min(until, begin + _BURST * grid.period, max(float(one.time[-1]) for one in waiting))
+        left = []
+        for one in waiting:
+            count = int(np.searchsorted(one.time, end, "right"))
+            if count:
+                grid.take(part_of(one, slice(None, count)))
+            if count < len(one.time):
+                left.append(part_of(one, slice(count, None)))
+        waiting = left
+        if (rows := grid.rows(end)) is not None:
+            made.append(rows)
+    return waiting, made
+
+
+# -- the folder ------------------------------------------------------------------------------------------------------
+
+_SUFFIX: Final = ".teds-part"
+
+
+@contextmanager
+def _folder_for(target: Path) -> Iterator[Path]:
+    """A folder of our own beside the file, locked while it is used; it goes with all that is left in it."""
+    _sweep(target)
+    folder = target.with_name(f".{target.name}.{secrets.token_hex(8)}{_SUFFIX}")
+    folder.mkdir(mode=0o700)
+    held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(held)
+
+
+def _sweep(target: Path) -> None:
+    """Remove what a killed conversion to this name left: a folder of such a name, ours, locked by nobody."""
+    name = re.compile(re.escape(f".{target.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
+    with suppress(OSError):
+        for found in [one for one in os.listdir(target.parent) if name.fullmatch(one)]:
+            folder = target.with_name(found)
+            held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                if os.fstat(held).st_uid == os.geteuid():
+                    fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(folder)
+            finally:
+                os.close(held)
+
+
+def _published(path: Path, folder: Path) -> Path:
+    """Give a whole file its name, never over another."""
+    target = folder / path.name
+    try:
+        os.link(path, target)
+    except FileExistsError:
+        raise UsageFailure(f"{target} exists already and is not overwritten.", hint="Choose another name.") from None
+    except OSError:  # a file system without hard links
+        require_new(target)
+        os.rename(path, target)
+    return target

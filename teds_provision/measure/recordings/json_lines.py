@@ -1,0 +1,176 @@
+"""Reads JSON lines as ``sinks/text.py`` writes them; what ``measure --json`` printed is read as well."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, get_args
+
+import numpy as np
+
+from teds_provision.errors import BadData
+from teds_provision.files import open_to_read
+from teds_provision.measure.blocks import Block, Invalid, NodeReport, Note, State
+from teds_provision.measure.recordings.columns import Joined, integers, stacked
+from teds_provision.measure.recordings.source import (
+    MOST,
+    Entry,
+    Recording,
+    channel_number,
+    facts_of,
+    station_of,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FIRST: Final = b'{"event":'
+_PIECE: Final = 1 << 20
+_DATA: Final = re.compile(rb'{"event":"data",(?:(?!"index":).)*')
+_COUNTS: Final = ("samples", "lost", "late", "bad", "invalid")
+_STATES: Final[tuple[State, ...]] = get_args(State)
+
+
+class JsonLines(Recording):
+    """JSON lines; see the module."""
+
+    form = "JSON lines"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._line = 0
+        told: set[bytes] = set()
+        for line in self._lines():
+            if line.startswith(b'{"event":"channel"'):
+                self.know(self._channel(self._event(line)))
+            elif (data := _DATA.match(line)) and data[0] not in told and len(told) < MOST.channels:
+                told.add(data[0])
+                event = self._event(line)
+                names = ("uuid", "name", "unit", "uncertainty", "unsigned", "unverified")
+                facts = {name: event[name] for name in names if event.get(name) is not None}
+                self.know(self._channel({**facts, "number": event.get("channel")}))
+            elif line.startswith(b'{"event":"recording"'):
+                self.station = station_of(self._event(line))
+
+    def _bad(self, why: str) -> BadData:
+        return BadData(f"{self.path}:{self._line}: {why}.", hint="It was changed since it was recorded, or is damaged.")
+
+    def _lines(self) -> Iterator[bytes]:
+        self._line, rest = 0, b""
+        with open_to_read(self.path) as file:
+            while piece := file.read(_PIECE):
+                *whole, rest = (rest + piece).split(b"\n")
+                for line in whole:
+                    self._line += 1
+                    yield line
+                if len(rest) > MOST.line:
+                    self._line += 1
+                    raise self._bad(f"the line has more than {MOST.line} octets")
+        self.torn = len(rest)
+
+    def _event(self, line: bytes) -> dict[str, Any]:
+        try:
+            event = json.loads(line)
+        except (ValueError, RecursionError):
+            raise self._bad("the line is not JSON") from None
+        if not isinstance(event, dict):
+            raise self._bad("the line is not a JSON object")
+        return event
+
+    def _channel(self, event: dict[str, Any]) -> Any:
+        return facts_of({name: value for name, value in event.items() if name != "event"}, f"{self.path}:{self._line}")
+
+    def entries(self) -> Iterator[Entry]:
+        """See the class above."""
+        joined, numbers = Joined(), dict[str, dict[tuple[int, ...], int]]()
+        together: list[dict[str, Any]] = []  # lines of one block: a line for each channel
+        for line in self._lines():
+            event = self._event(line)
+            if together and not _goes_with(together, event):
+                yield from joined.take(self._block(together, numbers))
+                together = []
+            if event.get("event") == "data":
+                together.append(event)
+            elif (entry := self._other(event)) is not None:
+                yield from joined.rest()
+                yield entry
+        if together:
+            yield from joined.take(self._block(together, numbers))
+        yield from joined.rest()
+
+    def _other(self, event: dict[str, Any]) -> Entry | None:
+        kind = event.get("event")
+        if kind == "channel":
+            return (self._channel(event),)
+        if kind == "note":
+            at = event.get("time")
+            return Note(float(at) if isinstance(at, int | float) else 0.0, str(event.get("why"))[: MOST.text])
+        if kind == "status":
+            return report_of(event)
+        return None
+
+    def _block(self, lines: list[dict[str, Any]], numbers: dict[str, dict[tuple[int, ...], int]]) -> Block:
+        first = lines[0]
+        try:
+            uuid, index = str(first["uuid"]), int(first["index"])
+            time = np.array(first["time"], dtype=np.float64)
+            value = np.column_stack([np.array(one["value"], dtype=np.float64) for one in lines])
+            raw = stacked([_raw(one["raw"]) for one in lines])
+            error = first.get("clock_error")
+            error = None if error is None else float(error)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            raise self._bad("the values in or above the line are not those of a recording") from None
+        if time.ndim != 1 or not value.shape == raw.shape == (len(time), len(lines)) or len(uuid) > MOST.text:
+            raise self._bad("the lists in or above the line are not of one length")
+        channels = tuple(channel_number(one["channel"], f"{self.path}:{self._line}") for one in lines)
+        streams = numbers.setdefault(uuid, {})
+        stream = streams.setdefault(channels, len(streams))
+        valid = np.isfinite(value)
+        test = first.get("test_pattern") is True
+        ticks = np.zeros(len(time), dtype=np.uint64)
+        return Block(uuid, stream, channels, index, time, ticks, raw, value, valid, 0.0, error, test)
+
+
+def _goes_with(lines: list[dict[str, Any]], event: dict[str, Any]) -> bool:
+    """Whether a line is another channel of the block that began with these lines."""
+    first = lines[0]
+    return (
+        event.get("event") == "data"
+        and all(event.get(name) == first.get(name) for name in ("uuid", "index", "time"))
+        and all(event.get("channel") != one.get("channel") for one in lines)
+    )
+
+
+def _raw(values: list[Any]) -> NDArray[Any]:
+    kinds = {type(one) for one in values}
+    if kinds <= {int}:
+        return integers(values)
+    if kinds <= {int, float, type(None)}:
+        return np.array(values, dtype=np.float64)
+    found = np.empty(len(values), dtype=object)
+    found[:] = [bytes.fromhex(one) if isinstance(one, str) else one for one in values]
+    return found
+
+
+def report_of(words: dict[str, Any]) -> NodeReport | None:
+    """The state of a node as a recording has it; None where it is none."""
+    uuid, state = words.get("uuid"), words.get("state")
+    if not isinstance(uuid, str) or state not in _STATES or len(uuid) > MOST.text:
+        return None
+    counts = {name: words.get(name) for name in _COUNTS}
+    error, time, reasons = words.get("clock_error"), words.get("time"), words.get("invalid_why")
+    why: list[Invalid] = []
+    for one in reasons[: MOST.text] if isinstance(reasons, list) else ():
+        if isinstance(one, dict) and isinstance(one.get("channel"), int) and isinstance(one.get("count"), int):
+            why.append(Invalid(one["channel"], str(one.get("why"))[: MOST.text], one["count"]))
+    return NodeReport(
+        uuid,
+        state,
+        str(words.get("why") or "")[: MOST.text],
+        **{name: value if isinstance(value, int) else 0 for name, value in counts.items()},
+        clock_error=float(error) if isinstance(error, int | float) else None,
+        time=float(time) if isinstance(time, int | float) else 0.0,
+        invalid_why=tuple(why),
+    )

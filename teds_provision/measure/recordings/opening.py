@@ -1,0 +1,31 @@
+"""Opens a recording of any format, told by its first octets, whatever its name is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from teds_provision.errors import BadData
+from teds_provision.files import open_to_read
+from teds_provision.measure.recordings import json_lines, mcap, parquet, text
+from teds_provision.measure.recordings.source import Recording
+from teds_provision.measure.sinks.mcap.writer import MAGIC
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a recording; raises NotFound, BadData (none of ours, damaged), UsageFailure (Parquet without pyarrow)."""
+    with open_to_read(path) as file:
+        begin = file.read(64)
+    if begin.startswith(MAGIC):
+        return mcap.McapRecording(path)
+    if begin.startswith(parquet.MAGIC):
+        return parquet.ParquetRecording(path)
+    if begin.startswith(json_lines.FIRST):
+        return json_lines.JsonLines(path)
+    if begin.startswith(text.FIRST.encode()):
+        return text.TextRecording(path)
+    if not begin:
+        raise BadData(f"{path} is empty.")
+    raise BadData(
+        f"{path} is no recording.",
+        hint="A recording is what `measure --to` wrote: CSV, text, MCAP, JSON lines; or Parquet.",
+    )

@@ -1,0 +1,181 @@
+"""What every format of a recording is read as: facts of channels, blocks of samples, rows of a grid, reports, notes.
+
+A recording may come from anybody: sizes and counts are limited (:data:`MOST`), so that memory stays small whatever the
+file says, and what is malformed raises BadData with the place.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from teds_provision.errors import BadData
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, Kind, NodeReport, Note, StationFacts
+from teds_provision.teds import Units
+from teds_provision.teds.calibration.plain import calibration_from_json
+from teds_provision.teds.units import parse_units
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The most that is read of a recording at a time."""
+
+    line: int = 8 << 20
+    """Octets of a line of text or JSON."""
+    chunk: int = 64 << 20
+    """Octets of an MCAP chunk, unpacked; of any other record."""
+    channels: int = 20_000
+    """TransducerChannels, and topics of an MCAP."""
+    text: int = 1_000
+    """Characters of a name, a unit, a date."""
+    columns: int = 40_100
+
+
+MOST: Final = Limits()
+ROWS: Final = 4096
+"""Rows that are handed on together: enough for numpy, few enough to keep nodes together in time."""
+
+
+Entry = Block | GroupRows | NodeReport | Note | tuple[ChannelFacts, ...]
+"""No facts at all end a batch: everything behind them was recorded after everything before them."""
+
+
+class Recording(ABC):
+    """A recording that is open for reading: what its head says, then its entries in the order of the file.
+
+    ``facts`` has the first facts of each channel, wherever in the file they stand. ``torn`` is known when all entries
+    were read: octets at the end that are no whole piece (a killed recorder, or one that still writes).
+    """
+
+    form: str
+    """Name of the format."""
+    wide = False
+    """Whether it has rows of one grid in place of blocks."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.station = StationFacts("")
+        self.facts: dict[tuple[str, int], ChannelFacts] = {}
+        self.torn = 0
+        self.complete = True
+        """Whether the file has its end, where the format has one."""
+        self.being_written = is_locked(path)
+
+    @abstractmethod
+    def entries(self) -> Iterator[Entry]:
+        """All that is in it; each call begins anew. Raises BadData, NotFound."""
+
+    def know(self, facts: ChannelFacts) -> None:
+        """Keep the first facts of a channel; raises BadData for more channels than are read."""
+        if facts.key not in self.facts and len(self.facts) >= MOST.channels:
+            raise BadData(f"{self.path} names more than {MOST.channels} channels.")
+        self.facts.setdefault(facts.key, facts)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a recorder holds the file now."""
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(file)
+    return False
+
+
+def station_of(words: Mapping[str, Any]) -> StationFacts:
+    """Who measured, of a head that anybody may have written."""
+    name, group, clock = (str(words.get(key) or "")[: MOST.text] for key in ("station", "group", "clock"))
+    test = words.get("test_pattern") in (True, "true")
+    plain = StationFacts(name, group=group, test_pattern=test, started=unix_of(words.get("started")))
+    return plain if not clock else StationFacts(**{**vars(plain), "clock": clock})
+
+
+def unix_of(text: object) -> float:
+    """Unix seconds of an ISO time; 0.0 where it is none."""
+    from datetime import datetime
+
+    try:
+        return datetime.fromisoformat(str(text)).timestamp()
+    except (ValueError, OverflowError):
+        return 0.0
+
+
+_TEXTS = frozenset(
+    {"uuid", "node", "name", "unit", "shown_unit", "calibrated", "due", "fingerprint", "sample_form", "quantity"}
+    | {"frame"}
+)
+_NUMBERS = frozenset({"low", "high", "uncertainty", "period", "deviation", "own_period"})
+_FLAGS = frozenset({"overdue", "unsigned", "unverified"})
+_FIELDS = frozenset(field.name for field in fields(ChannelFacts))
+
+
+def facts_of(words: object, where: str) -> ChannelFacts:
+    """Facts of a channel as a recording has them (``lines.facts_as_json``); raises BadData, ``where`` before it.
+
+    The exponents of the unit are read from its text: a unit that is none (another program's) stays text alone.
+    """
+    if not isinstance(words, dict):
+        raise BadData(f"{where}: the facts of a channel are not a JSON object.")
+    kept: dict[str, Any] = {}
+    curve = words.get("calibration")
+    for name, value in words.items():
+        if name in _TEXTS and isinstance(value, str) and len(value) <= MOST.text:
+            kept[name] = value
+        elif name in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
+            kept[name] = _finite(float(value), name, where)
+        elif (name in _FLAGS and isinstance(value, bool)) or (name == "kind" and value in get_args(Kind)):
+            kept[name] = value
+        elif name == "vector" and _are_channels(value):
+            kept[name] = tuple(value)
+        elif name == "number":
+            kept[name] = channel_number(value, where)
+        elif name in _FIELDS and name != "calibration":
+            raise BadData(f"{where}: {name} of a channel is {_short(value)}.")
+    if "uuid" not in kept or "number" not in kept:
+        raise BadData(f"{where}: a channel has no UUID or no number.")
+    try:
+        kept["units"] = parse_units(kept["unit"]) if kept.get("unit") else None
+    except BadData:
+        kept["units"] = None
+    if curve is not None:
+        kept["calibration"] = calibration_from_json(curve, kept["number"], kept["units"] or Units())
+    return ChannelFacts(**{"node": "", "name": "", **kept})
+
+
+def channel_number(value: object, where: str) -> int:
+    """Number of a TransducerChannel; raises BadData."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFF:
+        raise BadData(f"{where}: {_short(value)} is no number of a channel.")
+    return value
+
+
+def _are_channels(value: object) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) <= MOST.text
+        and all(isinstance(one, int) and 0 <= one <= 0xFFFF for one in value)
+    )
+
+
+def _finite(value: float, name: str, where: str) -> float:
+    if not math.isfinite(value):
+        raise BadData(f"{where}: {name} of a channel is not finite.")
+    return value
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}…"

@@ -1,0 +1,129 @@
+"""What is in a recording: channels, from when to when, how much, what is not valid, what was lost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, Note
+from teds_provision.measure.recordings.source import MOST, Entry, Recording
+from teds_provision.measure.sinks.lines import facts_as_json, iso
+
+NOTES = 100
+
+
+@dataclass
+class Seen:
+    """What was seen of a channel; times are unix seconds."""
+
+    samples: int = 0
+    invalid: int = 0
+    first: float = math.inf
+    last: float = -math.inf
+    low: float = math.inf
+    high: float = -math.inf
+
+    def saw(self, times: Any, values: Any) -> None:
+        """Count values (NaN where not valid) at these times."""
+        good = values[np.isfinite(values)]
+        self.samples += len(values)
+        self.invalid += len(values) - len(good)
+        self.first, self.last = min(self.first, float(times.min())), max(self.last, float(times.max()))
+        if len(good):
+            self.low, self.high = min(self.low, float(good.min())), max(self.high, float(good.max()))
+
+
+@dataclass
+class Summary:
+    """Counts what goes by. ``missing`` samples are gaps of the sample number within a run of a stream."""
+
+    channels: dict[tuple[str, int], Seen] = field(default_factory=dict)
+    facts: dict[tuple[str, int], ChannelFacts] = field(default_factory=dict)
+    reports: dict[str, NodeReport] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+    messages: int = 0
+    missing: int = 0
+    _next: dict[tuple[str, int, tuple[int, ...]], int] = field(default_factory=dict)
+
+    def take(self, entry: Entry) -> None:
+        """One entry."""
+        if isinstance(entry, Block):
+            self._block(entry)
+        elif isinstance(entry, GroupRows):
+            self.messages += len(entry.time)
+            for column, key in enumerate(entry.channels):
+                self._of(key).saw(entry.time, entry.value[:, column])
+        elif isinstance(entry, NodeReport):
+            if len(self.reports) < MOST.channels:
+                self.reports[entry.uuid] = entry
+        elif isinstance(entry, Note):
+            self.notes = [*self.notes, entry][:NOTES]
+        else:
+            self.facts.update((one.key, one) for one in entry if len(self.facts) < MOST.channels)
+
+    def _of(self, key: tuple[str, int]) -> Seen:
+        return self.channels.setdefault(key, Seen())
+
+    def _block(self, block: Block) -> None:
+        if not len(block.time):
+            return
+        self.messages += len(block.time)
+        stream = block.uuid, block.stream, block.channels
+        due = self._next.get(stream, block.index)
+        if block.index > due:
+            self.missing += block.index - due
+        self._next[stream] = block.index + len(block.time)
+        for column, number in enumerate(block.channels):
+            self._of((block.uuid, number)).saw(block.time, block.value[:, column])
+
+    def to_json(self, recording: Recording) -> dict[str, Any]:
+        """The result of ``record info``: ``lost`` counts messages of nodes, as the recorder reported them last.
+
+        null where it reported nothing; times are ISO 8601.
+        """
+        seen = self.channels.values()
+        lost = sum(one.lost for one in self.reports.values()) if self.reports else None
+        first = min((one.first for one in seen), default=math.inf)
+        last = max((one.last for one in seen), default=-math.inf)
+        return {
+            "file": str(recording.path),
+            "format": recording.form,
+            "station": recording.station.name,
+            "group": recording.station.group,
+            "started": iso(recording.station.started) if recording.station.started else None,
+            "test_pattern": recording.station.test_pattern,
+            "complete": recording.complete and not recording.torn,
+            "being_written": recording.being_written,
+            "torn": recording.torn,
+            "from": iso(first) if math.isfinite(first) else None,
+            "until": iso(last) if math.isfinite(last) else None,
+            "messages": self.messages,
+            "samples": sum(one.samples for one in seen),
+            "invalid": sum(one.invalid for one in seen),
+            "lost": lost,
+            "missing": self.missing,
+            "channels": [self._channel(key, recording) for key in sorted({*recording.facts, *self.channels})],
+            "nodes": [
+                {"uuid": one.uuid, "state": one.state, "why": one.why, "samples": one.samples, "lost": one.lost,
+                 "late": one.late, "bad": one.bad, "invalid": one.invalid}
+                for one in self.reports.values()
+            ],
+            "notes": [{"time": iso(one.at), "why": one.text} for one in self.notes],
+        }  # fmt: skip
+
+    def _channel(self, key: tuple[str, int], recording: Recording) -> dict[str, Any]:
+        facts = self.facts.get(key) or recording.facts.get(key) or ChannelFacts(key[0], "", key[1], "")
+        seen = self.channels.get(key, Seen())
+        return {
+            "channel": facts.number,
+            **{name: value for name, value in facts_as_json(facts).items() if name != "number"},
+            "from": iso(seen.first) if seen.samples else None,
+            "until": iso(seen.last) if seen.samples else None,
+            "samples": seen.samples,
+            "invalid": seen.invalid,
+            "lowest": seen.low if math.isfinite(seen.low) else None,
+            "highest": seen.high if math.isfinite(seen.high) else None,
+        }

@@ -1,0 +1,72 @@
+"""Wide CSV: one grid of times for all channels, one row a time, a column for each channel with its unit in the name.
+
+For spreadsheets and data frames. A cell holds the last value that is not newer than the row and not older than two
+periods of its channel (``grid.py``); it is empty where there is none. Raw values, sample numbers and the bounds of the
+clock do not fit a grid: they are in the other formats. Lines with ``#`` say what those of ``text.py`` say.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
+from teds_provision.measure.sinks.base import Item
+from teds_provision.measure.sinks.text import TextSink, heads_of
+
+WIDE = "wide:"
+"""What stands before the path of such a file in the words for a sink."""
+
+
+class WideSink(TextSink):
+    """Recorder of rows; see the module."""
+
+    wants_rows = True
+    layout = "text 1, wide"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._form = ""
+        self._changed = False
+        self._unwritten: list[tuple[float, str]] = []  # notes that wait for the head of their part
+        self._nan = re.compile(f"(?<=[{self._comma}])nan(?=[{self._comma}\n])")
+
+    def _take(self, item: Item) -> None:
+        if isinstance(item, GroupRows):
+            self._rows_of(item)
+        elif isinstance(item, tuple):
+            if self._news(item):  # other columns, or another datasheet: the next rows begin another part
+                self._changed = bool(self._columns)
+        elif not isinstance(item, Block):
+            super()._take(item)
+
+    def _begin(self) -> None:
+        """Begin with the first row, which says what channels there are."""
+        self._columns, self._changed = {}, False
+
+    def _note(self, at: float, text: str) -> None:
+        if self._columns:
+            super()._note(at, text)
+        else:
+            self._unwritten.append((at, text))
+
+    def _rows_of(self, rows: GroupRows) -> None:
+        if not rows.channels:
+            return
+        if self._columns and (self._changed or tuple(self._columns) != rows.channels):
+            self._new_part()
+        if not self._columns:
+            self._columns = {key: place for place, key in enumerate(rows.channels)}
+            known = [self.facts.get(key) or ChannelFacts(key[0], "", key[1], "") for key in rows.channels]
+            self._preamble(known, ["time", *heads_of(known)])
+            notes, self._unwritten = self._unwritten, []
+            for at, text in notes:
+                self._note(at, text)
+            self._form = self._comma.join(["%.6f", *["%.12g"] * len(known)]) + "\n"
+        table = np.column_stack([rows.time, rows.value]).tolist()
+        text = "".join([self._form % tuple(row) for row in table])
+        octets = (self._nan.sub("", text) if "nan" in text else text).encode()
+        self._count(written=rows.value.size, octets=len(octets), messages=len(rows.time))
+        self.part.add(octets, rows.value.size)

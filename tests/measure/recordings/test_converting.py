@@ -1,0 +1,190 @@
+"""Every format becomes every other one, and what was measured is in all of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from mcap.reader import make_reader
+
+from teds_provision.errors import UsageFailure
+from teds_provision.measure.blocks import Block, GroupRows, NodeReport, Note
+from teds_provision.measure.recordings.converting import convert
+from teds_provision.measure.recordings.opening import open_recording
+from teds_provision.measure.recordings.summary import Summary
+from teds_provision.measure.sinks import open_sink
+from teds_provision.teds.calibration.model import Calibration, CalibrationInput
+from teds_provision.teds.units import parse_units, recognize
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, OIL, STATION, block, blocks, fill
+
+FORMATS = (".csv", ".txt", ".jsonl", ".mcap", ".parquet")
+CURVE = Calibration(
+    1,
+    "linear",
+    (CalibrationInput(1, 1, (0.0, 65535.0), (0.0,)),),
+    (0.5, 0.25),
+    recognize(parse_units("rad"), 0.01, 0.0),
+)
+FACTS = (
+    replace(ANGLE, units=parse_units("rad"), calibration=CURVE, frame="{node}_tip", deviation=0.002, own_period=1e-4),
+    replace(FORCE, sample_form="int16"),
+    replace(OIL, sample_form="float32"),
+)
+
+
+def measured(n: int = 40) -> list[Any]:
+    """Two nodes, one of them with two channels; an invalid value, a gap of three samples, an end."""
+    items: list[Any] = []
+    for k in range(0, n, 4):
+        raw = [[k + row] for row in range(4)]
+        index = k if k < n // 2 else k + 3
+        items.append(block(raw, valid=[[True], [True], [k != 8], [True]], index=index))
+        both = np.array([[k + row, 0.5 * (k + row)] for row in range(4)])
+        items.append(block(both, uuid=HAND, channels=(2, 3), index=k))
+    counts = {"samples": n, "lost": 1, "invalid": 1}
+    items.append(NodeReport(ARM, "ended", **counts, time=1_795_000_100.0))
+    return items
+
+
+def recorded(path: Path, items: list[Any] | None = None) -> Path:
+    sink = open_sink(str(path))
+    sink.open(FACTS, STATION)
+    fill(sink, measured() if items is None else items)
+    return path
+
+
+def convert_to(folder: Path, suffix: str, target: Path) -> None:
+    """A recording in any format, Parquet too, which no recorder writes."""
+    if suffix != ".parquet":
+        recorded(target)
+    else:
+        convert(recorded(folder / "origin.mcap"), target)
+
+
+def told(path: Path) -> dict[str, Any]:
+    recording, summary = open_recording(path), Summary()
+    for entry in recording.entries():
+        summary.take(entry)
+    return summary.to_json(recording)
+
+
+def values(path: Path) -> dict[tuple[str, int], list[tuple[float, Any, float]]]:
+    """Time, raw and calibrated value of each channel, by time."""
+    found: dict[tuple[str, int], list[tuple[float, Any, float]]] = {}
+    for entry in open_recording(path).entries():
+        if isinstance(entry, Block):
+            for column, key in enumerate(entry.keys):
+                pairs = zip(
+                    entry.time.tolist(), entry.raw[:, column].tolist(), entry.value[:, column].tolist(), strict=True
+                )
+                found.setdefault(key, []).extend((round(t, 5), raw, value) for t, raw, value in pairs)
+    return {key: sorted(one, key=lambda each: each[0]) for key, one in found.items()}
+
+
+@pytest.mark.parametrize("begin", [one for one in FORMATS if one != ".parquet"])
+@pytest.mark.parametrize("end", FORMATS)
+def test_a_recording_in_another_format_says_the_same(tmp_path: Path, begin: str, end: str) -> None:
+    first = recorded(tmp_path / f"run{begin}")
+    done = convert(first, tmp_path / f"other{end}")
+    assert done.files == (tmp_path / f"other{end}",)
+    again = convert(done.files[0], tmp_path / f"back{begin}")
+    before = values(first)
+    assert len(before[ARM, 1]) == 40
+    for path in (*done.files, *again.files):
+        after = values(path)
+        assert after.keys() == before.keys()
+        for key, expected in before.items():
+            assert [one[:2] for one in after[key]] == [one[:2] for one in expected], "times and raw values are exact"
+            np.testing.assert_allclose([one[2] for one in after[key]], [one[2] for one in expected], rtol=1e-11)
+        facts, said, origin = open_recording(path), told(path), told(first)
+        assert facts.facts[ARM, 1] == FACTS[0], "every fact of the datasheet, its calibration too"
+        assert (facts.station.name, facts.station.group) == ("bench", "crane")
+        names = ("from", "until", "messages", "samples", "invalid", "lost", "missing", "complete")
+        assert {name: said[name] for name in names} == {name: origin[name] for name in names}
+    assert (origin["invalid"], origin["lost"], origin["missing"]) == (1, 1, 3)
+
+
+@given(blocks())
+@settings(max_examples=25)
+def test_any_block_survives_mcap_to_json_to_mcap(one: Block) -> None:
+    with TemporaryDirectory() as folder:
+        path = recorded(Path(folder) / "run.mcap", [one])
+        convert(path, Path(folder) / "run.jsonl")
+        convert(Path(folder) / "run.jsonl", Path(folder) / "again.mcap")
+        first, last = values(path), values(Path(folder) / "again.mcap")
+    assert first.keys() == last.keys()
+    for key, expected in first.items():
+        got = last[key]
+        np.testing.assert_array_equal([each[1] for each in got], [each[1] for each in expected])
+        np.testing.assert_array_equal([each[2] for each in got], [each[2] for each in expected])
+
+
+def test_foreign_readers_take_what_was_converted(tmp_path: Path) -> None:
+    first = recorded(tmp_path / "run.csv")
+    [mcap] = convert(first, tmp_path / "run.mcap").files
+    with mcap.open("rb") as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
+    assert topics.count("/bench/arm/stream_0") == 40
+    [parquet] = convert(first, tmp_path / "run.parquet").files
+    by_parquet, by_csv = pd.read_parquet(parquet), pd.read_csv(first, comment="#")
+    assert len(by_parquet) == len(by_csv) == 80
+    arm = by_parquet[by_parquet["uuid"] == ARM]
+    assert arm["arm/angle [rad]"].isna().sum() == 1
+    assert arm["arm/angle raw"].tolist() == by_csv[by_csv["uuid"] == ARM]["arm/angle raw"].tolist()
+
+
+def test_a_grid_has_one_row_a_time_and_units_in_its_columns(tmp_path: Path) -> None:
+    first = recorded(tmp_path / "run.mcap")
+    [wide] = convert(first, tmp_path / "wide.csv", wide=True).files
+    table = pd.read_csv(wide, comment="#")
+    assert list(table.columns) == ["time", "arm/angle [rad]", "hand/force [N]", "hand/oil [K]"]
+    assert table["time"].is_monotonic_increasing
+    assert table["time"].is_unique
+    assert len(table) == 43, "the three samples that are missing have rows, what lies behind the last one has none"
+    assert np.diff(table["time"]).max() == pytest.approx(0.01, abs=1e-5)
+    row = table[np.isclose(table["time"] - 1_795_000_000, 0.05, atol=1e-6)]
+    assert row["arm/angle [rad]"].tolist() == [0.5]
+    assert row["hand/oil [K]"].tolist() == [0.25]
+    [again] = convert(wide, tmp_path / "wide.parquet").files
+    pd.testing.assert_frame_equal(pd.read_parquet(again), table)
+    with pytest.raises(UsageFailure, match="grid"):
+        convert(wide, tmp_path / "no.mcap")
+
+
+def test_a_grid_is_recorded_as_it_is_converted(tmp_path: Path) -> None:
+    sink = open_sink(f"wide:{tmp_path / 'run.csv'}")
+    sink.open(FACTS, STATION)
+    keys = ((ARM, 1), (HAND, 2))
+    time = np.array([1.0, 1.01])
+    fill(sink, [GroupRows("crane", keys, time, np.array([[1.5, np.nan], [2.5, -3.0]]), np.zeros((2, 2)))])
+    table = pd.read_csv(tmp_path / "run.csv", comment="#")
+    assert list(table.columns) == ["time", "arm/angle [rad]", "hand/force [N]"]
+    assert table.iloc[0].isna().tolist() == [False, False, True]
+    assert table.iloc[1].tolist() == [1.01, 2.5, -3.0]
+    assert told(tmp_path / "run.csv")["messages"] == 2
+
+
+def test_another_datasheet_midway_begins_another_file_of_columns(tmp_path: Path) -> None:
+    newer = replace(ANGLE, fingerprint="ef" * 32)
+    first = recorded(tmp_path / "run.jsonl", [block(), [newer], block(index=3)])
+    for end in (".csv", ".parquet"):
+        files = convert(first, tmp_path / f"other{end}").files
+        assert [path.name for path in files] == [f"other{end}", f"other.2{end}"]
+        assert [open_recording(path).facts[ARM, 1].fingerprint[:2] for path in files] == ["ab", "ef"]
+    assert len(convert(first, tmp_path / "one.mcap").files) == 1
+
+
+def test_notes_of_the_recorder_go_along(tmp_path: Path) -> None:
+    first = recorded(tmp_path / "run.mcap", [block()])
+    sink = open_sink(str(tmp_path / "noted.mcap"))
+    sink.copy([*open_recording(first).entries(), Note(1_795_000_050.0, "The disk was full.")], FACTS, STATION)  # type: ignore[attr-defined]
+    path = tmp_path / "noted.mcap"
+    for end in (".jsonl", ".csv", ".parquet", ".mcap"):
+        [path] = convert(path, tmp_path / f"next{end}").files
+        assert [one["why"] for one in told(path)["notes"]] == ["The disk was full."]

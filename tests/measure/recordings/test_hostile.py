@@ -1,0 +1,125 @@
+"""Recordings from anybody: refused with words, in little time and memory, whatever is in them."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadData, TedsProvisionError
+from teds_provision.measure.recordings.converting import convert
+from teds_provision.measure.recordings.opening import open_recording
+from teds_provision.measure.sinks.mcap.writer import CHUNK, CHUNK_HEAD, HEADER, MAGIC, record, text
+from tests.measure.recordings.test_converting import FORMATS, convert_to, recorded
+
+
+def read(path: Path) -> int:
+    return sum(1 for _ in open_recording(path).entries())
+
+
+def refused(path: Path, *words: str) -> None:
+    with pytest.raises(BadData) as caught:
+        read(path)
+    for word in words:
+        assert word in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("octets", "words"),
+    [
+        (b"", ["is empty"]),
+        (b"\x7fELF" + bytes(100), ["no recording"]),
+        (b"PAR1" + bytes(100) + b"PAR1", ["Parquet"]),
+        (b'{"event":"data","uuid":"1","channel":1,"index":0,"time":[1],"raw":[1,2],"value":[1],"valid":[true]}\n', []),
+        (b'{"event":' + b"[" * 100_000 + b"\n", [":1:", "not JSON"]),
+        (b'{"event":"data"' + b" " * (9 << 20), [":1:", "octets"]),
+        (b'{"event":"channel","uuid":5}\n', ["uuid"]),
+        (b'{"event":"channel","uuid":"1","number":1e9}\n', ["number of a channel"]),
+        (b'{"event":"channel","uuid":"1","number":1,"low":NaN}\n', ["not finite"]),
+        (b"# teds-provision measurement, text 1\ntime,uuid,index\n", ["columns"]),
+        (b"# teds-provision measurement, text 1\n# channel: [1]\n", ["JSON object"]),
+        (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,3,4,5,6\n", [":3:", "6 cells"]),
+        (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,x,4,5\n", ["no number"]),
+        (b"# teds-provision measurement, text 1\n\xff\xfe\n", [":2:", "UTF-8"]),
+    ],
+)  # fmt: skip
+def test_what_is_no_recording_is_refused_with_its_place(tmp_path: Path, octets: bytes, words: list[str]) -> None:
+    path = tmp_path / "run"
+    path.write_bytes(octets)
+    refused(path, str(path), *words)
+
+
+def test_a_chunk_that_unpacks_to_gigabytes_is_refused_unopened(tmp_path: Path) -> None:
+    bomb = zstandard.ZstdCompressor(level=19).compress(bytes(1 << 28))
+    head = MAGIC + record(HEADER, text("ros2") + text(""))
+    for claimed in (1 << 28, 100):  # honest, and a lie
+        body = CHUNK_HEAD.pack(0, 0, claimed, 0) + text("zstd") + struct.pack("<Q", len(bomb)) + bomb
+        path = tmp_path / f"{claimed}.mcap"
+        path.write_bytes(head + record(CHUNK, body) + record(CHUNK, body))
+        code = (
+            "import resource, sys\n"
+            "from pathlib import Path\n"
+            "from teds_provision.errors import BadData\n"
+            "from teds_provision.measure.recordings.opening import open_recording\n"
+            "resource.setrlimit(resource.RLIMIT_DATA, (400 << 20, 400 << 20))\n"
+            "try:\n"
+            "    list(open_recording(Path(sys.argv[1])).entries())\n"
+            "except BadData as error:\n"
+            "    print(error.message)\n"
+        )
+        done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
+        assert "damaged" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@given(data=st.data())
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_whatever_octets_are_changed_ends_in_values_or_words(tmp_path: Path, suffix: str, data: st.DataObject) -> None:
+    whole = tmp_path / f"run{suffix}"
+    if not whole.exists():
+        convert_to(tmp_path, suffix, whole)
+    octets = bytearray(whole.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(octets) - 1))
+        octets[at : at + data.draw(st.sampled_from([0, 1, 8]))] = data.draw(st.binary(max_size=9))
+    broken = tmp_path / f"broken{suffix}"
+    broken.write_bytes(octets)
+    try:
+        read(broken)
+    except TedsProvisionError as refusal:
+        message = refusal.message
+    else:
+        return
+    assert str(broken) in message
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".mcap"])
+def test_a_file_cut_anywhere_gives_all_that_is_whole(tmp_path: Path, suffix: str) -> None:
+    whole = recorded(tmp_path / f"run{suffix}")
+    octets, before = whole.read_bytes(), -1
+    for at in np.linspace(len(octets) // 3, len(octets), 40).astype(int).tolist():
+        cut = tmp_path / "cut"
+        cut.write_bytes(octets[:at])
+        recording = open_recording(cut)
+        rows = sum(len(entry.time) for entry in recording.entries() if hasattr(entry, "value"))
+        assert rows >= before, "more octets hold no less"
+        before = rows
+    assert before == 80
+
+
+def test_a_damaged_mcap_is_refused_with_the_command_that_saves_the_rest(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap")
+    octets = bytearray(path.read_bytes())
+    octets[octets.find(b"zstd") + 200] ^= 0xFF
+    path.write_bytes(octets)
+    with pytest.raises(BadData, match="chunk at octet") as caught:
+        convert(path, tmp_path / "run.csv")
+    assert "measure recover" in caught.value.hint
+    assert [one.name for one in tmp_path.iterdir()] == ["run.mcap"], "nothing half done is left"

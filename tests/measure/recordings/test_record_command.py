@@ -1,0 +1,126 @@
+"""``record`` by command: pairs with a recorder that writes, one that was killed, and itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from teds_provision.measure.recordings.opening import open_recording
+from tests.cli.shell import call, unmeasured_environment
+from tests.measure.recordings.test_converting import recorded, told
+from tests.measure.sinks.parts import block
+from tests.pace import until
+
+WRITER = """
+import sys, time
+from teds_provision.measure.sinks import open_sink
+from tests.measure.sinks.parts import ANGLE, STATION, block
+sink = open_sink(sys.argv[1])
+sink.open((ANGLE,), STATION)
+for k in range(0, 1_000_000, 3):
+    sink.write(block(index=k))
+    if k % 30 == 0:
+        time.sleep(0.01)
+"""
+
+
+def rows_in(path: Path) -> int:
+    return sum(len(one.time) for one in open_recording(path).entries() if hasattr(one, "value"))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".mcap"])
+def test_a_recorder_that_is_killed_in_the_middle_leaves_what_info_and_convert_read(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"run{suffix}"
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, path], env=unmeasured_environment())
+    try:
+        until(lambda: path.exists() and path.stat().st_size > 30_000)
+        info = json.loads(call(tmp_path / "home", "--json", "record", "info", str(path)).out)
+        assert info["being_written"] is True
+        assert info["messages"] > 0
+        early = call(tmp_path / "home", "record", "convert", str(path), str(tmp_path / f"early{suffix}"))
+        assert early.code == 0
+        assert "still being written" in early.err
+    finally:
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.wait()
+    octets = path.read_bytes()
+    done = call(tmp_path / "home", "--json", "record", "convert", str(path), str(tmp_path / "whole.mcap"))
+    assert done.code == 0, done.err
+    told_of = json.loads(done.out)
+    assert told_of["being_written"] is False
+    assert path.read_bytes() == octets, "the recording itself is only read"
+    assert (
+        info["messages"]
+        <= rows_in(tmp_path / f"early{suffix}")
+        <= told_of["messages"]
+        == rows_in(tmp_path / "whole.mcap")
+    )
+    assert told(tmp_path / "whole.mcap")["missing"] == 0, "all of it, from the first sample on"
+    if suffix == ".mcap":
+        assert told_of["complete"] is False
+        assert "was cut off" in done.err
+        assert call(tmp_path / "home", "measure", "recover", str(path)).code == 0
+        assert json.loads(call(tmp_path / "home", "--json", "record", "info", str(path)).out)["complete"] is True
+
+
+def test_two_conversions_to_one_name_leave_one_whole_file(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 30_000, 3)])
+    words = [sys.executable, "-m", "teds_provision", "record", "convert", str(source), str(tmp_path / "to.csv")]
+    both = [subprocess.Popen(words, env=unmeasured_environment(), stderr=subprocess.PIPE) for _ in range(2)]
+    codes = sorted((one.communicate()[0], one.returncode)[1] for one in both)
+    assert codes == [0, 2]
+    assert rows_in(tmp_path / "to.csv") == 30_000
+    assert {one.name for one in tmp_path.iterdir()} == {"run.mcap", "to.csv"}
+
+
+def test_what_a_killed_conversion_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 90_000, 3)])
+    words = [sys.executable, "-m", "teds_provision", "record", "convert", str(source), str(tmp_path / "to.csv")]
+    one = subprocess.Popen(words, env=unmeasured_environment())
+    until(lambda: any(found.name.endswith(".teds-part") for found in tmp_path.iterdir()))
+    os.kill(one.pid, signal.SIGKILL)
+    one.wait()
+    if not (tmp_path / "to.csv").exists():
+        assert call(tmp_path / "home", "record", "convert", str(source), str(tmp_path / "to.csv")).code == 0
+    assert {one.name for one in tmp_path.iterdir()} == {"run.mcap", "to.csv"}
+
+
+def test_show_speaks_peoples_units_and_json_speaks_si(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "run.mcap")
+    lines = call(tmp_path / "home", "record", "show", str(path), "--limit", "2").out.splitlines()
+    assert len(lines) == 2
+    assert lines[1].endswith("arm/angle 5.72958 °")
+    printed = call(tmp_path / "home", "--json", "record", "show", path, "--channel", "3").out
+    *events, end = [json.loads(line) for line in printed.splitlines()]
+    assert {(one["event"], one["channel"], one["unit"]) for one in events} == {("data", 3, "K")}
+    assert sum(len(one["time"]) for one in events) == 40
+    assert end["event"] == "end"
+    assert end["samples"] == 120, "the end counts the whole recording"
+
+
+def test_a_file_that_may_not_grow_ends_a_conversion_with_words_and_leaves_nothing(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 30_000, 3)])
+    program = f"{sys.executable} -m teds_provision record convert {source} {tmp_path / 'to.csv'}"
+    words = ["bash", "-c", f"ulimit -f 200; trap '' XFSZ; exec {program}"]
+    done = subprocess.run(
+        words,
+        env=unmeasured_environment() | {"PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 7
+    assert "may not grow" in done.stderr
+    assert {one.name for one in tmp_path.iterdir()} == {"run.mcap"}
+
+
+def test_wide_needs_a_file_of_text(tmp_path: Path) -> None:
+    done = call(tmp_path / "home", "measure", "8d4d", "--to", str(tmp_path / "run.mcap"), "--wide")
+    assert done.code == 2
+    assert "--to FILE.csv" in done.err

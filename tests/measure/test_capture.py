@@ -1,0 +1,121 @@
+"""`calibrate capture` from running sensors, and a calibration that is made of nothing else."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.desk import ANGLE
+from tests.measure import hall as halls
+from tests.measure.hall import Hall
+from tests.measure.test_zero import Shaft
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(halls.CALIBRATIONS, ANGLE, "# date: 2026-10-01\nraw,value [degree]\n0,0\n65536,360\n")
+        hall = Hall(tmp_path_factory.mktemp("capture") / "hall", {"angle": ANGLE})
+    try:
+        yield hall
+    finally:
+        hall.close()
+
+
+@pytest.fixture(scope="module")
+def angle(hall: Hall) -> Shaft:
+    return Shaft(hall, "angle").start()
+
+
+def at(hall: Hall, degrees: float, file: Path, *, code: int = 0) -> dict[str, object]:
+    words = ("calibrate", "capture", "angle", 1, "--reference", degrees, "--unit", "degree", "--to", file)
+    return dict(hall.ask(*words, code=code))
+
+
+def test_a_calibration_is_captured_fitted_and_written(hall: Hall, angle: Shaft, tmp_path: Path) -> None:
+    file = tmp_path / "joint.csv"
+    for raw, degrees in ((1000, 5.0), (30_000, 164.0), (65_000, 356.5)):
+        angle.turn("angle", raw)
+        done = at(hall, degrees, file)
+        assert done["added"] == {
+            "raw": raw,
+            "mean": raw,
+            "spread": 0,
+            "count": 32,
+            "reference": pytest.approx(degrees * 0.0174532925),
+            "unit": "rad",
+        }
+    assert [point["value"] for point in done["points"]] == [5, 164, 356.5]  # type: ignore[attr-defined]
+    told = hall.station.ask("calibrate", "fit", file)
+    assert (told["method"], told["rms"]) == ("table", pytest.approx(0, abs=1e-4))
+    assert hall.station.ask("calibrate", "fit", file, "--profile", ANGLE)["channels"][0]["left_out"]["maximum"] < 1
+    words = ("provision", "--calibration", file, "--profile", ANGLE, "--name", "angle", "--yes", "--via", "can")
+    assert hall.ask(*words)["verdict"] == "authentic"
+    angle.turn("angle", 30_000)
+    assert hall.ask("sample", "angle")["samples"][0]["value"] == pytest.approx(164 * 0.0174532925, abs=1e-5)
+
+
+def test_a_restless_sensor_and_one_at_the_wrap_of_its_raw_values_give_no_point(
+    hall: Hall, angle: Shaft, tmp_path: Path
+) -> None:
+    file = tmp_path / "joint.csv"
+    for far, said in ((5, "raw values begin anew"), (4000, "too restless")):
+        about = 0 if far == 5 else 20_000
+        running = hall.station.start(
+            *("--json", "calibrate", "capture", "angle", 1, "--reference", 0, "--to", file, "--can", hall.can)
+        )
+        with angle.file.open("a") as lines:
+            for step in range(2000):
+                lines.write(json.dumps({"raw": {"angle": (about + (far, -far)[step % 2]) % 65536}}) + "\n")
+                lines.flush()
+                time.sleep(0.003)
+                if not running.runs:
+                    break
+        refused = running.end()
+        assert refused.code == 6
+        assert said in refused.json["error"]["message"]
+    assert not file.exists()
+
+
+def test_points_are_captured_while_this_and_another_station_measure(hall: Hall, angle: Shaft, tmp_path: Path) -> None:
+    angle.turn("angle", 30_000)
+    other = hall.copy("other")
+    watches = hall.begin("angle", "--rate", 50, can=f"{hall.can}&source=0xF4", station=other)
+    mine = hall.begin("angle", "--rate", 50)
+    for running in (watches, mine):
+        running.wait_for('"event":"data"')
+    for count in (1, 2):
+        assert len(at(hall, 164, tmp_path / "x.csv")["points"]) == count  # type: ignore[arg-type]
+    for running in (watches, mine):
+        running.signal(2)
+        assert halls.ran(halls.events(running.end().out)) == ["running", "ended"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["--reference", "inf", "--to", "x.csv"], 2),
+        (["--reference", 1, "--unit", "kg", "--to", "x.csv"], 8),
+        (["--reference", 1, "--to", "/nowhere/x.csv"], 3),
+    ],
+)
+def test_what_is_no_point_is_refused(hall: Hall, angle: Shaft, words: list[object], code: int, tmp_path: Path) -> None:
+    del angle
+    given = [tmp_path / word if word == "x.csv" else word for word in words]
+    assert "error" in hall.ask("calibrate", "capture", "angle", 1, *given, code=code)
+    assert not (tmp_path / "x.csv").exists()
+
+
+def test_two_at_once_into_one_file_lose_no_point(hall: Hall, angle: Shaft, tmp_path: Path) -> None:
+    angle.turn("angle", 30_000)
+    file = tmp_path / "both.csv"
+    words = ("--json", "calibrate", "capture", "angle", 1, "--reference", 1, "--to", file, "--can", hall.can)
+    both = [hall.station.start(*words) for _ in range(2)]
+    assert [one.end().code for one in both] == [0, 0]
+    assert file.read_text().count("1, 30000, ") == 2

@@ -1,0 +1,70 @@
+"""People see the unit of the profile, programs get SI; limits are told in the unit that was given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import pytest
+
+from teds_provision.teds.profile import shipped_profiles
+from teds_provision.teds.sheet import Channel
+from teds_provision.teds.units import units_of
+from tests.e2e.desk import ANGLE
+from tests.terminal import on_terminal
+
+from .hall import Hall
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    made = Hall(tmp_path_factory.mktemp("hall"))
+    made.nodes["a"].start()
+    made.nodes["g"].start()
+    yield made
+    made.close()
+
+
+def shown_in(hall: Hall, unit: str) -> None:
+    """The station's own version of the type says in which unit its values are shown."""
+    folder = hall.station.home / "profiles"
+    folder.mkdir(exist_ok=True)
+    text = (shipped_profiles() / f"{ANGLE}.toml").read_text()
+    text = text.replace('unit = "degree"\n', f'unit = "degree"\ndisplay-unit = "{unit}"\n', 1)
+    (folder / f"{ANGLE}.toml").write_text(text)
+
+
+def test_a_reading_is_shown_in_the_unit_of_the_profile_and_json_stays_si(hall: Hall) -> None:
+    for unit, factor in (("degree", 180 / math.pi), ("mrad", 1000.0)):
+        shown_in(hall, unit)
+        (one,) = hall.ask("sample", "a")["samples"]
+        assert one["unit"] == "rad"
+        assert one["shown"]["unit"].startswith({"degree": "°", "mrad": "mrad"}[unit])
+        assert one["shown"]["value"] == pytest.approx(one["value"] * factor)
+        assert one["shown"]["uncertainty"] == pytest.approx(one["uncertainty"] * factor)
+        said = hall.station.run("sample", "a", "--can", hall.can)
+        assert f" {one['shown']['unit']} " in said.out.replace("\n", " "), said.out
+
+
+def test_a_profile_that_is_gone_or_of_another_dimension_changes_nothing(hall: Hall) -> None:
+    shown_in(hall, "kg")
+    assert hall.ask("sample", "a")["samples"][0]["shown"]["unit"] == "°"
+    assert Channel(1, units=units_of(radians=1), display="kg").shown.text == "°"
+    assert Channel(1, units=units_of(radians=1), display="no unit").shown.text == "°"
+
+
+def test_limits_are_told_in_the_unit_that_was_given(hall: Hall) -> None:
+    for unit, words in (("mm", "0 to 110 mm"), ("m", "0 to 0.11 m"), ("cm", "0 to 11 cm")):
+        said = hall.ask("set", "g", "1", "5000", "--unit", unit, "--hold", "0.1", code=6)
+        assert words in said["error"]["message"]
+        assert f"5000 {unit} is beyond" in said["error"]["message"]
+
+
+def test_a_bare_number_of_a_person_is_refused_where_another_unit_is_shown(hall: Hall) -> None:
+    words = ["set", "g", "1", "0.05", "--hold", "0.1", "--can", hall.can]
+    said = on_terminal(hall.station.home, *words, passphrase=hall.station.passphrase)
+    assert (said.code, "--unit mm or --unit m" in " ".join(said.screen.split())) == (2, True), said
+    applied = hall.station.run("--json", "set", "g", "1", "0.05", "--hold", "0.1", "--can", hall.can)
+    assert applied.code == 0, "a program means SI"
