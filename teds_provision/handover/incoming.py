@@ -203,6 +203,17 @@ class Imported:
         return tuple(bytes.fromhex(uuid) for uuid in self.notes.uuids if uuid not in refused)
 
 
+class NothingTaken(PolicyRefused):
+    """Every node of a bundle is refused; ``nodes`` say why."""
+
+    def __init__(self, bundle: Bundle, nodes: tuple[PlannedNode, ...]) -> None:
+        super().__init__(
+            f"No node of the bundle can be taken in; {nodes[0].node.uuid.hex()}: {nodes[0].why}.",
+            hint="Nothing was imported. Tell the sender.",
+        )
+        self.bundle, self.nodes = bundle, nodes
+
+
 @gc_pause.put_off()
 def plan_import(station: Station, source: Source, now: datetime | None = None) -> ImportPlan | Imported:
     """Open and check a bundle (octets, or a file), and say what would become of each node; changes nothing.
@@ -211,7 +222,7 @@ def plan_import(station: Station, source: Source, now: datetime | None = None) -
     and epochs is hearsay: none of it is kept but the epoch of a pending key, which the first session corrects. A node
     that was moved away comes back only from the station that it went to. Raises what
     :func:`open_bundle` raises, and PolicyRefused: an id seen with other content, no signature of the bundle's CA over
-    this station, or every node refused.
+    this station, or every node refused (NothingTaken).
     """
     opened = open_bundle(source, station.vault.identity(), station.policy.station_points().get, None)
     bundle, content = opened.bundle, digest_of(opened.bundle)
@@ -223,11 +234,7 @@ def plan_import(station: Station, source: Source, now: datetime | None = None) -
     denied, passed_over = _judged(station, opened)
     nodes = tuple(_Judge(station, denied, bundle).each(bundle.nodes))
     if nodes and all(node.decision == "refused" for node in nodes):
-        first = nodes[0]
-        raise PolicyRefused(
-            f"No node of the bundle can be taken in; {first.node.uuid.hex()}: {first.why}.",
-            hint="Nothing was imported. Tell the sender.",
-        )
+        raise NothingTaken(bundle, nodes)
     return ImportPlan(opened, content, nodes, denied, _is_known_ca(station, bundle.ca), passed_over)
 
 
@@ -285,6 +292,12 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
         deny_all(station, plan.denied, bundle)
         Arrivals(station, plan.opened.bundle).take_in(plan.taken)
         station.handovers.put(row)
+        for one in plan.nodes if station.plant.joined is not None else ():
+            node, told = one.node, {"peer": bundle.sender, "bundle": bundle.id}
+            if one.decision == "refused":
+                station.plant.tell("refused", node.uuid, why=one.why, **told)
+            elif one.decision != "same":
+                station.plant.tell("took", node.uuid, epoch=node.epoch, key_id=node.kid, mode=bundle.mode, **told)
         refused = {refused.uuid.hex() for refused in receipt.refused}
         taken = [uuid for uuid in notes.uuids if uuid not in refused]
         detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}

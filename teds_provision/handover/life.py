@@ -51,6 +51,7 @@ def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
     with station.transaction():
         if statement is not None:
             deny(station, statement, key=statement.fingerprint)
+            station.plant.tell("revoked", uuid, statement=statement.statement)
         station.pins.remove(uuid)
         keys = station.keys.remove(uuid)
         station.nodes.drop_draft(uuid)

@@ -94,6 +94,10 @@ class Selection:
             raise NotFound("There is no node to hand over.", hint="Name nodes, or see: teds-provision nodes")
         return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
 
+    def fitting(self) -> Chosen:
+        """Those of the nodes that were named which can go."""
+        return [self.keys[uuid] for uuid in sorted(set(self.order.nodes or ())) if not self._obstacle(uuid)]
+
     def _named(self, nodes: tuple[bytes, ...]) -> dict[bytes, str]:
         """The nodes that were named; raises PolicyRefused where one cannot go."""
         why = {uuid: self._obstacle(uuid) for uuid in sorted(set(nodes))}
@@ -236,16 +240,18 @@ class Exported:
     fresh: bool
 
 
-def plan_export(station: Station, order: ExportOrder) -> ExportPlan:
+def plan_export(station: Station, order: ExportOrder, now: datetime | None = None) -> ExportPlan:
     """:func:`plan_exports` for what fits into one bundle; raises UsageFailure for more."""
-    plans = plan_exports(station, order)
+    plans = plan_exports(station, order, now=now)
     if len(plans) > 1:
         raise UsageFailure("These are too many nodes for one bundle.", hint="Export them in several.")
     return plans[0]
 
 
 @gc_pause.put_off()
-def plan_exports(station: Station, order: ExportOrder, *, most: int = NODES_IN_A_BUNDLE) -> list[ExportPlan]:
+def plan_exports(
+    station: Station, order: ExportOrder, *, most: int = NODES_IN_A_BUNDLE, now: datetime | None = None
+) -> list[ExportPlan]:
     """Find the receivers and nodes, and the CA's signature over each receiver; changes nothing.
 
     Returns a plan for each bundle, of at most ``most`` nodes. Raises NotFound, UsageFailure (two receivers of a move),
@@ -260,7 +266,7 @@ def plan_exports(station: Station, order: ExportOrder, *, most: int = NODES_IN_A
     if order.ca is not None:
         nodes = [node for node, kept in _with_ca(station, nodes) if kept == ca]
     signatures = {record.fingerprint: _signature(station, ca, record) for record in receivers}
-    common = _Common(order, receivers, ca, signatures, datetime.now(UTC), station.fingerprint, selection.rows)
+    common = _Common(order, receivers, ca, signatures, now or datetime.now(UTC), station.fingerprint, selection.rows)
     plans = [common.plan(part, _other_holders(station, part, receivers)) for part in selection.parts(nodes, most)]
     return [replace(plans[0], skipped=tuple(skipped)), *plans[1:]]
 
@@ -332,6 +338,46 @@ def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetim
     return Exported(plan, made.sha256, made.octets, fresh=True)
 
 
+@dataclass(frozen=True)
+class Sealed:
+    """A bundle that lies in no file; :func:`record_export` has to be durable before anybody gets it."""
+
+    plan: ExportPlan
+    octets: bytes
+    sha256: str
+    signed_sha256: str
+
+
+@gc_pause.put_off()
+def seal_export(station: Station, plan: ExportPlan, now: datetime) -> Sealed:
+    """Seal a bundle in memory, for a parcel. Raises StoreFailure, VaultFailure, PolicyRefused (a node changed)."""
+    made = _sealing(station, plan, now)
+    octets = b"".join([*made.body(), made.end()])
+    return Sealed(plan, octets, made.sha256, made.signed_sha256)
+
+
+def record_export(station: Station, sealed: Sealed) -> None:
+    """Note who holds what from now on; the caller holds the transaction in which the parcel is kept."""
+    _record(station, sealed.plan, (sealed.sha256, sealed.signed_sha256))
+
+
+def plan_copies(
+    station: Station, receiver: TrustRecord, uuids: Sequence[bytes], now: datetime, *, most: int = NODES_IN_A_BUNDLE
+) -> list[ExportPlan]:
+    """Plans of copies for one station: those of the nodes that may go and keep the owner's CA.
+
+    What an export leaves out is left out without a word. Raises PolicyRefused where the receiver is not certified.
+    """
+    order = ExportOrder((receiver.fingerprint,), tuple(uuids), "copy", ca=fingerprint(station.ca))
+    selection = Selection(station, order, {receiver.fingerprint})
+    nodes = [node for node, kept in _with_ca(station, selection.fitting()) if kept == station.ca]
+    if not nodes:
+        return []
+    signatures = {receiver.fingerprint: _signature(station, station.ca, receiver)}
+    common = _Common(order, (receiver,), station.ca, signatures, now, station.fingerprint, selection.rows)
+    return [common.plan(part, ()) for part in selection.parts(nodes, most)]
+
+
 def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[Path]) -> list[Exported]:
     """Seal each plan into its file. Of several, all keys of a move rest before the first file exists.
 
@@ -389,8 +435,11 @@ def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[Leaving, bytes]]
 
 
 def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
-    """SIG104 over the receiver: known, or made now where the CA key is here."""
+    """SIG104 over the receiver: known, in the plant's roster, or made now where the CA key is here."""
     known = station.identity.certificate(ca, receiver.point)
+    if known is None and ca == station.ca and (roster := station.plant.roster) is not None:
+        member = roster.member(receiver.fingerprint)
+        known = member.certificate if member is not None else None
     if known is None and ca == station.ca:
         try:
             known = station.identity.certify(receiver.point)
@@ -488,6 +537,11 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
     for record in plan.receivers:
         station.identity.keep_certificate(plan.ca, record.point, plan.signatures[record.fingerprint])
     _record_holders(station, plan, peers)
+    if plan.earlier is None and station.plant.joined is not None:
+        for node in plan.nodes:
+            for peer in peers:
+                told = {"epoch": node.epoch, "key_id": node.key_id, "peer": peer, "mode": plan.mode, "bundle": plan.id}
+                station.plant.tell("gave", node.uuid, **told)
     if digests:
         detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex)}
         station.audit("export", None, "again" if files else "done", file=digests[0], **detail)

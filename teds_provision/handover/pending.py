@@ -71,7 +71,9 @@ def content_digest(
     No time and no id: the same command gives the same digest again. Key ids are public, keys are not in it. ``nodes``
     ascend by UUID. The digest is over JSON, which is never there as a whole.
     """
-    digest = hashlib.sha256(_compact([sender, sorted(to), mode, ca.hex()])[:-1] + b",[")
+    digest = hashlib.sha256(
+        json.dumps([sender, sorted(to), mode, ca.hex()], separators=(",", ":")).encode()[:-1] + b",["
+    )
     comma = ""
     for page in pages(nodes):
         # as JSON, by hand: hex digits and a number need no quoting, and there may be ten thousand
@@ -80,10 +82,6 @@ def content_digest(
         comma = ","
     digest.update(b"]]")
     return digest.hexdigest()
-
-
-def _compact(value: object) -> bytes:
-    return json.dumps(value, separators=(",", ":")).encode()
 
 
 def digest_of(bundle: Bundle) -> str:
@@ -140,6 +138,7 @@ def undo(station: Station, row: Handover) -> Undone:
     with station.transaction():
         for uuid in uuids:
             _lift(station, uuid, row)
+            station.plant.tell("undone", uuid, bundle=row.id, peer=row.peers[0], why="taken back")
         station.handovers.put(replace(row, state=UNDONE))
         station.audit("handover", None, "undone", handover=row.id, nodes=[uuid.hex() for uuid in uuids])
     return Undone(row, uuids, fresh=True)
@@ -199,6 +198,7 @@ def _settle(station: Station, row: Handover, receipt: Receipt) -> None:
             _lift(station, refused.uuid, row)
         else:
             station.keys.remove_holder(refused.uuid, receipt.sender)
+        station.plant.tell("undone", refused.uuid, bundle=row.id, peer=receipt.sender, why="refused")
 
 
 def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -> None:

@@ -256,9 +256,20 @@ def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candi
     digits = fingerprint(point)
     if point == station.point or (role == "ca" and point == station.ca):
         raise PolicyRefused(f"{path} holds this station's own key ({digits[:16]}); it needs no trust.")
-    _check_name(name)
+    if not name.strip() or name != name.strip() or not name.isprintable() or len(name) > 100:
+        raise UsageFailure(f"{name!r} is no name for a key.", hint="Give printable text of at most 100 characters.")
+    if role == "station":
+        _refuse_in_roster(station, digits)
     record = TrustRecord(name, role, point, digits)
     return Candidate(record, path, certificate, _is_listed(station, record))
+
+
+def _refuse_in_roster(station: Station, fingerprint: str) -> None:
+    if station.policy.in_roster(fingerprint):
+        raise PolicyRefused(
+            f"The roster of the plant decides about the key {fingerprint[:16]}, not this station.",
+            hint="Where the CA key is: teds-provision registry add, or remove",
+        )
 
 
 def _is_listed(station: Station, wanted: TrustRecord) -> bool:
@@ -402,7 +413,9 @@ class Removal:
 
 
 def plan_removal(station: Station, record: TrustRecord) -> Removal:
-    """Find what hangs on the trust in a key; changes nothing."""
+    """Find what hangs on the trust in a key; changes nothing. Raises PolicyRefused for one that the roster names."""
+    if record.role == "station":
+        _refuse_in_roster(station, record.fingerprint)
     cas = _cas_of(station, record)
     under = sum(ca in cas for ca in station.keys.cas_of_nodes().values())
     if record.role == "ca":
@@ -459,11 +472,6 @@ def _read(path: Path) -> tuple[bytes, Certificate | None]:
         return from_pem(octets), None
     except BadData as error:
         raise BadData(f"{path}: {error.message}", hint="Give the public key (PEM) that init shows.") from error
-
-
-def _check_name(name: str) -> None:
-    if not name.strip() or name != name.strip() or not name.isprintable() or len(name) > 100:
-        raise UsageFailure(f"{name!r} is no name for a key.", hint="Give printable text of at most 100 characters.")
 
 
 def _kind(path: Path) -> tuple[str, bool] | None:

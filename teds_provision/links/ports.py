@@ -71,18 +71,18 @@ class Capabilities:
     ``tapped``: somebody holds the node to this reader, so that a key that comes this way may be pinned and agreed.
     ``wired``: who answers hangs on this very wire, so that a new node's first key may be taken for its own.
     ``streams``: data messages of measuring nodes can be heard. ``many``: several nodes are there at once, and may be
-    talked to from one thread each, ``at_once`` of them at a time.
+    talked to from one thread each, ``max_parallel`` of them at a time.
     """
 
     tapped: bool = False
     wired: bool = False
     streams: bool = False
     many: bool = False
-    at_once: int = 1
+    max_parallel: int = 1
 
 
 NFC = Capabilities(tapped=True)
-CAN = Capabilities(wired=True, streams=True, many=True, at_once=24)
+CAN = Capabilities(wired=True, streams=True, many=True, max_parallel=24)
 """While most of 24 nodes calculate, a bus is never idle at 500 kbit/s."""
 BLE = Capabilities(streams=True, many=True)
 """One node after the other: an adapter holds few connections (notes in docs/hardware.md)."""
@@ -185,13 +185,20 @@ class Spaced(Protocol):
     gap: int
 
 
+@runtime_checkable
+class Abandons(Protocol):
+    """A link whose exchange is given up (NodeSilent) as soon as ``hopeless()`` says that no reply will come."""
+
+    hopeless: Callable[[], bool]
+
+
 @dataclass(frozen=True)
 class Contact:
     """A node that was found: its unauthenticated Identify, its link, and where it was found.
 
     ``address`` is its CAN address, ``connection`` the number of its BLE connection. ``charging`` and ``ble`` are what
     its initial NFC message says beside; hints, as unauthenticated as the rest. ``trace`` is where the messages with it
-    are written down.
+    are written down, ``bus`` the place of the bus or the air (``can:socketcan:can0``), "" at a reader.
     """
 
     identity: Identity
@@ -202,6 +209,7 @@ class Contact:
     ble: BleAddress | None = None
     trace: Trace | None = None
     connection: int | None = None
+    bus: str = ""
 
     @property
     def line(self) -> int:
@@ -280,6 +288,7 @@ class LinkSettings:
 
     ``timeout`` in seconds; ``listen`` is how long a command that collects nodes listens at least: 3 s, or ``--timeout``
     where that was given. ``nfc`` None or ``auto``: the one reader that is there. ``trace`` is an open one (--trace).
+    ``via_chosen``: somebody said which kind of link is meant, so that no other is looked at.
     """
 
     via: str = "nfc"
@@ -289,6 +298,25 @@ class LinkSettings:
     timeout: float = 60.0
     trace: Trace | None = None
     listen: float = LISTEN_SECONDS
+    via_chosen: bool = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether nobody said over which link, and no reader is named: any that the node may be on will do."""
+        return self.via == "nfc" and self.nfc is None and not self.via_chosen
+
+    def at(self, place: str) -> LinkSettings:
+        """The same patience and trace at another place, ``LINK:WHERE``."""
+        via, _, where = place.partition(":")
+        there = replace(self, via=via, via_chosen=True)
+        if via == "can":
+            return replace(there, can=where or None)
+        return replace(there, ble=where or None) if via == "ble" else replace(there, nfc=where or None)
+
+    @property
+    def buses(self) -> tuple[str, ...]:
+        """The places of every bus and the air that are named, whatever ``via`` says."""
+        return tuple(place for via in ("can", "ble") if getattr(self, via) for place in replace(self, via=via).places)
 
     @property
     def places(self) -> tuple[str, ...]:

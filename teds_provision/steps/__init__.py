@@ -6,6 +6,7 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.steps import (
+        adopting,
         agree,
         batch,
         batch_sheet,

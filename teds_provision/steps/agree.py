@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from teds_provision.errors import BadData, Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
 from teds_provision.protocol.agreement import AgreedKey, OtherTranscript, StationAgreement, fit_to_agree
 from teds_provision.protocol.datasheet import signature_good, station_signature_good
+from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, reset_message, verify
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
@@ -70,6 +71,7 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
     Epoch and sequence of a bundle are hearsay until here: the node's own words in this session replace them.
     """
     uuid, record = node.uuid, held.record
+    station.nodes.met_at(uuid, node.contact.bus)
     told = read_identity(node) if record.state == "pending" and record.source == "import" else None
     if _is_taken_up(station, record):
         return held
@@ -96,9 +98,13 @@ def _is_taken_up(station: Station, record: KeyRecord) -> bool:
 def _activate(station: Station, record: KeyRecord) -> None:
     uuid = record.uuid
     station.keys.promote(uuid, record.key_id)
-    # a pending key out of a backup may have been used and shared since (model/README.md, OLD_PENDING)
-    if record.state == "pending" and record.source == "agreement" and not station.keys.restored(uuid):
-        station.keys.rotated(uuid)
+    if record.state == "pending" and record.source == "agreement":
+        # a pending key out of a backup may have been used and shared since (model/README.md, OLD_PENDING)
+        if not station.keys.restored(uuid):
+            station.keys.rotated(uuid)
+        pinned = station.pins.pinned(uuid)
+        if is_whole(pinned):
+            station.plant.tell("agreed", uuid, fingerprint=pinned, epoch=record.epoch, key_id=record.key_id)
     station.audit("key", uuid, "active", key_id=record.key_id, epoch=record.epoch)
 
 
@@ -272,6 +278,9 @@ def _new_key(
 ) -> Agreed:
     """Agree on a key; where none is ``demanded``, one that a new node has stored after all is as good."""
     new = who.state == NodeState.FACTORY
+    if new:
+        station.plant.require_undisputed(node.uuid)
+        station.plant.require_role("line", "keys no new node", "Key it at a station that has, and take it over")
     pinned = _pin_for(entry, node, who)
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
@@ -388,6 +397,8 @@ def _agree_anew(
         )
     with station.durable("agree", more_follows=True):
         station.keys.promote(uuid, key_id)
+        station.plant.tell("agreed", uuid, fingerprint=fingerprint(agreed.node), epoch=agreed.epoch, key_id=key_id)
+        station.nodes.met_at(uuid, node.contact.bus)
         station.nodes.remember(
             uuid,
             epoch=agreed.epoch,
@@ -439,6 +450,7 @@ def reset_node(station: Station, node: Conversation, who: Identified) -> ResetRe
         station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), retired=None)
         station.nodes.forget_reading(who.uuid)
         told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
+        station.plant.tell("reset", who.uuid, epoch=receipt.epoch, point=who.point.hex(), **told)
         station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)
     return receipt
 

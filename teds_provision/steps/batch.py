@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import getpass
+import os
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+from teds_provision import __version__
 from teds_provision.errors import NotWhitelisted, OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
+from teds_provision.steps.adopting import Adopt, brought_by, nobody_adopts
 from teds_provision.steps.agree import TakeOver
 from teds_provision.steps.batch_sheet import (
+    About,
     Board,
     Progress,
     Row,
@@ -39,13 +45,16 @@ from teds_provision.steps.build import (
     propose,
 )
 from teds_provision.steps.identify import Identified, examine
-from teds_provision.steps.provision import Accept, Provisioned, provision
+from teds_provision.steps.provision import Accept, Line, Provisioned, inspect, provision
 from teds_provision.steps.read import survey
 from teds_provision.steps.reading import verdict_of
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.meeting import Patience, meet, onward, refuse_twins, watch_nodes, without_twins
-from teds_provision.talk.progress import Reporter
+from teds_provision.talk.progress import OfNode, Reporter
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import default_folders, load_profile
 
 _TOKEN_WORKERS: Final = 1
 _SHOWN: Final = 5
@@ -57,6 +66,7 @@ class Request:
     """What ``provision`` is asked for: one node (None: the one that is there), or many.
 
     ``watch``: tap after tap. ``everyone``: every node of the bus that is not finished. ``sheet``: what each board gets.
+    ``operator``: who worked, as the report shall say; "" for the user of this account.
     """
 
     node: str | None = None
@@ -65,6 +75,7 @@ class Request:
     everyone: bool = False
     sheet: Path | None = None
     report: Path | None = None
+    operator: str = ""
 
     @property
     def several(self) -> bool:
@@ -72,12 +83,17 @@ class Request:
         return self.watch or self.everyone or self.sheet is not None
 
 
+_AFTER: Final = ("build", "sign", "write", "verify", "check")
+"""Steps behind the key agreement."""
+
+
 @dataclass(frozen=True)
 class Questions:
     """Who is asked: before an unknown node is whitelisted, and before what nobody named is written (None: nobody).
 
     ``low``: before a node with a low battery is written. ``take_over``: before a node with another station's key gets
-    one of ours (None: nobody). ``retype``: before a board becomes one of another type.
+    one of ours (None: nobody). ``retype``: before a board becomes one of another type. ``adopt``: before a
+    datasheet that it brought is signed.
     """
 
     accept: Accept
@@ -85,6 +101,7 @@ class Questions:
     low: Low = wait_for_charge
     take_over: TakeOver | None = None
     retype: Retype | None = None
+    adopt: Adopt = nobody_adopts
 
 
 @dataclass(frozen=True)
@@ -104,16 +121,28 @@ class Boards:
     Raises UsageFailure, NotFound, BadData, PolicyRefused before any node is waited for.
     """
 
-    def __init__(self, station: Station, links: LinkSettings, request: Request, reporter: Reporter) -> None:
-        self._station, self._links, self._request, self._reporter = station, links, request, reporter
+    def __init__(
+        self,
+        station: Station,
+        links: LinkSettings,
+        request: Request,
+        reporter: Reporter,
+        *,
+        line: Line | None = None,
+    ) -> None:
+        self._station, self._request, self._reporter = station, request, reporter
+        self._links = replace(links, via_chosen=True)  # a new board is tapped, unless a bus is named
+        self.line = line
         _check(request, links)
         check_report(request.report)
         self.node = station.nodes.resolve(request.node) if request.node is not None else None
-        order = for_several(request.order) if request.several else request.order
+        wanted = line.base if line is not None else request.order
+        order = for_several(wanted) if request.several else wanted
         self.prepared = prepare(station, order, self.node)
         if self.prepared.order.name is not None and self.node is not None:
             named_for(station, self.node, self.prepared)
         self.progress = _progress(station, request, order)
+        self.expected = 0  # how many boards of a bus are worked on, once they were found
         self.stop = Patience(links.timeout if self.progress is not None and not request.watch else None)
         self._turn = threading.Lock()
         self._rows: dict[bytes, Row] = {}
@@ -147,24 +176,41 @@ class Boards:
             steps += ["agree"] if who.state == NodeState.FACTORY or not self._station.keys.held(who.uuid) else []
             found = survey(node, initial=who.security_teds)
             named = named_for(self._station, who.uuid, self._for(who))
+            if named.order.adopt and found.identity.state != NodeState.PROVISIONED:
+                brought = brought_by(self._station, found.image, name=named.order.name)
+                return Plan(who.uuid, who.state, (*steps, *_AFTER), (), (*brought.errors, *brought.warnings))
             proposal = propose(self._station, named, found, record=False)
             changes = tuple(change.text for change in proposal.changes)
             other = () if named.order.retype else differences(found.image.blocks, proposal.image)
-            steps += ["build", "sign", "write", "verify", "check"]
+            steps += _AFTER
             return Plan(who.uuid, who.state, tuple(steps), changes, merged((*proposal.warnings, *other)))
 
     # -- many ------------------------------------------------------------------------------------------------------
 
     def __len__(self) -> int:
-        """How many boards the sheet has, 0 without one."""
-        return len(self.progress.rows) if self.progress is not None else 0
+        """How many boards the sheet has, or the job; 0 without one."""
+        if self.progress is not None:
+            return len(self.progress.rows)
+        return self.line.total if self.line is not None else 0
 
     @property
     def passed(self) -> int:
-        """How many boards have passed: of the sheet over all runs, else in this one."""
+        """How many boards have passed: of the sheet or job over all runs, else in this one."""
         if self.progress is not None:
             return len(self.progress.rows) - len(self.progress.open)
+        if self.line is not None and self.line.total:
+            return self.line.passed
         return sum(board.result == "passed" for board in self._boards)
+
+    @property
+    def ended(self) -> int:
+        """How many boards of this run have ended, well or not."""
+        return len(self._boards)
+
+    @property
+    def of_a_job(self) -> bool:
+        """Whether a job counts the boards, and no sheet."""
+        return self.line is not None and self.line.total > 0
 
     @property
     def next_row(self) -> Row | None:
@@ -191,7 +237,12 @@ class Boards:
                 yield board
         finally:
             if self._request.report is not None and self.progress is not None:
-                write_report(self._request.report, self.progress)
+                write_report(self._request.report, self.progress, self._about())
+
+    def _about(self) -> About:
+        operator = self._request.operator or os.environ.get("SUDO_USER") or getpass.getuser()
+        station = self._station
+        return About(station.name, station.fingerprint, operator, f"teds-provision {__version__}")
 
     def totals(self) -> Totals:
         """What it came to: the whole sheet over all runs, or the nodes of this run."""
@@ -242,8 +293,9 @@ class Boards:
     def _side_by_side(self, port: Port, contacts: list[Contact], questions: Questions) -> Iterator[Board]:
         """Each of these nodes in a thread, as many at a time as the bus and the token bear, until ``stop`` is set."""
         token = self._station.identity.keystore.startswith("pkcs11:")
-        workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.at_once, len(contacts)))
+        workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.max_parallel, len(contacts)))
         pool = ThreadPoolExecutor(workers, thread_name_prefix="node")
+        self.expected = len(contacts)
         running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
         try:
             for done in as_completed(running):
@@ -273,20 +325,30 @@ class Boards:
         listed = self._station.pins.entry(uuid) is not None
         if self.progress is not None and any(row.uuid in (uuid, None) for row in self.progress.open):
             return True
+        if self.line is not None and self.line.is_listed(uuid):
+            listed = True
+        if self.line is not None and self.line.only_verify:
+            return listed
         if not listed or self.progress is not None:
             self._station.notice(f"Left alone: node {uuid.hex()} is not {'in the sheet' if listed else 'whitelisted'}.")
             return False
         judged = verdict_of(self._station, uuid)
         verified = judged is not None and judged.verified.verdict == "authentic"
-        return not (verified and contact.identity.state == NodeState.PROVISIONED)
+        if not verified or contact.identity.state != NodeState.PROVISIONED:
+            return True
+        image = self._station.nodes.datasheet(uuid)
+        return image is not None and self._lacks_calibration(uuid, image) is not None
 
     def _board(self, contact: Contact, place: str, questions: Questions) -> Board:
         began, uuid = time.monotonic(), contact.identity.uuid
         done: Provisioned | None = None
         error: TedsProvisionError | None = None
+        known = self._station.nodes.get(uuid)
+        told = OfNode(self._reporter, known.name if known is not None and known.name else uuid.hex())
         try:
-            with Conversation(contact, notice=self._reporter.notice) as node:
-                done = self._provision(node, questions)
+            with Conversation(contact, notice=told.notice) as node:
+                done = self._provision(node, questions, told)
+            error = self._lacks_calibration(uuid, done.image)
         except TedsProvisionError as failure:
             error = failure
         except SessionLost as lost:
@@ -296,23 +358,44 @@ class Boards:
 
     # -- both ------------------------------------------------------------------------------------------------------
 
-    def _provision(self, node: Conversation, questions: Questions) -> Provisioned:
+    def _lacks_calibration(self, uuid: bytes, image: Image) -> PolicyRefused | None:
+        """Why this board is not finished although its datasheet is authentic: its type requires a calibration."""
+        record = self._station.nodes.get(uuid)
+        profile = self.prepared.profile
+        if profile is None and record is not None and record.profile:
+            with suppress(TedsProvisionError):
+                profile = load_profile(record.profile, default_folders(self._station.home))
+        required = [one.number for one in profile.channels if one.calibration.required] if profile is not None else []
+        missing = [str(number) for number in required if (number, AccessCode.CALIBRATION) not in image.blocks]
+        if profile is None or not missing:
+            return None
+        return PolicyRefused(
+            f"Board {uuid.hex()} has no calibration of channel {', '.join(missing)}, which its type requires.",
+            hint=f"Calibrate it: teds-provision provision {uuid.hex()} --calibration FILE; for many: --batch SHEET.",
+        )
+
+    def _provision(self, node: Conversation, questions: Questions, reporter: Reporter | None = None) -> Provisioned:
         def accept(who: Identified) -> None:
             row = self._rows.get(who.uuid)
-            if row is None or row.by_order:  # a sheet that names the board is a person's word
+            listed = self.line is not None and self.line.lists(who)
+            if not listed and (row is None or row.by_order):  # a sheet or job that names the board is a person's word
                 questions.accept(who)
 
+        if self.line is not None and self.line.only_verify:
+            return inspect(self._station, node, self.line, self._reporter)
         return provision(
             self._station,
             node,
             self._for,
             accept=accept,
-            reporter=self._reporter,
+            reporter=reporter or self._reporter,
             confirm=questions.confirm or nobody,
             onward=onward(self._links, self._reporter.notice),
             low=questions.low,
             take_over=questions.take_over,
             retype=questions.retype,
+            line=self.line,
+            adopt=questions.adopt,
         )
 
     def _for(self, who: Identified) -> Prepared:
@@ -320,6 +403,8 @@ class Boards:
 
         Whoever is refused here has not taken a row.
         """
+        if self.line is not None:
+            return self.line.order(who)
         if self.progress is None:
             return self.prepared
         with self._turn:

@@ -34,7 +34,7 @@ from teds_provision.errors import (
     TedsProvisionError,
     UsageFailure,
 )
-from teds_provision.files import SHARED, private_folder, read_limited, write_whole
+from teds_provision.files import SHARED, open_lock, private_folder, read_limited, write_whole
 from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, Prepared, prepare
@@ -396,7 +396,7 @@ class Progress:
         """What is written is made from what lies there: two runs of one sheet (two desks) lose each other no board."""
         private_folder(self._path.parent)
         place = self._path.with_suffix(".lock")
-        descriptor = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        descriptor = open_lock(place)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)  # held for one small file
             yield
@@ -533,8 +533,24 @@ _HEAD: Final = ("row", "uuid", "name", "profile", "result", "tries", "first_pass
 _RESULT: Final = _HEAD.index("result")
 _STYLE: Final = (
     "body{font:16px sans-serif;margin:2em}table{border-collapse:collapse}td,th{border:1px solid #999;padding:.3em .6em;"
-    "text-align:left;white-space:nowrap}td:last-child{white-space:normal}.passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
+    "text-align:left;white-space:nowrap}td:last-child{white-space:normal}"
+    ".passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
+    # on paper: A4 lying, the head of the table on each sheet, no board torn in two, colours as on the screen
+    "@page{size:A4 landscape;margin:12mm}@media print{body{font-size:8.5pt;margin:0}thead{display:table-header-group}"
+    "tr{break-inside:avoid}td,th{padding:.15em .35em;white-space:normal;overflow-wrap:anywhere}"
+    "td:nth-child(2){white-space:nowrap}"
+    "*{print-color-adjust:exact;-webkit-print-color-adjust:exact}}"
 )
+
+
+@dataclass(frozen=True)
+class About:
+    """Who made a report: the station with its key (64 hex digits), the operator, and with which software."""
+
+    station: str
+    fingerprint: str
+    operator: str
+    software: str
 
 
 def check_report(path: Path | None) -> None:
@@ -547,10 +563,10 @@ def check_report(path: Path | None) -> None:
         raise NotFound(f"There is no folder {path.parent} for the report.", hint="Make it, or name another place.")
 
 
-def write_report(path: Path, progress: Progress) -> None:
-    """Write the report whole; raises what ``write_whole`` raises."""
-    rows, totals = _rows(progress), progress.totals()
-    text = _csv(rows, totals) if path.suffix.lower() == ".csv" else _html(progress.sheet.path.name, rows, totals)
+def write_report(path: Path, progress: Progress, about: About) -> None:
+    """Write the report whole; raises what ``write_whole`` raises. CSV is for programs: rows and totals alone."""
+    rows, totals, name = _rows(progress), progress.totals(), progress.sheet.path.name
+    text = _csv(rows, totals) if path.suffix.lower() == ".csv" else _html(name, rows, totals, about)
     write_whole(path, text.encode(), mode=SHARED)
 
 
@@ -591,7 +607,7 @@ def _tame(cell: str) -> str:
     return f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell
 
 
-def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals) -> str:
+def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals, about: About) -> str:
     head = "".join(f"<th>{html.escape(cell.replace('_', ' '))}</th>" for cell in _HEAD)
     body = "".join(
         f'<tr class="{html.escape(row[_RESULT])}">'
@@ -602,10 +618,14 @@ def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals) -> str:
     sums = "".join(
         f"<tr><th>{html.escape(what)}</th><td>{html.escape(value)}</td></tr>\n" for what, value in _sums(totals)
     )
+    made = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+    who = [("station", about.station), ("key", about.fingerprint), ("operator", about.operator)]
+    who += [("software", about.software), ("made", made)]
+    sums = "".join(f"<tr><th>{what}</th><td>{html.escape(value)}</td></tr>\n" for what, value in who) + sums
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)}</title>'
         f"<style>{_STYLE}</style></head><body><h1>{html.escape(name)}</h1>\n<table>{sums}</table><p></p>"
-        f"<table><tr>{head}</tr>\n{body}</table></body></html>\n"
+        f"<table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></body></html>\n"
     )
 
 

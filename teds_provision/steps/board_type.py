@@ -222,13 +222,14 @@ class Borne:
         return any(self.channels.values())
 
 
-def bears(node: Conversation, image: Image) -> Borne:
+def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = None) -> Borne:
     """Ask a node, in its session, whether each channel bears the datasheet ``image``, and its sensors for one reading.
 
-    Nothing stays claimed. Sensors that another session claims are left alone. Raises WrongBoard with the channel that
+    ``shown`` are the units in which people see the values of channels, where the profile names one. Nothing stays
+    claimed. Sensors that another session claims are left alone. Raises WrongBoard with the channel that
     does not bear it, LinkFailure.
     """
-    sheet, digest = Sheet.of(image), hashlib.sha256(image.security or b"").digest()
+    sheet, digest = Sheet.of(image).shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
     found = {one.number: _bears(node, one, digest) for one in sheet.channels}
     sensors = [one for one in sheet.channels if not one.actuator and found[one.number]]
     if not sensors:
@@ -275,7 +276,7 @@ def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: byte
                 raws[number] = one.reader.raw(reply.data[at : at + one.octets])
                 at += one.octets
             for number in part:
-                yield _told(readers[number], raws, valid=reply.valid)
+                yield _to_json(readers[number], raws, valid=reply.valid)
     finally:
         node.send(idle(0), "to let go")
 
@@ -292,7 +293,7 @@ def _parts(readers: dict[int, ChannelInterpreter]) -> list[list[int]]:
     return [part for part in parts if part]
 
 
-def _told(one: ChannelInterpreter, raws: dict[int, Any], *, valid: bool) -> dict[str, Any]:
+def _to_json(one: ChannelInterpreter, raws: dict[int, Any], *, valid: bool) -> dict[str, Any]:
     channel, value = one.channel, math.nan
     if not one.problem and all(other in raws for other in one.others):
         found = one.values(raws[channel.number], {other: raws[other] for other in one.others})
@@ -304,4 +305,5 @@ def _told(one: ChannelInterpreter, raws: dict[int, Any], *, valid: bool) -> dict
         "value": value if valid else None,
         "unit": channel.si_unit,
         "valid": valid,
+        "shown": {"value": channel.shown.from_si(value) if valid else None, "unit": channel.shown.text},
     }

@@ -20,6 +20,7 @@ from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
+from teds_provision.steps.adopting import brought_by
 from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse
 from teds_provision.steps.read import Survey
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
@@ -67,6 +68,7 @@ class BuildOrder:
     drop_calibration: bool = False
     accept_calibration: str | None = None
     retype: bool = False  # whether the board may become one of another type than it says it is
+    adopt: bool = False  # whether the datasheet that the board brought is signed, by a person's yes
 
     @property
     def names_nothing(self) -> bool:
@@ -130,6 +132,12 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
     Changes nothing. Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (the guard).
     """
     check_name(order.name)
+    if order.adopt:
+        if order.profile is not None or order.calibration is not None or order.drop_calibration:
+            raise UsageFailure(
+                "--adopt signs the datasheet that the board brought.", hint="Leave --profile and --calibration out."
+            )
+        return Prepared(order)
     wanted = _whole(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
     if order.calibration is not None and not order.calibration.is_file():
         raise NotFound(f"There is no calibration file {order.calibration}.")
@@ -264,7 +272,11 @@ def _kept_calibrations(
         return {}, ()
     require_fit(kept, has, Image(_NOBODY, dict(_made(profile, _NOBODY, {}, None, 2007).blocks)), profile)
     numbers = ", ".join(map(str, kept))
-    return kept, (f"The calibration that was given before is kept (channel {numbers}).",)
+    return kept, (
+        f"Channel {numbers} keeps its calibration."
+        if len(kept) == 1
+        else f"Channels {numbers} keep their calibrations.",
+    )
 
 
 def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile: Profile | None = None) -> None:
@@ -560,6 +572,8 @@ def _proposal(station: Station, prepared: Prepared, present: Survey) -> Proposal
     keep = {block: has.blocks[block] for block in present.read_only}
     if not has.unsigned_blocks().keys() - keep.keys():
         return _composed(station, prepared, present, keep, named=True)
+    if order.adopt:
+        return _as_it_is(station, present, keep) if order.name is None else _only_named(station, prepared, present)
     if not _intact(station, present):
         return _mended(station, prepared, present) or _composed(
             station, prepared, present, keep, named=order.profile is not None
@@ -626,6 +640,12 @@ def _as_it_is(station: Station, present: Survey, keep: Mapping[BlockId, bytes]) 
     image = Image(uuid, {**keep, **pending.unsigned_blocks()})
     profile = draft.profile if draft is not None else None
     return Proposal(image, (), named=False, profile=profile, name=own_name(station, image, profile))
+
+
+def _only_named(station: Station, prepared: Prepared, present: Survey) -> Proposal:
+    """What the node has under another name, whatever its type."""
+    brought = brought_by(station, present.image, name=prepared.order.name)
+    return Proposal(brought.image, (), True, name=brought.name or None)
 
 
 def _only_what_is_named(

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
@@ -193,11 +193,11 @@ def _side_by_side(
         except TedsProvisionError as error:
             return error
 
-    at_once = min(len(nodes), *(node.contact.link.capabilities.at_once for node in nodes))
-    if at_once < 2:
+    max_parallel = min(len(nodes), *(node.contact.link.capabilities.max_parallel for node in nodes))
+    if max_parallel < 2:
         yield from ((node, one(node)) for node in nodes)
         return
-    pool = ThreadPoolExecutor(at_once, thread_name_prefix="node")
+    pool = ThreadPoolExecutor(max_parallel, thread_name_prefix="node")
     try:
         yield from zip(nodes, pool.map(one, nodes), strict=True)
     finally:  # after a Ctrl-C nobody is waited for: the bus is closed next
@@ -265,6 +265,7 @@ def agree_at(
         return AgreeDone(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
     if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
         confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
+    links = replace(links, via_chosen=True)  # a first key is agreed on by a tap, unless a bus is named
     with at_node(station, links, uuid, reporter, unlock="always", writes="agree") as visit:
         return AgreeDone(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=confirm))
 

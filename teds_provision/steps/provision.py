@@ -6,15 +6,17 @@ finds nothing to do.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
+from teds_provision.steps.adopting import Adopt, brought_by, nobody_adopts, require_a_reason
 from teds_provision.steps.agree import Agreed, TakeOver, agree
 from teds_provision.steps.board_type import (
     Borne,
@@ -42,11 +44,11 @@ from teds_provision.steps.identify import Identified, identify
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign
 from teds_provision.steps.verify import Verified
-from teds_provision.steps.verify_node import verify_node
+from teds_provision.steps.verify_node import look_at_node, verify_node
 from teds_provision.steps.write import Low, Written, wait_for_charge, write
 from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
-from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.image import SECURITY, Image
@@ -72,6 +74,102 @@ class Provisioned:
     """One reading of each sensor at the end: channel, name, value and unit (SI), valid."""
 
 
+def inspect(station: Station, node: Conversation, line: Line, reporter: Reporter) -> Provisioned:
+    """Test one board that another station made: identify, verify, check; nothing is written, proof is left.
+
+    Raises what :func:`provision` raises; a board that is not authentic is told by its verdict.
+    """
+    steps, unit = Steps(reporter), None
+    try:
+        with station.turn(node.uuid), station.released(node.uuid, "provision"):
+            with steps.step("identify") as step:
+                who = identify(station, node)
+                step.detail = f"{who.uuid.hex()}, key {who.fingerprint[:16]}"
+            prepared = line.order(who)
+            unit = line.take(node, who, prepared, None)
+            try:
+                with steps.step("verify") as step:
+                    looked = look_at_node(station, node, who)
+                    step.detail = looked.verified.verdict
+                    told = differences(looked.image.blocks, prepared.profile) if prepared.profile is not None else ()
+                    if told:
+                        refuse(who.uuid, told)
+                with steps.step("check") as step:
+                    passed = looked.verified.verdict == "authentic" and node.sealed
+                    borne = bears(node, looked.image) if passed else Borne({})
+                    step.result = DONE if borne.asked else SKIPPED
+                done = Provisioned(who, tuple(steps.done), looked.image, looked.verified, borne.warnings, borne.samples)
+                unit.ended(node, done)
+            except (TedsProvisionError, SessionLost) as error:
+                cause = error.cause if isinstance(error, SessionLost) else error
+                unit.failed(node, who, steps.done, steps.current, cause)
+                raise
+            return done
+    except TedsProvisionError as error:
+        with suppress(StoreFailure):
+            station.audit("provision", node.uuid, error.code, step=steps.current, why=error.message)
+        raise
+
+
+# -- what a line asks of a run (plant/line.py): an order, a unit before a key is agreed on, proof at the end -----------
+
+
+class Unit(Protocol):
+    """One board of a line, from before its key is agreed on until it is done."""
+
+    prepared: Prepared
+    """What it gets, its name included."""
+
+    def sign(self, node: Conversation, keys: NodeKeys, proposal: Proposal, present: Survey) -> Signed | None:
+        """The datasheet signed elsewhere; None where this station signs."""
+
+    def ended(self, node: Conversation, done: Provisioned) -> None:
+        """Leave proof, in the session that is open."""
+
+    def failed(
+        self, node: Conversation, who: Identified, steps: Sequence[StepResult], step: str, error: TedsProvisionError
+    ) -> None:
+        """Leave proof of an attempt that ended with an error in ``step``, as far as the board still answers."""
+
+
+class Line(Protocol):
+    """What every board of a run belongs to."""
+
+    @property
+    def total(self) -> int:
+        """How many boards it is for, 0 where nobody says."""
+
+    @property
+    def passed(self) -> int:
+        """How many have passed, over all runs."""
+
+    @property
+    def base(self) -> BuildOrder:
+        """What all boards get."""
+
+    def order(self, who: Identified) -> Prepared:
+        """What this board gets; raises PolicyRefused where it gets nothing."""
+
+    @property
+    def only_verify(self) -> bool:
+        """Whether boards are tested alone, and nothing is written."""
+
+    def told(self, uuid: bytes) -> dict[str, Any]:
+        """What is told of a board beside its steps."""
+
+    def lists(self, who: Identified) -> bool:
+        """Whether the job names this very board, by UUID and key."""
+
+    def is_listed(self, uuid: bytes) -> bool:
+        """Whether the job names this UUID."""
+
+    def take(self, node: Conversation, who: Identified, prepared: Prepared, entry: WhitelistEntry | None) -> Unit:
+        """Take a unit for this board, durably, or find the one that it has; ``entry`` is a newcomer's.
+
+        Raises PolicyRefused, and then no unit was taken.
+        """
+
+
 def provision(
     station: Station,
     node: Conversation,
@@ -84,19 +182,22 @@ def provision(
     low: Low = wait_for_charge,
     take_over: TakeOver | None = None,
     retype: Retype | None = None,
+    line: Line | None = None,
+    adopt: Adopt = nobody_adopts,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
     ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
     does not name, ``low`` before a node with a low battery is written, ``take_over`` before a node with another
     station's key gets one of ours (None: that is refused), ``retype`` before a board becomes one of another type than
-    it says it is. ``onward`` takes the conversation to another
-    link once the key is agreed on. A failure stands in the audit log with the step that it happened in.
+    it says it is, ``adopt`` before a datasheet that the board brought itself is signed. ``onward`` takes the
+    conversation to another link once the key is agreed on. ``line`` gives the board a unit before its key is agreed on,
+    and has it leave proof. A failure stands in the audit log with the step that it happened in.
     """
-    run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype)
+    run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype, line, adopt)
     try:
         with station.turn(node.uuid), station.released(node.uuid, "provision"), station.run():
-            return run.run()
+            return run.proven()
     except TedsProvisionError as error:
         with suppress(StoreFailure):  # a full disk must not hide what happened
             station.audit("provision", node.uuid, error.code, step=run.steps.current, why=error.message)
@@ -116,20 +217,41 @@ class _Run:
         low: Low,
         take_over: TakeOver | None,
         retype: Retype | None,
+        line: Line | None,
+        adopt: Adopt,
     ) -> None:
         self.station, self.node, self.order = station, node, order
         self.accept, self.confirm, self.reporter = accept, confirm, reporter
         self.steps, self.onward, self.low, self.take_over = Steps(reporter), onward, low, take_over
-        self.retype, self._retyped = retype or refuse, False
+        self.retype, self._retyped, self.adopt = retype or refuse, False, adopt
+        self.line = line
+        self.unit: Unit | None = None
 
-    def run(self) -> Provisioned:
+    def proven(self) -> Provisioned:
+        """The run; what ends a board that has a unit leaves proof too, while the board may still be there."""
         who = self._identify()
+        try:
+            done = self.run(who)
+            if self.unit is not None:
+                self.unit.ended(self.node, done)
+        except (TedsProvisionError, SessionLost) as error:
+            if self.unit is not None:
+                cause = error.cause if isinstance(error, SessionLost) else error
+                self.unit.failed(self.node, who, self.steps.done, self.steps.current, cause)
+            raise
+        return done
+
+    def run(self, who: Identified) -> Provisioned:
         prepared = self._prepared(who)
-        if who.state == NodeState.FACTORY and prepared.profile is not None:  # before it becomes ours
+        # before it becomes ours, or costs a unit
+        if prepared.profile is not None and (who.state == NodeState.FACTORY or self.line is not None):
             shown = shown_by(self.node, {one.number for one in prepared.profile.channels})
             told = differences(shown, prepared.profile, prepared.calibrations or ())
             self._require_its_board(who, prepared, told)
         entry = self._whitelist(who)
+        if self.line is not None:
+            self.unit = self.line.take(self.node, who, prepared, entry)
+            prepared = self.unit.prepared
         self._agree(who, entry)
         if self.onward is not None:
             self.onward(self.node)
@@ -171,7 +293,7 @@ class _Run:
             prepared = prepare(self.station, prepared.order, who.uuid)
         known = self.station.nodes.get(who.uuid)
         unknown = prepared.profile is None and (known is None or known.profile is None)
-        if unknown and who.state != NodeState.PROVISIONED:
+        if unknown and who.state != NodeState.PROVISIONED and not prepared.order.adopt:
             raise no_profile(who.uuid)
         return named_for(self.station, who.uuid, prepared, keep=True)
 
@@ -197,7 +319,8 @@ class _Run:
             if prepared.profile is not None:  # before a calibration is held against a channel that it is not of
                 told = differences(present.image.blocks, prepared.profile, prepared.calibrations or ())
                 self._require_its_board(who, prepared, told)
-            proposal = propose(self.station, prepared, present)
+            brings = prepared.order.adopt and present.identity.state != NodeState.PROVISIONED
+            proposal = self._adopted(prepared, present) if brings else propose(self.station, prepared, present)
             self._require_its_board(who, prepared, differences(present.image.blocks, proposal.image))
             proposal.require_a_yes(self.confirm)
             if not proposal.changes:
@@ -207,9 +330,25 @@ class _Run:
             step.detail = f"{kind}{len(proposal.image.blocks)} TEDS{fits}"
         return proposal
 
+    def _adopted(self, prepared: Prepared, present: Survey) -> Proposal:
+        """What the board brought, judged and asked about; nothing of it changes but its name, where one is given."""
+        brought = brought_by(self.station, present.image, name=prepared.order.name)
+        reason = prepared.order.accept_calibration
+        if brought.errors and reason is None:
+            require_a_reason(self.station, brought, None)
+        self.adopt(brought)
+        require_a_reason(self.station, brought, reason)
+        self.station.audit("adopt", brought.image.uuid, "accepted", teds=brought.image.digest(), name=brought.name)
+        return Proposal(brought.image, (), True, brought.warnings, name=brought.name or None)
+
     def _sign(self, who: Identified, proposal: Proposal, present: Survey) -> Signed:
         with self.steps.step("sign") as step:
             keys = NodeKeys(who.uuid, who.point, who.key_signature)
+            elsewhere = None if self.unit is None else self.unit.sign(self.node, keys, proposal, present)
+            if elsewhere is not None:
+                step.result = NOTHING if elsewhere.reused else DONE
+                step.detail = f"sequence {elsewhere.sequence}, by the office"
+                return elsewhere
             earlier = _signed_draft(self.station.nodes.draft(who.uuid))
             # a node whose TEDS are not what it was signed for takes them only under a newer sequence
             intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()
@@ -250,7 +389,7 @@ class _Run:
             if verified.verdict != "authentic":
                 step.result = SKIPPED
                 return Borne({})
-            borne = bears(self.node, written.on_node)
+            borne = bears(self.node, written.on_node, shown_units(self.station, self.node.uuid))
             step.result = DONE if borne.asked else SKIPPED
             good = sum(bool(one) for one in borne.channels.values())
             step.detail = f"{good} of {len(borne.channels)} channels bear it" if borne.asked else "it does not measure"

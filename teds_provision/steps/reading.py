@@ -160,7 +160,7 @@ def _judged_or_not(station: Station, row: Reading, *, keyed: bool) -> Judged:
 
 def _judged(station: Judging, row: Reading, *, keyed: bool) -> Judged:
     signers = Signers(row.node_key, row.node_key_signature, row.station_key, row.station_key_signature)
-    checks = judge(station, row.uuid, _read(row.checks), signers)
+    checks = judge(station, row.uuid, _read(row.checks), signers, digests_of(row).get(SECURITY))
     if row.station_key is None and all(check.result != "failed" for check in checks):  # a row of no reading of ours
         checks.append(Check("signed", "failed", "nobody is named who signed it"))
     if not any(check.name == "session" for check in checks):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -114,6 +115,7 @@ def sign(
             number = _sequence_if_the_same(station, keys, image, octets, epoch)
             if number is not None and (octets == on_node or number > node_sequence):
                 return Signed(image.with_block(SECURITY, octets), number, reused=True)
+    station.plant.require_role("sign", "signs no datasheet", "Have it signed by one that has: sign --by OFFICE")
     credentials = station.credentials(keys.uuid)
     with station.durable("sign"):
         known = station.nodes.get(keys.uuid)
@@ -134,6 +136,8 @@ def sign(
         station.nodes.remember(keys.uuid, sequence=number)
         if keep_draft:
             station.nodes.keep_draft(Draft(keys.uuid, made, "signed", profile))
+        digest = hashlib.sha256(made.blocks[SECURITY]).hexdigest()
+        station.plant.tell("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest)
         station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
     return Signed(made, number, reused=False)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, Protocol
@@ -12,6 +13,8 @@ from teds_provision.protocol.agreement import other_key
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.plant.signer import Signing
+from teds_provision.station.plant import SignerRules
 from teds_provision.station.station import Station
 from teds_provision.steps.sign import known_image
 from teds_provision.store import Revocation, WhitelistEntry
@@ -44,6 +47,9 @@ class PolicyAsked(Protocol):
 
     def trusted_stations(self) -> list[bytes]:
         """Station keys that count."""
+
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> Signing | None:
+        """What the plant says of who signed the datasheet of this digest; None where it has no say."""
 
 
 class Judging(Protocol):
@@ -82,6 +88,7 @@ class _Policy:
     cas: tuple[bytes, ...]
     cas_of_nodes: Mapping[bytes, bytes]
     stations: tuple[bytes, ...]
+    rules: SignerRules | None
 
     def revocation(self, uuid: bytes) -> Revocation | None:
         return self.denied.get(uuid)
@@ -92,6 +99,9 @@ class _Policy:
 
     def trusted_stations(self) -> list[bytes]:
         return list(self.stations)
+
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> Signing | None:
+        return None if self.rules is None else self.rules.signing(certifier, station_key, digest)
 
 
 @dataclass(frozen=True)
@@ -113,6 +123,7 @@ def remember(station: Station) -> Remembered:
             tuple(station.policy.trusted_cas()),
             _counting(station, station.keys.cas_of_nodes()),
             tuple(station.policy.trusted_stations()),
+            station.policy.signer_rules(),
         ),
     )
 
@@ -128,6 +139,7 @@ def remember_page(station: Station, uuids: Sequence[bytes]) -> Remembered:
             tuple(station.policy.trusted_cas()),
             _counting(station, station.keys.cas_of_page(uuids)),
             tuple(station.policy.trusted_stations()),
+            station.policy.signer_rules(),
         ),
     )
 
@@ -144,7 +156,9 @@ Scope = Literal["node", "image"]
 MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
 """Checks that fail where nothing is wrong but that nobody signed (all of) it."""
 _FRESHNESS = {"sequence", "key epoch"}
+_DIGEST_OCTETS: Final = 32  # a TEDS is longer
 _SESSION = "session"
+_PAGES = "pages"
 
 
 class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand files
@@ -180,6 +194,8 @@ class Verified:
     def verdict(self) -> Verdict:
         """One word for all checks."""
         failed = {check.name for check in self.checks if check.result == "failed"}
+        if _PAGES in failed and failed <= {_PAGES, _SESSION}:
+            return "unproven"
         if _SESSION in failed:  # what came without a session proves nothing, except that it is too old
             return "not authentic" if failed & _FRESHNESS else "unproven"
         if failed - MERELY_UNSIGNED:
@@ -211,7 +227,7 @@ def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Known:
     if image is None or octets is None or shown is None or not shown.signed:
         return Known(identity)
     signers = Signers.of(shown)
-    counts = _station(station, signers, _certifier(station, uuid, signers)).result == "passed"
+    counts = _signer(station, signers, _certifier(station, uuid, signers), octets)[0].result == "passed"
     trusted = counts and datasheet.signature_good(shown, octets, uuid)
     return Known(identity, shown.sequence, shown.key_epoch) if trusted else Known(identity)
 
@@ -256,7 +272,7 @@ def _proofs(image: Image) -> _Proofs:
 
 
 def _checks(station: Judging, image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
-    return judge(station, image.uuid, _octets(image, proofs, known), Signers.of(proofs.shown))
+    return judge(station, image.uuid, _octets(image, proofs, known), Signers.of(proofs.shown), image.security)
 
 
 class Signers(NamedTuple):
@@ -282,8 +298,13 @@ def what_octets_say(image: Image, known: Known | None) -> tuple[list[Check], Sig
     return _octets(image, proofs, known), Signers.of(proofs.shown)
 
 
-def judge(station: Judging, uuid: bytes, octets: Iterable[Check], signers: Signers) -> list[Check]:
-    """All checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust."""
+def judge(
+    station: Judging, uuid: bytes, octets: Iterable[Check], signers: Signers, security_teds: bytes | None
+) -> list[Check]:
+    """All checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust.
+
+    ``security_teds``: the TEDS itself or its SHA-256, by which the plant's stations name what they signed.
+    """
     checks = {check.name: check for check in octets}
     if signers.node_key is not None:
         if "node key" not in checks:
@@ -291,14 +312,14 @@ def judge(station: Judging, uuid: bytes, octets: Iterable[Check], signers: Signe
         checks["not revoked"] = _not_revoked(station, uuid)
     if signers.station_key is not None:
         certifier = _certifier(station, uuid, signers)
-        checks["signing station"] = _station(station, signers, certifier)
+        checks |= {check.name: check for check in _signer(station, signers, certifier, security_teds)}
         checks["station certificate"] = _certificate(station, signers, certifier)
     return sorted(checks.values(), key=lambda check: _PLACES[check.name])
 
 
 _ORDER: Final = (
     "form", "canonical form", "algorithms", "node key", "key epoch", "sequence", "not revoked", "signed",
-    "signing station", "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
+    "signing station", _PAGES, "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
     "possession", _SESSION,
 )  # fmt: skip
 _PLACES: Final = {name: place for place, name in enumerate(_ORDER)}
@@ -364,6 +385,11 @@ def require_authentic(verified: Verified) -> None:
     if verified.verdict == "authentic":
         return
     failed = {check.name: check for check in reversed(verified.checks) if check.result == "failed"}
+    if verified.verdict == "unproven" and _PAGES in failed:
+        raise Unproven(
+            f"Nothing is proven of the datasheet of node {verified.uuid.hex()}: {failed[_PAGES].why}.",
+            hint="Bring them: teds-provision registry sync",
+        )
     if verified.verdict == "unproven":
         raise unproven(verified.uuid, failed[_SESSION].why)
     told = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
@@ -447,6 +473,22 @@ def _station(station: Judging, signers: Signers, certifier: bytes | None) -> Che
         f"station {digits} is not trusted here, nor certified by a trusted CA",
         digits,
     )
+
+
+def _signer(
+    station: Judging, signers: Signers, certifier: bytes | None, security_teds: bytes | None
+) -> tuple[Check, ...]:
+    """Whether the station that signed counts; in a plant by its roster and pages, which may not be here yet."""
+    octets, key = security_teds or b"", signers.station_key or b""
+    digest = octets if len(octets) == _DIGEST_OCTETS else hashlib.sha256(octets).digest()
+    said = station.policy.signing(certifier, key, digest)
+    if said is None:
+        return (_station(station, signers, certifier),)
+    name, digits = "signing station", fingerprint(key)[:16]
+    if said.result == "unproven":
+        return (Check(name, "skipped", digits), Check(_PAGES, "failed", said.why))
+    why = f"{digits}, {said.why}" if said.why and said.result == "passed" else said.why or digits
+    return (Check(name, said.result, why),)
 
 
 def _certificate(station: Judging, signers: Signers, certifier: bytes | None) -> Check:

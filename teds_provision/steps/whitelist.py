@@ -30,6 +30,7 @@ from teds_provision.store.records import UUID_OCTETS
 MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
 MAX_ENTRIES: Final = 250_000
 FORMATS: Final = ("xml", "csv", "json")
+EUI64_PREFIX: Final = "fffe"
 FIELDS: Final = ("uuid", "fingerprint", "added", "assurance", "name")
 
 _SHOWN = 5
@@ -73,7 +74,7 @@ class _Reading:
         if self.count > MAX_ENTRIES:
             raise BadData(f"{self.file}:{line}: there are more than {MAX_ENTRIES} entries.")
         before = len(self.mistakes)
-        uuid = self._digits(line, "uuid", values.get("uuid", ""), _UUID_DIGITS)
+        uuid = self._digits(line, "uuid", uuid_of_eui64(values.get("uuid", "")), _UUID_DIGITS)
         print_text = values.get("fingerprint", "").strip()
         pin = self._fingerprint(line, print_text) if print_text else None
         name = values.get("name", "").strip() or None
@@ -105,6 +106,15 @@ class _Reading:
         if known is not None:
             entry = Listed(known.line, known.uuid, max(pins, key=len, default=None), known.name or entry.name)
         self.entries[entry.uuid] = entry
+
+
+def uuid_of_eui64(text: str) -> str:
+    """The UUID of a node whose maker gave it an EUI-64 (16 hex digits): FF FE before its octets; other text as it is.
+
+    A UUID of IEEE 1451.0-2007 that begins so would lie 291 degrees north, so none is made twice.
+    """
+    digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
+    return f"{EUI64_PREFIX}{digits}" if re.fullmatch("[0-9a-f]{16}", digits) else text
 
 
 def read_whitelist(path: Path, form: str | None = None) -> list[Listed]:
@@ -293,7 +303,7 @@ def _is_entry_text(element: _Element, text: str, root: bool) -> bool:
 def _parts(text: str) -> list[str]:
     """Several whole UUIDs in one text, or the one text as it is."""
     words = re.split(r"[\s,;]+", text.strip())
-    whole = all(len(word.lower().removeprefix("0x")) == _UUID_DIGITS for word in words)
+    whole = all(len(uuid_of_eui64(word).lower().removeprefix("0x")) == _UUID_DIGITS for word in words)
     return words if whole else [text]
 
 

@@ -7,9 +7,11 @@ fed by the bus, and nobody asks. It is a hint: it delays a write, and decides no
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from types import MappingProxyType
 from typing import Final
 
@@ -23,6 +25,7 @@ from teds_provision.steps.read import Survey, read_block, read_identity, read_im
 from teds_provision.steps.reading import is_known, keep
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.verify import known_of
+from teds_provision.store import NodeRecord
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
@@ -105,6 +108,22 @@ def write(
     return Written(octets, time.monotonic() - started, back)
 
 
+def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: int) -> None:
+    """Tell the plant which datasheet the node has now, and what it was made of."""
+    octets = image.security
+    if station.plant.joined is not None and octets is not None:
+        station.plant.tell(
+            "written",
+            image.uuid,
+            epoch=security.decode(octets).key_epoch,
+            sequence=sequence,
+            teds_sha256=hashlib.sha256(octets).hexdigest(),
+            profile=PurePath(known.profile).name if known.profile else None,  # of a file its name, not where it lies
+            profile_sha256=known.profile_digest if known.profile_digest and len(known.profile_digest) == 64 else None,
+            due=known.due,
+        )
+
+
 def _conclude(
     station: Station,
     node: Conversation,
@@ -126,7 +145,8 @@ def _conclude(
             channel, access_code = differing[0]
             station.audit("write", image.uuid, "read-back differs", block=[channel, access_code])
         else:
-            station.nodes.remember(image.uuid, **facts)
+            known = station.nodes.remember(image.uuid, **facts)
+            _tell_written(station, image, known, sequence)
             _forget_draft(station, image)
             station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
     if differing:

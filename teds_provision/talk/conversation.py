@@ -76,7 +76,7 @@ _CURE = {
 }
 
 
-HEARD = "Heard, not proven: "
+HEARD = "Not verified: "
 """What a refusal outside a session begins with: anyone on the link may have sent it."""
 
 
@@ -241,7 +241,9 @@ class Conversation:
         except TedsProvisionError as error:
             self.contact.note("in", outer.encode(), lambda: describe_answer(command, outer), sealed=True)
             raise SessionLost(error) from error
-        self._trace_opened(command, outer, inner)
+        if self.contact.trace is not None:
+            words, opened = describe_answer(command, inner), inner.encode()
+            self.contact.note("in", outer.encode(), words, sealed=True, opened=opened)
         if not inner.ok:
             raise refused(inner.reason, doing, sealed=True)
         return inner.payload
@@ -306,7 +308,11 @@ class Conversation:
         until = time.monotonic() + (self._patience_with_busy if within is None else 0.0)
         while True:
             frame = command.encode()
-            self._trace_sent(frame, command, inside)
+            if self.contact.trace is not None:
+                opened = None if inside is None else inside.encode()
+                self.contact.note(
+                    "out", frame, describe_request(inside or command), sealed=inside is not None, opened=opened
+                )
             raw = _carry(self.contact.link, frame, within)
             _log.debug("%d.%d: %d octets out, %d back", command.command_class, command.function, len(frame), len(raw))
             reply = decode_reply(raw)
@@ -318,18 +324,6 @@ class Conversation:
             time.sleep(BUSY_PAUSE)
 
     # The messages are encoded once more for the trace, so these look whether there is one.
-
-    def _trace_sent(self, frame: bytes, command: Command, inside: Command | None) -> None:
-        if self.contact.trace is not None:
-            opened = None if inside is None else inside.encode()
-            self.contact.note(
-                "out", frame, describe_request(inside or command), sealed=inside is not None, opened=opened
-            )
-
-    def _trace_opened(self, command: Command, outer: Reply, inner: Reply) -> None:
-        if self.contact.trace is not None:
-            words, opened = describe_answer(command, inner), inner.encode()
-            self.contact.note("in", outer.encode(), words, sealed=True, opened=opened)
 
 
 def _carry(link: Link, frame: bytes, within: float | None) -> bytes:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
-from teds_provision.errors import AddressConflict, NoReader, StoreLocked, TedsProvisionError, UsageFailure
+from teds_provision.errors import AddressConflict, NoNode, NoReader, StoreLocked, TedsProvisionError, UsageFailure
 from teds_provision.links import Contact, LinkSettings, Notice, open_place, open_port, open_ports
 from teds_provision.links.ports import NoticeSink, Port
 from teds_provision.protocol.announce import default_can_address
@@ -23,7 +24,10 @@ from teds_provision.talk.progress import Reporter
 if TYPE_CHECKING:
     from teds_provision.links.can.port import CanPort
 
+_log = logging.getLogger(__name__)
 _SHOWN = 5
+_TRY_SECONDS = 1.5
+"""So long a node is looked for where it was met last before a tap is waited for: an answer of everyone, and a spare."""
 
 
 @contextmanager
@@ -38,32 +42,105 @@ def meet(
     """Wait for node ``uuid`` (None: any node) on the chosen link and give a conversation with it.
 
     Of several nodes on a bus that is the one which is not finished yet. ``before`` is called when the link is open and
-    nothing is waited for yet: the time to ask for a passphrase. Raises NoReader, NoNode after
-    ``links.timeout`` seconds, AddressConflict, UsageFailure where several could be meant.
+    nothing is waited for yet: the time to ask for a passphrase. Where nobody said which link, ``uuid`` is looked for on
+    the buses that are named beside, else on the one where it was met last, and then waited for at the reader. Raises
+    NoReader, NoNode after ``links.timeout`` seconds, AddressConflict, UsageFailure where several could be meant.
     """
+    if uuid is None:
+        port = open_port(links)
+        try:
+            before()
+            contact = the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
+            with Conversation(contact, notice=reporter.notice) as node:
+                yield node
+        finally:
+            port.close()
+        return
+    known = likely_places(station, links, [uuid])
+    if not known:
+        with _met_at(station, links, uuid, reporter, before) as node:
+            yield node
+        return
+    with ExitStack() as stack:
+        yield _met_somewhere(stack, station, links, known, uuid, reporter, before)
+
+
+@contextmanager
+def _met_at(
+    station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter, before: Callable[[], object]
+) -> Iterator[Conversation]:
+    """Meet this one node on the one link that ``links`` name."""
 
     def wanted(identity: Identity) -> bool:
-        return uuid is None or identity.uuid == uuid
+        return identity.uuid == uuid
 
     try:
         port = open_port(links)
     except NoReader as error:
-        if uuid is None or links.via != "nfc" or links.nfc is not None:
+        if not links.is_open:
             raise
         raise _no_link(station, uuid, error) from error
     try:
-        if uuid is not None:
-            _require_no_measurement(station, port, uuid)
+        _require_no_measurement(station, port, uuid)
         before()
-        if uuid is None:
-            contact = the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
-        else:
-            address = likely_address(station, uuid)
-            contact = port.find(wanted, seconds=links.timeout, notice=reporter.notice, address=address)
+        address = likely_address(station, uuid)
+        contact = port.find(wanted, seconds=links.timeout, notice=reporter.notice, address=address)
         with Conversation(contact, notice=reporter.notice) as node:
             yield node
     finally:
         port.close()
+
+
+def _met_somewhere(
+    stack: ExitStack,
+    station: Station,
+    links: LinkSettings,
+    known: tuple[str, ...],
+    uuid: bytes,
+    reporter: Reporter,
+    before: Callable[[], object],
+) -> Conversation:
+    """Meet a node where it may be: a short look at each of the places that are known, then a tap.
+
+    Without a reader nobody can tap, and the first of the places has all the time that is left.
+    """
+    asked = False
+
+    def once() -> None:
+        nonlocal asked
+        if not asked:
+            asked = True
+            before()
+
+    began = time.monotonic()
+    for place in known:
+        there = replace(links.at(place), timeout=min(links.timeout, _TRY_SECONDS))
+        try:
+            return stack.enter_context(_met_at(station, there, uuid, reporter, once))
+        except (NoNode, NoReader) as error:  # off, elsewhere, or an adapter that is not plugged in: a tap may come
+            _log.debug("%s is not at %s: %s", uuid.hex(), place, error.message)
+    left = replace(links, timeout=max(0.1, links.timeout - (time.monotonic() - began)))
+    try:
+        return stack.enter_context(_met_at(station, left, uuid, reporter, once))
+    except NoReader as no_reader:
+        try:
+            return stack.enter_context(_met_at(station, left.at(known[0]), uuid, reporter, once))
+        except NoNode as error:
+            where = " or ".join(place.partition(":")[2] for place in known)
+            raise NoNode(
+                f"Node {uuid.hex()} did not answer on {where} within {links.timeout:g} s, and there is no NFC reader.",
+                hint=error.hint,
+            ) from no_reader
+
+
+def likely_places(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> tuple[str, ...]:
+    """Where nodes may be if nobody said which link is meant: the buses that are named beside, else where each was last.
+
+    Places are ``LINK:WHERE``; none where somebody said, or where nothing is known.
+    """
+    if not links.is_open:
+        return ()
+    return links.buses or tuple(dict.fromkeys(station.nodes.last_places(uuids).values()))
 
 
 def _no_link(station: Station, uuid: bytes, error: NoReader) -> NoReader:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from teds_provision.links import Notice
@@ -17,12 +17,16 @@ SKIPPED = "skipped"
 
 @dataclass
 class StepResult:
-    """One step: ``result`` is "done", "nothing to do" or "skipped"; ``detail`` one short sentence for people."""
+    """One step: ``result`` is "done", "nothing to do" or "skipped"; ``detail`` one short sentence for people.
+
+    ``of`` names the node where several are worked on at once.
+    """
 
     name: str
     result: str = DONE
     seconds: float = 0.0
     detail: str = ""
+    of: str = ""
 
 
 class Reporter(Protocol):
@@ -55,6 +59,29 @@ class Silent:
 
     def written(self, octets: int, total: int) -> None:
         """Say nothing."""
+
+
+class OfNode:
+    """A reporter for one of several nodes that are worked on at once: what it tells names that node."""
+
+    def __init__(self, inner: Reporter, label: str) -> None:
+        self._inner, self._label = inner, label
+
+    def started(self, step: str) -> None:
+        """A step begins."""
+        self._inner.started(step)
+
+    def finished(self, step: StepResult) -> None:
+        """A step of this node ended well."""
+        self._inner.finished(replace(step, of=self._label))
+
+    def notice(self, notice: Notice) -> None:
+        """Something of this node is waited for, or came by."""
+        self._inner.notice(replace(notice, text=f"{self._label}: {notice.text}"))
+
+    def written(self, octets: int, total: int) -> None:
+        """So many octets of its datasheet are staged."""
+        self._inner.written(octets, total)
 
 
 @dataclass

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+from teds_provision.errors import BadData
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
@@ -24,6 +26,7 @@ from teds_provision.teds.units import (
     display_unit,
     format_value,
     name_of_units,
+    parse_unit,
     units_of,
 )
 
@@ -97,7 +100,8 @@ class Timing:
 class Channel:
     """One TransducerChannel. Limits and uncertainty are in SI units as its own TEDS states them, NaN where it does not.
 
-    ``units`` are the exponents of PhyUnits, ``unit`` the unit in which people see its values. ``kind`` is None for a
+    ``units`` are the exponents of PhyUnits, ``unit`` the unit in which its values are computed, ``shown`` the one in
+    which people see them: ``display`` where a profile names one, else ``unit``. ``kind`` is None for a
     ChanType that is not known, ``halt`` is ActHalt (field 36). ``described`` is False where there is no
     TransducerChannel TEDS at all. ``calibration`` is None where there is none or none that can be computed;
     ``calibration_problem`` then says why.
@@ -119,6 +123,7 @@ class Channel:
     calibration_key: int | None = None
     calibration: Calibration | None = None
     calibration_problem: str = ""
+    display: str = ""
 
     @property
     def actuator(self) -> bool:
@@ -132,10 +137,20 @@ class Channel:
 
     @cached_property
     def unit(self) -> WrittenUnit:
-        """Unit in which people see its values: the calibrated one where that has a usual name, else a friendly one."""
+        """Unit that its datasheet suggests: the calibrated one where that has a usual name, else a friendly one."""
         if self.calibration is not None and self.calibration.unit.text[:1] not in ("", "("):
             return self.calibration.unit
         return display_unit(self.units)
+
+    @cached_property
+    def shown(self) -> WrittenUnit:
+        """Unit in which people see its values: the profile's where one is known and fits, else the datasheet's."""
+        if self.display:
+            with suppress(BadData):
+                chosen = display_unit(self.units, self.display)
+                if parse_unit(self.display).units == self.units:
+                    return chosen
+        return self.unit
 
     @property
     def si_unit(self) -> str:
@@ -200,7 +215,7 @@ class Channel:
 
     def show(self, value: float, *, difference: bool = False, digits: int = 6) -> str:
         """Value in SI units as people see it: ``360 °``, ``0.35 N``; a difference leaves the unit's offset out."""
-        return format_value(value, self.unit, difference=difference, digits=digits)
+        return format_value(value, self.shown, difference=difference, digits=digits)
 
 
 def described(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:

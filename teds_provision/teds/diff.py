@@ -49,6 +49,8 @@ _LABELS: Final = {
     "SHoldOff": "slow-access time-out",
     "ChanType": "channel type",
     "CalKey": "calibration key",
+    "ZeroOffset": "zero offset",
+    "ZeroDate": "date of the zero offset",
 }
 _OPAQUE: Final = 48
 _OPAQUE_OCTETS: Final = 16

@@ -104,7 +104,7 @@ class Requirement:
         """Whether a channel is one that this requirement looks at."""
         if self.channel:
             return channel.name == self.channel
-        return not self.quantity or _same_kind(channel.units, QUANTITIES[self.quantity])
+        return not self.quantity or channel.units == QUANTITIES[self.quantity]
 
 
 @dataclass(frozen=True)
@@ -241,10 +241,6 @@ def _asked(term: Term) -> str:
 
 def _relative(term: Term) -> bool:
     return term.unit.units.interpretation == RATIO and term.what == "uncertainty"
-
-
-def _same_kind(one: Units, other: Units) -> bool:
-    return one == other
 
 
 def _term(text: str) -> Term:

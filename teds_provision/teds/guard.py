@@ -326,7 +326,7 @@ def misfit(calibration: Calibration, had: SheetChannel, now: SheetChannel, of: C
         return f"it was made for samples of {had.sample.name}, and these are {now.sample.name}"
     method = of.calibration.method if of is not None else None
     if method and method != calibration.method:
-        return f"this type asks for the method {method}, and it is {calibration.method}"
+        return f"this type expects the method {method}, but got {calibration.method}"
     raw = of.raw_range if of is not None else calibration.raw_range or now.sample.raw_range
     return _beyond_raw_range(calibration, had, now, raw) or _points_beyond(calibration, had, now)
 
@@ -419,7 +419,10 @@ class _Judge:
     def _damage(self, calibration: Calibration) -> Iterator[GuardFinding]:
         """Words that were erased, or boundaries without which nothing can be computed."""
         for name, values, per_cell in _words(calibration):
-            bad = next((n for n, value in enumerate(values) if _looks_erased(value)), None)
+            bad = next(
+                (n for n, value in enumerate(values) if not math.isfinite(value) or 0 < abs(value) < _SMALLEST_NORMAL),
+                None,
+            )
             if bad is not None:
                 where = f" (segment {bad // per_cell + 1})" if len(values) > per_cell else ""
                 text = f"{name} {bad + 1} of {len(values)}{where} is {values[bad]:g}, as erased flash reads."
@@ -473,7 +476,3 @@ def _words(calibration: Calibration) -> Iterator[tuple[str, tuple[float, ...], i
     limits = (calibration.low_limit, calibration.high_limit, calibration.uncertainty)
     yield "limit", tuple(value for value in limits if value is not None and not math.isnan(value)), 1
     yield "zero offset", (calibration.zero_offset,), 1
-
-
-def _looks_erased(value: float) -> bool:
-    return not math.isfinite(value) or 0 < abs(value) < _SMALLEST_NORMAL

@@ -247,7 +247,7 @@ class _View:
             return
         axes.plot(own.inputs, own.differences, "o-", color=_ORANGE, markersize=3, linewidth=0.7)
         stated = self._uncertainty(axes, own.maximum)
-        self._told(axes, f"residuals: largest {own.maximum:.3g}, rms {own.rms:.3g}{stated}")
+        self._caption(axes, f"residuals: largest {own.maximum:.3g}, rms {own.rms:.3g}{stated}")
         axes.set_ylabel("point - curve")
 
     def straightness(self, axes: Any) -> None:
@@ -263,11 +263,11 @@ class _View:
         largest = float(np.abs(away).max())
         axes.plot(x, away, color=_BLUE, linewidth=1)
         stated = self._uncertainty(axes, largest)
-        self._told(axes, f"departure from a straight line: largest {largest:.3g}{stated}")
+        self._caption(axes, f"departure from a straight line: largest {largest:.3g}{stated}")
         axes.set_ylabel("curve - line")
 
     @staticmethod
-    def _told(axes: Any, text: str) -> None:
+    def _caption(axes: Any, text: str) -> None:
         axes.set_title(text, fontsize=8, loc="left", pad=3)
 
     def _uncertainty(self, axes: Any, largest: float) -> str:

@@ -103,6 +103,12 @@ class Sheet:
         """Datasheet of framed TEDS by (channel, access code); its UUID is what the Meta-TEDS says, or empty."""
         return _Reader(b"", blocks).sheet()
 
+    def shown_in(self, units: Mapping[int, str]) -> Sheet:
+        """The same datasheet, with the values of these channels shown to people in these units, where they fit."""
+        if not units:
+            return self
+        return replace(self, channels=tuple(replace(one, display=units.get(one.number, "")) for one in self.channels))
+
     def channel(self, number: int) -> Channel | None:
         """Channel of that number, None where it is not described."""
         return next((channel for channel in self.channels if channel.number == number), None)

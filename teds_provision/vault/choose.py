@@ -77,10 +77,10 @@ def create_vault(
     def asked(prompt: str, confirm: bool) -> str:
         if confirm:
             tell(
-                f"The keys of this station are about to be made and sealed in {home / 'vault.json'} under a passphrase"
-                f"{'' if keystore else ', as no keyring can be used here'}. Commands that use a key ask for it, "
-                "or once: teds-provision unlock. Without it only a backup helps. At least 8 characters; four random "
-                "words are good. Sealing takes about a second."
+                f"{'' if keystore else 'No OS keyring was found. '}The station's keys will be stored in"
+                f" {home / 'vault.json'}, encrypted with a passphrase. Commands that use a key ask for it; after"
+                " teds-provision unlock they don't for a while. If you lose it, you can only restore from a backup."
+                " At least 8 characters; four random words are good. This takes about a second."
             )
         return ask(prompt, confirm)
 

@@ -66,7 +66,7 @@ def test_without_the_calibration_the_new_type_is_built(station: Station, board: 
 def test_the_same_type_keeps_it(station: Station, board: Board, calibrated: Path) -> None:
     built = build(station, board.uuid, BuildOrder(ANGLE, name="slew"))
     assert (1, AccessCode.CALIBRATION) in built.image.blocks
-    assert any("is kept" in text for text in built.warnings)
+    assert any("keeps its calibration" in text for text in built.warnings)
 
 
 def test_a_draft_that_was_never_written_is_kept_for_its_own_type_alone(
@@ -147,4 +147,4 @@ def test_a_method_that_the_type_asks_for_is_compared() -> None:
     asks = replace(own, calibration=replace(own.calibration, method="linear"))
     assert calibration.method != "linear" or misfit(calibration, had, had, asks) == ""
     other = replace(own, calibration=replace(own.calibration, method="steps"))
-    assert "asks for the method steps" in misfit(calibration, had, had, other)
+    assert "expects the method steps" in misfit(calibration, had, had, other)

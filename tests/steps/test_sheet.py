@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.errors import BadData, NodeBusy, NodeSilent, NoNode
 from teds_provision.station.station import Station
-from teds_provision.steps.batch_sheet import Board, Declined, Progress, Sheet, read_sheet, write_report
+from teds_provision.steps.batch_sheet import About, Board, Declined, Progress, Sheet, read_sheet, write_report
 from teds_provision.steps.build import BuildOrder
 
 
@@ -160,12 +160,15 @@ def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(st
     progress = Progress(station.home, read(station, tmp_path, "name\n<b>\nb\n"))
     progress.take(progress.sheet.rows[0], bytes(10))
     progress.note(progress.sheet.rows[0], Board(bytes(10), 1.23, error=NodeSilent("It is <silent>."), row=1))
-    write_report(tmp_path / "day.html", progress)
+    about = About("bench <1>", "ab" * 32, "Ada", "teds-provision 9")
+    write_report(tmp_path / "day.html", progress, about)
     text = (tmp_path / "day.html").read_text()
     assert "<th>first-pass yield</th><td>0.0%</td>" in text
     assert "<th>skipped or not reached</th><td>1</td>" in text
     assert "&lt;b&gt;" in text
     assert "It is &lt;silent&gt;." in text
     assert "<td>not reached</td><td>0</td><td></td><td></td><td></td><td></td></tr>" in text
-    write_report(tmp_path / "day.csv", progress)
+    for fact in ("bench &lt;1&gt;", "ab" * 32, "Ada", "teds-provision 9", "@page{size:A4 landscape"):
+        assert fact in text
+    write_report(tmp_path / "day.csv", progress, about)
     assert "first_pass,0.0000" in (tmp_path / "day.csv").read_text()

@@ -254,7 +254,7 @@ def test_a_refusal_outside_a_session_is_told_as_heard_and_not_proven(station: St
     board.power_on()
     with talk(board) as node, pytest.raises(PolicyRefused, match="proves nothing"):
         require_session(station, node)
-    with talk(board) as node, pytest.raises(NodeRefused, match="Heard, not proven"):
+    with talk(board) as node, pytest.raises(NodeRefused, match="Not verified"):
         node.plain(security_command(Function.CLOSE), "to close")
 
 

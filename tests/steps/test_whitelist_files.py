@@ -254,3 +254,22 @@ def test_a_list_of_many_pages_is_held_against_what_is_known_on_each(station: Sta
     other = [*listed[:999], Listed(999, listed[999].uuid, OTHER), *listed[1000:]]
     with pytest.raises(OtherKey, match=listed[999].uuid.hex()):
         plan_addition(station, other)
+
+
+def test_an_eui_64_gets_the_uuid_of_the_written_rule_in_every_format(tmp_path: Path) -> None:
+    """The NCAP of the second paper lists transducers by 8 octets (its Figure 4)."""
+    for name, text in {
+        "list.xml": '<whitelist><transducer uuid="0x0011223344556677" fingerprint="" /></whitelist>',
+        "text.xml": "<UUIDs><UUID>00-11-22-33-44-55-66-77</UUID></UUIDs>",
+        "several.xml": "<whitelist>0x0011223344556677 0x8d4d9da65281f7000000</whitelist>",
+        "list.csv": "uuid,name\n00:11:22:33:44:55:66:77,arm\n",
+        "list.json": '["0011223344556677"]',
+    }.items():
+        (tmp_path / name).write_text(text)
+        found = read_whitelist(tmp_path / name)
+        assert found[0].uuid.hex() == "fffe0011223344556677", name
+    assert found[0].uuid != bytes.fromhex("00000011223344556677")
+    for wrong in ("00112233445566", "001122334455667788"):
+        (tmp_path / "wrong.csv").write_text(f"uuid\n{wrong}\n")
+        with pytest.raises(BadData, match="20 hex digits"):
+            read_whitelist(tmp_path / "wrong.csv")

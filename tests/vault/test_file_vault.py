@@ -235,7 +235,8 @@ def test_a_change_killed_at_any_instant_leaves_the_old_or_the_new(tmp_path: Path
 def test_a_full_disk_leaves_the_vault_as_it_was(tmp_path: Path, vault: FileVault) -> None:
     before = (tmp_path / "vault.json").read_bytes()
     code = (
-        "import resource, sys; from pathlib import Path; from teds_provision.errors import VaultFailure\n"
+        "import resource, sys; sys.dont_write_bytecode = True\n"
+        "from pathlib import Path; from teds_provision.errors import VaultFailure\n"
         "from teds_provision.vault.file_vault import FileVault\n"
         f"vault = FileVault.open(Path(sys.argv[1]), {STORE!r}, lambda prompt, confirm: {GOOD!r})\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"

@@ -187,7 +187,7 @@ class BlePort:
                 return contact
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
         raise NoNode(
-            f"No such node was met over BLE {where}within {seconds:g} s{others}.",
+            f"The node did not answer over BLE {where}within {seconds:g} s{others}.",
             hint="A node advertises for 60 s after a tap, and while it has a key. Bring it closer, or tap it.",
         )
 
@@ -337,7 +337,8 @@ class BlePort:
                 uuid = identity.uuid.hex()
                 notice(Notice("foreign-tag", f"Node {uuid} is at {address}, but it is not the one looked for."))
             return None
-        return Contact(identity, link, connection=link.connection.number, trace=self.trace)
+        connection = link.connection.number
+        return Contact(identity, link, connection=connection, trace=self.trace, bus=self.place)
 
     def _leave(self, link: BleLink, *, in_use: bool) -> None:
         """End a connection that was made for a question alone."""

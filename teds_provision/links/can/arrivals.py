@@ -17,7 +17,7 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 
 if TYPE_CHECKING:
     from teds_provision.links.can.isotp import Frame
-    from teds_provision.links.can.shared import Ear, SharedBus
+    from teds_provision.links.can.shared import Listener, SharedBus
 
 _GONE_SECONDS: Final = 3.0
 """A node that has been silent for so long has left."""
@@ -73,12 +73,12 @@ class Arrivals:
         self._round = 0
         self._asked_at = self._served_at = 0.0
         self._served: set[int] = set()
-        self._ear: Ear | None = None
+        self._listener: Listener | None = None
         self._bus: SharedBus | None = None
 
     def lost(self) -> None:
         """The bus failed: its listener is of no use any more."""
-        self._ear = self._bus = None
+        self._listener = self._bus = None
 
     def round(self, stop: threading.Event) -> Iterator[tuple[int, Identity]]:
         """Ask everyone (or ``node=`` alone) and yield address and identity of each node that is news."""
@@ -104,15 +104,15 @@ class Arrivals:
 
         A board that was served may be changed meanwhile; what it announced while it was served is no news.
         """
-        if self._ear is not None and not all(map(self._was_served, self._ear.get_all(0.0))):
+        if self._listener is not None and not all(map(self._was_served, self._listener.get_all(0.0))):
             return
         answered = sum(last.round == self._round for last in self._seen.values())
         until = self._asked_at + min(_MOST_PAUSE, _PAUSE_PER_NODE * answered)
         until = max(until, self._served_at + _CHANGE_SECONDS)
         while (left := until - time.monotonic()) > 0 and not stop.is_set():
-            if self._ear is None:
+            if self._listener is None:
                 stop.wait(left)
-            elif self._ear.get(min(left, 0.1)) is not None:
+            elif self._listener.get(min(left, 0.1)) is not None:
                 return
 
     def _was_served(self, frame: Frame) -> bool:
@@ -124,7 +124,7 @@ class Arrivals:
         bus = self._port.bus()
         if bus is not self._bus:
             self._bus = bus
-            self._ear = bus.listen(lambda frame: is_announce(frame.identifier), most=256)
+            self._listener = bus.listen(lambda frame: is_announce(frame.identifier), most=256)
 
     def _one(self, address: int, clashing: set[int]) -> Iterator[tuple[int, Identity]]:
         try:

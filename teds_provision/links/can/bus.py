@@ -317,7 +317,11 @@ def _open(spec: CanSpec) -> can.BusABC:
         raise _not_opened(spec, error) from error
     if spec.interface == "udp_multicast":
         _this_group_alone(bus)
-        _room_for_a_flood(bus)
+        # have the kernel hold more than the 256 frames of its default: 60 nodes answer one Identify with 300
+        found = getattr(getattr(bus, "_multicast", None), "_socket", None)
+        if isinstance(found, socket.socket):
+            with contextlib.suppress(OSError):
+                found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
     if spec.interface == "socketcan":
         bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in _OURS])
     return bus
@@ -433,14 +437,6 @@ def _this_group_alone(bus: can.BusABC) -> None:
         return
     level, option = (socket.IPPROTO_IPV6, 29) if found.family == socket.AF_INET6 else (socket.IPPROTO_IP, 49)
     found.setsockopt(level, option, 0)  # IPV6_MULTICAST_ALL, IP_MULTICAST_ALL (linux/in6.h, linux/in.h)
-
-
-def _room_for_a_flood(bus: can.BusABC) -> None:
-    """Have the kernel hold more than the 256 frames of its default: 60 nodes answer one Identify with 300."""
-    found = getattr(getattr(bus, "_multicast", None), "_socket", None)
-    if isinstance(found, socket.socket):
-        with contextlib.suppress(OSError):
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
 
 
 def _probe(spec: CanSpec, options: dict[str, Any]) -> None:

@@ -257,15 +257,11 @@ def _tolerable(data: bytes) -> bytes | None:
     if kind == _SINGLE:
         return data if read_single(data) is not None else None
     if kind == _FIRST:
-        return _tolerable_first(data)
+        length = (data[0] & 0xF) << 8 | data[1]
+        return data if len(data) >= 8 and (length > 7 or length == 0) else None
     if kind == _CONSECUTIVE:
         return data
     return _tolerable_flow(data) if kind == _FLOW else None
-
-
-def _tolerable_first(data: bytes) -> bytes | None:
-    length = (data[0] & 0xF) << 8 | data[1]
-    return data if len(data) >= 8 and (length > 7 or length == 0) else None
 
 
 def _tolerable_flow(data: bytes) -> bytes | None:

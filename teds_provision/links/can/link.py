@@ -41,6 +41,8 @@ _BUSY: Final = refusal(Reason.BUSY).encode()
 BUSY_SECONDS: Final = 10.0
 BUSY_PAUSE: Final = 0.1
 """A node that cannot take a long request now is sent it again after each pause, for so long (profile.md, "CAN")."""
+_HOPE_SECONDS: Final = 0.1
+"""Between two looks whether whoever asks still hopes for a reply."""
 _LONGEST_TRY: Final = 120.0
 """Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
 
@@ -88,6 +90,7 @@ class CanLink:
         self._last = 0
         self.left = self.came = 0.0  # see links.ports.Timed
         self.gap = 0  # see links.ports.Spaced
+        self.hopeless: Callable[[], bool] = lambda: False  # see links.ports.Abandons
         self._reply_seconds = REPLY_SECONDS if reply_seconds is None else reply_seconds
 
     @property
@@ -163,7 +166,8 @@ class CanLink:
         try:
             with bus.line(self.address, self._source).exchange(transaction) as line:
                 line.gap = self.gap
-                exchange = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds, prompt=prompt)
+                body = bytes([transaction]) + frame
+                exchange = _Exchange(bus, line, body, tries, seconds, prompt=prompt, hopeless=self.hopeless)
                 self.left = self.left or time.monotonic()
                 reply, self.came = exchange.run()
         except LinkFailure as failure:
@@ -179,10 +183,18 @@ class _Exchange:
     """One request and its reply, repeated as needed. Runs in the thread that asks."""
 
     def __init__(
-        self, bus: SharedBus, line: Line, body: bytes, tries: int, seconds: float, *, prompt: bool = False
+        self,
+        bus: SharedBus,
+        line: Line,
+        body: bytes,
+        tries: int,
+        seconds: float,
+        *,
+        prompt: bool,
+        hopeless: Callable[[], bool],
     ) -> None:
         self._bus, self._line, self._body = bus, line, body
-        self._tries, self._seconds, self._prompt = tries, seconds, prompt
+        self._tries, self._seconds, self._prompt, self._hopeless = tries, seconds, prompt, hopeless
         self._longest = seconds if prompt else REPEAT_SECONDS
         self._fd = bus.spec.fd
         self._torn = False
@@ -195,7 +207,7 @@ class _Exchange:
         """
         began = time.monotonic()
         whole = refused = 0
-        while whole < self._tries:
+        while whole < self._tries and not self._hopeless():
             try:
                 self._send(self._flow_patience(refused))
             except _Answered as answered:
@@ -299,10 +311,12 @@ class _Exchange:
         end = time.monotonic() + _LONGEST_TRY
         while (left := min(until, end) - time.monotonic()) > 0:
             try:
-                event = self._bus.next_of(self._line.events, left)
+                event = self._bus.next_of(self._line.events, min(left, _HOPE_SECONDS))
             except Empty:
                 self._bus.check()
                 if self._line.partial is None:
+                    if self._hopeless():
+                        return None
                     continue
                 until = self._line.heard_at + _GAP_SECONDS  # it came on meanwhile, or is torn
                 self._torn = self._torn or until <= time.monotonic()
@@ -318,8 +332,10 @@ class _Exchange:
                     self._torn = True
                     self._bus.note_loss()
                     return None
-                case _:
+                case _:  # the bus failed, or something announced itself at this address
                     self._bus.check()
+                    if self._hopeless():
+                        return None
         return None
 
     def _failed(self) -> LinkFailure:

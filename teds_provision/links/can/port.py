@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 from teds_provision.errors import LinkFailure, NoNode
@@ -25,7 +26,7 @@ from teds_provision.links.can.finding import (
 )
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.link import CanLink, conflict
-from teds_provision.links.can.shared import Ear, SharedBus
+from teds_provision.links.can.shared import Listener, SharedBus
 from teds_provision.links.can.spec import LAST_NODE, parse_spec
 from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
@@ -82,7 +83,7 @@ class CanPort:
         self.close()
         self.spec = replace(self.spec, source=source)
 
-    def listen(self, wanted: Callable[[Frame], bool]) -> Ear:
+    def listen(self, wanted: Callable[[Frame], bool]) -> Listener:
         """Hear every frame for which ``wanted`` is true, data frames and announcements above all; see SharedBus."""
         return self.bus().listen(wanted)
 
@@ -107,10 +108,18 @@ class CanPort:
         if bus is not None:
             bus.close()
 
-    def identify(self, address: int, *, seconds: float = _HELLO_SECONDS) -> Identity | None:
-        """Ask one address who is there; None for nobody. Raises AddressConflict, LinkFailure."""
+    def identify(
+        self, address: int, *, seconds: float = _HELLO_SECONDS, until_announced: bool = False
+    ) -> Identity | None:
+        """Ask one address who is there; None for nobody. Raises AddressConflict, LinkFailure.
+
+        ``until_announced``: given up when something announces itself there, as it has not heard the question; whoever
+        asks it because of its Announce need not wait for this one.
+        """
         link = self.link(address)
-        return ask_one(lambda frame: link.ask(frame, tries=1, seconds=seconds))
+        if until_announced:
+            link.hopeless = partial(self.bus().announced_since, address, time.monotonic())
+        return ask_one(partial(link.ask, tries=1, seconds=seconds))
 
     # -- finding ---------------------------------------------------------------------------------------------------
 
@@ -126,7 +135,9 @@ class CanPort:
         told: set[bytes] = set()
         notice(Notice("waiting", f"Looking for the node on {self.spec.text}.", seconds))
         if self.spec.node is None and address is not None and 1 <= address <= LAST_NODE:
-            guessed = self._guess(address, wanted)
+            # ask where the node was last: there is no random wait, unlike after a question to everyone
+            identity = self.identify(address, seconds=_GUESS_SECONDS)
+            guessed = self._contact(address, identity) if identity is not None and wanted(identity) else None
             if guessed is not None:
                 return guessed
         while (left := until - time.monotonic()) > 0:
@@ -140,16 +151,11 @@ class CanPort:
             time.sleep(max(0.0, round_ends - time.monotonic()))
         raise self._nobody(seconds, told)
 
-    def _guess(self, address: int, wanted: Callable[[Identity], bool]) -> Contact | None:
-        """Ask where the node was last: there is no random wait, unlike after a question to everyone."""
-        identity = self.identify(address, seconds=_GUESS_SECONDS)
-        return self._contact(address, identity) if identity is not None and wanted(identity) else None
-
-    def _nobody(self, seconds: float, told: set[bytes]) -> NoNode:
+    def _nobody(self, seconds: float, told: set[bytes], whom: str = "The node did not answer") -> NoNode:
         where = f"at 0x{self.spec.node:02X} on {self.spec.text}" if self.spec.node else f"on {self.spec.text}"
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
         return NoNode(
-            f"No such node answered {where} within {seconds:g} s{others}.",
+            f"{whom} {where} within {seconds:g} s{others}.",
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists who answers.",
         )
 
@@ -180,7 +186,9 @@ class CanPort:
                 break
         if found.identities:
             return [self._contact(node, identity) for node, identity in sorted(found.identities.items())]
-        return [self.find(lambda _: True, seconds=max(0.1, until - time.monotonic()), notice=notice)]
+        if self.spec.node is None:
+            raise self._nobody(seconds, set(), whom="No node answered")
+        return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 
     def _everyone(self, longest: float, notice: NoticeSink, silence: float = SILENCE_SECONDS) -> Found:
         began = time.monotonic()
@@ -255,7 +263,7 @@ class CanPort:
             notice(Notice("conflict", f"{rivals.text} {rivals.hint}"))
 
     def _contact(self, node: int, identity: Identity) -> Contact:
-        return Contact(identity, self.link(node), address=node, trace=self.trace)
+        return Contact(identity, self.link(node), address=node, trace=self.trace, bus=self.place)
 
     def _at(
         self, node: int, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]

@@ -32,6 +32,7 @@ from teds_provision.links.can.isotp import (
     flow,
     read_single,
 )
+from teds_provision.protocol.announce import is_announce
 
 # Who reads a bus: a loop of its own, or the thread that waits for a reply and so need not be woken by another.
 #
@@ -294,7 +295,7 @@ _LOSSY_SECONDS: Final = 60.0
 _MOST_HELD: Final = 8192
 
 
-class Ear:
+class Listener:
     """A queue of frames for one listener; see :meth:`SharedBus.listen`. ``lost`` counts what did not fit."""
 
     def __init__(self, bus: SharedBus, wanted: Callable[[Frame], bool], most: int) -> None:
@@ -325,7 +326,7 @@ class Ear:
 
     def close(self) -> None:
         """Listen no more; a thread that waits in :meth:`get` returns."""
-        self._bus.deaf(self)
+        self._bus.forget(self)
         self.wake()
 
     def wake(self) -> None:
@@ -340,7 +341,7 @@ class Ear:
             else:
                 self.lost += 1
 
-    def __enter__(self) -> Ear:
+    def __enter__(self) -> Listener:
         return self
 
     def __exit__(
@@ -426,10 +427,11 @@ class SharedBus:
         self.own = bus.spec.source
         self.rivals = Rivals(self.own)
         self._failure: LinkFailure | None = None
-        self._ears: tuple[Ear, ...] = ()
+        self._listeners: tuple[Listener, ...] = ()
         self._asked: tuple[Asked, ...] = ()
         self._lines: dict[tuple[int, int], Line] = {}
         self._clashes: dict[int, float] = {}
+        self._announced: dict[int, float] = {}
         self._lost_at = -math.inf
         self._lock = threading.Lock()
         self._sending = threading.Lock()
@@ -488,20 +490,20 @@ class SharedBus:
         with self._sending:
             self._bus.send(frame)
 
-    def listen(self, wanted: Callable[[Frame], bool], *, most: int = _MOST_HELD) -> Ear:
+    def listen(self, wanted: Callable[[Frame], bool], *, most: int = _MOST_HELD) -> Listener:
         """Hear every frame for which ``wanted`` is true, from now on; at most ``most`` wait to be read.
 
         ``wanted`` runs in the receiving loop: it must be quick and raise nothing.
         """
-        ear = Ear(self, wanted, most)
+        listener = Listener(self, wanted, most)
         with self._lock:
-            self._ears = (*self._ears, ear)
-        return ear
+            self._listeners = (*self._listeners, listener)
+        return listener
 
-    def deaf(self, ear: Ear) -> None:
+    def forget(self, listener: Listener) -> None:
         """Take a listener away."""
         with self._lock:
-            self._ears = tuple(other for other in self._ears if other is not ear)
+            self._listeners = tuple(other for other in self._listeners if other is not listener)
 
     def line(self, node: int, own: int | None = None) -> Line:
         """The line to the node at this address; ``own`` is another address than this station's, to try a node out."""
@@ -534,9 +536,9 @@ class SharedBus:
     def _fail(self, failure: LinkFailure) -> None:
         self._failure = self._failure or failure
         with self._lock:
-            ears, asked, lines = self._ears, self._asked, list(self._lines.values())
-        for ear in ears:
-            ear.wake()
+            listeners, asked, lines = self._listeners, self._asked, list(self._lines.values())
+        for listener in listeners:
+            listener.wake()
         for one in asked:
             one.news.put(-1)
         for line in lines:
@@ -545,13 +547,25 @@ class SharedBus:
 
     def _take(self, frame: Frame) -> None:
         self.rivals.heard(frame)
+        if is_announce(frame.identifier):
+            self._note_announce(frame.identifier & 0xFF)
         ends = addresses(frame.identifier)
         if ends is not None and len(frame.data) >= 2:
             own, node = ends
             if own == self.own or (node, own) in self._lines:
                 self._from_node(self.line(node, own), frame)
-        for ear in self._ears:
-            ear.offer(frame)
+        for listener in self._listeners:
+            listener.offer(frame)
+
+    def _note_announce(self, node: int) -> None:
+        self._announced[node] = time.monotonic()
+        line = self._lines.get((node, self.own))
+        if line is not None and line.transaction >= 0:
+            line.events.put(Event("announced"))
+
+    def announced_since(self, node: int, moment: float) -> bool:
+        """Whether something announced itself at this address after ``moment`` (time.monotonic)."""
+        return self._announced.get(node, -math.inf) > moment
 
     def _from_node(self, line: Line, frame: Frame) -> None:
         line.heard_at = frame.at

@@ -64,7 +64,9 @@ def decode(octets: bytes) -> tuple[Record, ...]:
         if bool(flags & 0x80) != (not records and chunk is None):
             raise Garbled("The NDEF message does not begin where it says.")
         ended = bool(flags & 0x40)
-        _require_order(chunk, record)
+        # a record goes on with a chunk where one is open, and only there
+        if (chunk is not None) != (record.tnf == 6) or (chunk is not None and record.type):
+            raise Garbled("The NDEF message has a chunk out of order.")
         if chunk is not None:
             record = Record(chunk.tnf, chunk.type, chunk.payload + record.payload, chunk.id)
         chunk = record if flags & 0x20 else None
@@ -73,12 +75,6 @@ def decode(octets: bytes) -> tuple[Record, ...]:
     if chunk is not None or at != len(octets):
         raise Garbled("The NDEF message does not end where it says.")
     return tuple(records)
-
-
-def _require_order(chunk: Record | None, record: Record) -> None:
-    """A record goes on with a chunk where one is open, and only there; raises Garbled."""
-    if (chunk is not None) != (record.tnf == 6) or (chunk is not None and record.type):
-        raise Garbled("The NDEF message has a chunk out of order.")
 
 
 def _record(octets: bytes, at: int) -> tuple[int, Record, int]:

@@ -339,7 +339,11 @@ class NfcLink:
                 try:
                     return poller.transact(transaction, frame)
                 except (NodeSilent, Garbled) as error:
-                    self._after(error)
+                    # choose how to go on: in the same activation while the tag still answers, else from a new one
+                    if self._poller is not None and not isinstance(error, FieldLost) and self.visit.tag.is_present:
+                        self._poller.restart()
+                    else:
+                        self._poller = None
                     if attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
                         raise
                     self._notice(Notice("retry", f"{error.message} Trying again."))
@@ -372,13 +376,6 @@ class NfcLink:
             self.lost = False
             self._poller = Poller(self.visit.tag, self.visit.service)
         return self._poller
-
-    def _after(self, error: LinkFailure) -> None:
-        """Choose how to go on: in the same activation while the tag still answers, else from a new one."""
-        if self._poller is not None and not isinstance(error, FieldLost) and self.visit.tag.is_present:
-            self._poller.restart()
-        else:
-            self._poller = None
 
 
 def _contact(visit: Visit, link: NfcLink, trace: Trace | None) -> Contact:

@@ -105,13 +105,18 @@ def _usb_readers(path: str) -> list[tuple[int, int, int, int]]:
     return [found for found in seen if found[:2] in nfc.clf.device.usb_device_map]
 
 
-def _the_only_one() -> str:
-    """The path of the only reader that is there; ``usb`` where there is none, so that it says what is missing."""
+def plugged_in() -> list[str]:
+    """The paths of the readers that ``auto`` chooses from: USB readers, else those of PC/SC. None is opened."""
     try:
         found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
     except NoReader:  # no libusb: a PC/SC reader needs none
         found = []
-    found = found or [f"{PREFIX}:{name}" for name in names_if_any()]
+    return found or [f"{PREFIX}:{name}" for name in names_if_any()]
+
+
+def _the_only_one() -> str:
+    """The path of the only reader that is there; ``usb`` where there is none, so that it says what is missing."""
+    found = plugged_in()
     if len(found) > 1:
         raise UsageFailure(
             f"{len(found)} readers are plugged in: {', '.join(found)}.", hint=f"Name one, e.g. --nfc '{found[0]}'."

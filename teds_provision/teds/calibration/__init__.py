@@ -11,7 +11,7 @@ from teds_provision.lazy import lazy
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method, from_decoded
 
 if TYPE_CHECKING:
-    from teds_provision.teds.calibration.files import load_calibrations, read_calibrations
+    from teds_provision.teds.calibration.files import fit_points, load_calibrations, read_calibrations
     from teds_provision.teds.calibration.formula import (
         Evaluation,
         PreparedCurve,
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         evaluate,
         fit,
         kind_of,
+        left_out,
         residuals,
         sentence,
     )
@@ -42,8 +43,10 @@ __all__ = [
     "describe_calibration",
     "evaluate",
     "fit",
+    "fit_points",
     "from_decoded",
     "kind_of",
+    "left_out",
     "load_calibrations",
     "read_calibrations",
     "residuals",
@@ -53,9 +56,9 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
-        "files": "load_calibrations read_calibrations",
+        "files": "fit_points load_calibrations read_calibrations",
         "formula": "Evaluation PreparedCurve PreparedInverse Residuals describe_calibration evaluate fit kind_of"
-        " residuals sentence",
+        " left_out residuals sentence",
         "interpreter": "ChannelInterpreter Values",
         "samples": "SampleReader",
     },

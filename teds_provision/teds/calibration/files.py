@@ -17,12 +17,14 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_size, load_json
-from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.model import PLAIN, Calibration
 from teds_provision.teds.calibration.order import Order, calibration_of
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 from teds_provision.teds.profile.reader import Item, Table, Where, parse, read_text
+from teds_provision.teds.units import parse_unit
 
 # The CSV reader takes delimiter, decimal comma, header, units and metadata as instruments and spreadsheets write them.
+# Columns whose name begins with "#" are remarks.
 
 MAXIMUM_ROWS: Final = 200_000
 _CHANNEL_DIGITS: Final = 5
@@ -30,6 +32,7 @@ _LINE: Final = 20_000
 RAW: Final = {"raw", "count", "counts", "adc", "code", "digital", "x", "input"}
 CHANNEL: Final = {"channel", "ch"}
 SEGMENT: Final = ("from", "to", "offset")
+REMARK: Final = "#"
 _METADATA: Final = re.compile(r"#\s*([A-Za-z][A-Za-z -]*?)\s*:\s*(.*?)\s*\Z")
 _UNIT: Final = re.compile(r"\s*(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*\Z")
 
@@ -68,6 +71,7 @@ class _Columns:
     names: tuple[str, ...]
     places: tuple[int, ...]
     channel: int | None = None
+    remarks: int = 0
 
 
 def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
@@ -164,13 +168,14 @@ def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
     heads = [_name_and_unit(cell) for cell in cells]
     names = [name for name, _ in heads]
     channel = next((at for at, name in enumerate(names) if name in CHANNEL), None)
+    remarks = sum(name.startswith(REMARK) for name in names)
     if {"from", "to"} <= set(names):
         return _segment_columns(table, number, names, channel)
     raw, value = _pair_columns(table, number, names, channel)
     unit = heads[value][1]
     if unit:
         table.unit = (unit, number)
-    return _Columns(("raw", "value"), (raw, value), channel)
+    return _Columns(("raw", "value"), (raw, value), channel, remarks)
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -181,7 +186,7 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
 
 def _pair_columns(table: CsvTable, number: int, names: list[str], channel: int | None) -> tuple[int, int]:
     """Places of raw value and value: the raw one by its name, else the first."""
-    rest = [at for at in range(len(names)) if at != channel]
+    rest = [at for at, name in enumerate(names) if at != channel and not name.startswith(REMARK)]
     if len(rest) != 2:
         raise BadData(
             f"{table.file}:{number}: the header names {len(rest)} columns besides the channel; "
@@ -220,8 +225,8 @@ def _wrong_columns(names: list[str], wanted: tuple[str, ...]) -> str:
 
 def _row(table: CsvTable, number: int, cells: list[str], columns: _Columns, decimal_comma: bool) -> Row:
     asked = len(columns.places) + (columns.channel is not None)
-    if len(cells) != asked:
-        raise BadData(f"{table.file}:{number}: {len(cells)} columns where {asked} are expected.")
+    if not asked <= len(cells) <= asked + columns.remarks or len(cells) <= max(columns.places):
+        raise BadData(f"{table.file}:{number}: {len(cells)} columns where {asked + columns.remarks} are expected.")
     values = []
     for name, place in zip(columns.names, columns.places, strict=True):
         try:
@@ -287,6 +292,31 @@ def read_calibrations(text: str, file: str, profile: Profile) -> dict[int, Calib
                 raise order.wrong("channel", f"channel {channel.number} has two calibrations in this file.")
             out[channel.number] = calibration_of(order, channel)
     return out
+
+
+def fit_points(text: str, file: str, *, method: str | None = None, degree: int | None = None) -> dict[int, Calibration]:
+    """Fit the points of a CSV for what they are, by channel number: no profile says what they are to be.
+
+    ``method`` and ``degree`` go before what the file says. Raises BadData (file, line, field) as reading one does, and
+    for a file of segments, which has no points.
+    """
+    table = read_csv(text, file, CSV_KEYS)
+    out: dict[int, Calibration] = {}
+    for order in _from_csv(table):
+        if table.segments:
+            raise order.wrong("", "these are segments with coefficients; there are no points to fit.")
+        for key, value in (("method", method), ("degree", degree)):
+            if value is not None:
+                order.values[key] = (value, order.line)
+        number = int(order.number("channel") or 1)
+        unit = order.get("unit")
+        out[number] = calibration_of(
+            order, ChannelProfile(number, "", parse_unit(str(unit)) if unit else PLAIN, _SENSOR)
+        )
+    return out
+
+
+_SENSOR: Final[Mapping[str, object]] = {"ChanType": 0}
 
 
 def _from_csv(table: CsvTable) -> list[Order]:

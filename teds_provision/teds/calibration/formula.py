@@ -243,6 +243,33 @@ def residuals(calibration: Calibration) -> Residuals | None:
     return Residuals(*(tuple(part.tolist()) for part in (inputs, references, curve, references - curve)))
 
 
+MOST_LEFT_OUT = 200
+
+
+def left_out(calibration: Calibration) -> tuple[float, ...]:
+    """Differences (reference - curve) of each inner point from a fit without it, in the order of the points.
+
+    What residuals cannot say of a table, which goes through every point. Nothing where there are too few points for
+    that, more than 200, or an actuator's.
+    """
+    points = calibration.points
+    inputs = {raw for raw, _ in points}
+    if calibration.actuator or not 3 <= len(points) <= MOST_LEFT_OUT:
+        return ()
+    degree = calibration.inputs[0].degree if calibration.method == "polynomial" else None
+    found = []
+    for raw, value in points:
+        if raw in (min(inputs), max(inputs)):
+            continue
+        others = [point for point in points if point[0] != raw]
+        try:
+            curve = fit(others, calibration.method, channel=calibration.channel, degree=degree)
+        except BadData:  # too few are left
+            return ()
+        found.append(value - evaluate(curve, raw).value)
+    return tuple(found)
+
+
 def fit(
     points: Points,
     method: Method,
@@ -385,6 +412,7 @@ def describe_calibration(calibration: Calibration, now: datetime | None = None) 
         "unit": calibration.unit.text,
         "uncertainty": calibration.uncertainty,
         "zero_offset": calibration.zero_offset,
+        "zeroed": calibration.zeroed.isoformat() if calibration.zeroed else None,
         "monotone": calibration.monotone,
         "raw_range": list(calibration.raw_range) if calibration.raw_range else None,
         "date": calibration.date.isoformat() if calibration.date else None,

@@ -72,7 +72,8 @@ class ChannelInterpreter:
         self.turn = abs(self.unit.difference_from_si(TURN)) if channel.full_turn else math.inf
         ends = self.unit.from_si(channel.low), self.unit.from_si(channel.high)
         self.wraps_into: Range = min(ends), max(ends)
-        self.uncertainty = self._uncertainty()
+        stated = self.channel.stated_uncertainty
+        self.uncertainty = self.unit.difference_from_si(stated) if math.isfinite(stated) and stated >= 0 else None
         slack = self.uncertainty or 0.0
         low, high = self.limits
         self._floor = low - slack - ROUNDING * abs(low) if math.isfinite(low) else -math.inf
@@ -108,6 +109,19 @@ class ChannelInterpreter:
         valid &= (shown >= self._floor) & (shown <= self._ceiling) & np.isfinite(shown)
         return Values(raw, np.where(valid, shown, math.nan), valid, extrapolated)
 
+    def calibrated(
+        self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None
+    ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+        """What the calibration of a sensor gives, in its own unit, neither wrapped nor held against any limit.
+
+        Beside it: which raw values are possible, and which lie beyond the calibrated range. Raises BadData where there
+        is no calibration that can be computed, or an input is missing.
+        """
+        if self.problem or self._curve is None or self.channel.actuator:
+            raise BadData(self.problem or f"Channel {self.channel.number} has no calibration of a sensor.")
+        inputs, possible = self._inputs(*self.reader.numbers(raw), others or {})
+        return self._curve(*inputs), possible, self._curve.outside(*inputs)
+
     def why_invalid(
         self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None
     ) -> dict[str, int]:
@@ -115,7 +129,7 @@ class ChannelInterpreter:
         if self.problem:
             return {self.problem.removesuffix("."): len(raw)}
         shown, possible, extrapolated = self._computed(raw, others or {})
-        low, high = (f"{limit:.6g} {self.unit.text}".strip() for limit in self.limits)
+        low, high = (self.channel.show(self.unit.to_si(limit)) for limit in self.limits)
         found: dict[str, int] = {}
         left = np.ones(len(raw), dtype=bool)
         with np.errstate(invalid="ignore"):
@@ -203,13 +217,18 @@ class ChannelInterpreter:
         above = low + np.mod(values - low, turn)
         return np.where((above <= high) | (above - high <= low + turn - above), above, above - turn)
 
-    def beyond(self, value: float) -> str:
-        """Why a value may not be set, as a sentence; "" where the limits of the datasheet allow it."""
+    def beyond(self, value: float, told: WrittenUnit | None = None) -> str:
+        """Why a value may not be set, as a sentence in the unit ``told``; "" where the datasheet's limits allow it.
+
+        ``value`` is in :attr:`unit`; without ``told`` the sentence is in the unit that people see.
+        """
         low, high = self.limits
         if math.isfinite(value) and low - ROUNDING * abs(low) <= value <= high + ROUNDING * abs(high):
             return ""
-        text = f"{low:.6g} to {high:.6g} {self.unit.text}".strip()
-        return f"{value:g} {self.unit.text} is beyond the limits of channel {self.channel.number}, {text}."
+        unit = told or self.channel.shown
+        asked, *ends = (unit.from_si(self.unit.to_si(each)) for each in (value, low, high))
+        text = f"{min(ends):.6g} to {max(ends):.6g} {unit.text}".strip()
+        return f"{asked:.6g} {unit.text} is beyond the limits of channel {self.channel.number}, {text}."
 
     @property
     def accepted(self) -> Range:
@@ -240,7 +259,7 @@ class ChannelInterpreter:
         """Between which inputs of the curve its inverse is looked for; None where the datasheet sets no ends."""
         if not self.channel.actuator:
             return curve.calibration.raw_range or self.reader.form.raw_range
-        ends = [self._own_value(limit) for limit in self.limits]
+        ends = [float(self._stated(np.asarray(limit))) for limit in self.limits]
         return (min(ends), max(ends)) if all(map(math.isfinite, ends)) else None
 
     @cached_property
@@ -290,9 +309,6 @@ class ChannelInterpreter:
         own = self.channel.calibration
         return (si - own.unit.offset) / own.unit.scale if own is not None else si
 
-    def _own_value(self, value: float) -> float:
-        return float(self._stated(np.asarray(value)))
-
     def _limits(self) -> Range:
         """The narrower of the channel's limits (SI) and those of its calibration, in :attr:`unit`."""
         channel, own = self.channel, self.channel.calibration
@@ -303,10 +319,6 @@ class ChannelInterpreter:
         low = max(filter(math.isfinite, lows), default=-math.inf)
         high = min(filter(math.isfinite, highs), default=math.inf)
         return self.unit.from_si(low), self.unit.from_si(high)
-
-    def _uncertainty(self) -> float | None:
-        stated = self.channel.stated_uncertainty
-        return self.unit.difference_from_si(stated) if math.isfinite(stated) and stated >= 0 else None
 
     def _problem(self, sheet: Sheet) -> str:
         channel = self.channel

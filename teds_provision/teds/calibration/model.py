@@ -78,7 +78,8 @@ class Calibration:
 
     ``unit`` is the calibrated unit with its way into SI (SIConvrt); limits, uncertainty and zero offset are in it. For
     an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the
-    (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds. ``monotone`` and
+    (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds, ``zeroed`` when
+    the zero offset was set where the sensor is mounted. ``monotone`` and
     ``raw_range`` are what the transducer type demands and delivers, carried along so that the guard knows them without
     the profile.
     """
@@ -99,6 +100,7 @@ class Calibration:
     by: str = ""
     monotone: Monotone | None = None
     raw_range: tuple[float, float] | None = None
+    zeroed: datetime | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.inputs) <= MAXIMUM_INPUTS:
@@ -157,8 +159,7 @@ class Calibration:
         """Fields of the Calibration TEDS (access code 5) by name, ready to be composed."""
         out: list[tuple[str, object]] = []
         if self.date is not None:
-            seconds = (self.date - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(seconds=1)
-            out.append(("LstCalDt", TimeInstance(abs(seconds), 0, seconds < 0)))
+            out.append(("LstCalDt", instant(self.date)))
         if self.interval is not None:
             out.append(("CalInrvl", TimeInstance(round(self.interval))))
         out.append(("SIConvrt", (("Slope", self.unit.scale), ("Intercept", self.unit.offset))))
@@ -182,7 +183,15 @@ class Calibration:
             out.append(("Monotone", 1 + MONOTONE.index(self.monotone)))
         if self.raw_range:
             out.append(("RawRange", self.raw_range))
+        if self.zeroed is not None:
+            out.append(("ZeroDate", instant(self.zeroed)))
         return out
+
+
+def instant(moment: datetime) -> TimeInstance:
+    """A moment as a TEDS has it, to the second."""
+    seconds = (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(seconds=1)
+    return TimeInstance(abs(seconds), 0, seconds < 0)
 
 
 def from_decoded(
@@ -217,6 +226,7 @@ def from_decoded(
         actuator=actuator,
         monotone=_monotone(_top(decoded, "Monotone")),
         raw_range=_raw_range(_top(decoded, "RawRange")),
+        zeroed=_date(_top(decoded, "ZeroDate")),
     )
 
 

@@ -160,7 +160,10 @@ class SampleReader:
         if model == DataModel.TIME_OF_DAY:
             return _times(rows)
         if model in _FRACTIONS:
-            return self._fractions(rows)
+            whole = 8 * self.form.octets
+            if not self._long:
+                return _words(rows).astype(np.float64) * 2.0**-whole
+            return np.array([number / (1 << whole) for number in _whole(rows).tolist()], dtype=np.float64)
         return _whole(rows) if self._long else _words(rows)
 
     def numbers(self, raw: NDArray[np.generic]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -196,7 +199,9 @@ class SampleReader:
         whole, used = 8 * self.form.octets, self.form.bits
         bits = used if 0 < used < whole else whole
         if self.form.model in _FRACTIONS:  # the leading bits count, the others stay 0
-            steps = _scaled(min(max(number, 0.0), 1.0), bits)
+            # number × 2^bits to the nearest integer, exact however many bits there are
+            above, below = min(max(number, 0.0), 1.0).as_integer_ratio()
+            steps = ((above << (bits + 1)) + below) // (2 * below)
             return (min(steps, (1 << bits) - 1) << (whole - bits)).to_bytes(self.form.octets, "big")
         return min(max(round(number), 0), (1 << bits) - 1).to_bytes(self.form.octets, "big")
 
@@ -210,12 +215,6 @@ class SampleReader:
         elif rows.shape[1] != size:
             raise BadData(f"A sample of {rows.shape[1]} octets was given; the data model has {size}.")
         return rows
-
-    def _fractions(self, rows: NDArray[np.uint8]) -> NDArray[np.float64]:
-        whole = 8 * self.form.octets
-        if not self._long:
-            return _words(rows).astype(np.float64) * 2.0**-whole
-        return np.array([number / (1 << whole) for number in _whole(rows).tolist()], dtype=np.float64)
 
 
 def big_endian(rows: NDArray[np.uint8]) -> NDArray[Any]:
@@ -250,9 +249,3 @@ def _float(number: int) -> float:
         return float(number)
     except OverflowError:
         return math.inf
-
-
-def _scaled(number: float, bits: int) -> int:
-    """``number`` × 2^bits to the nearest integer, exact however many bits there are."""
-    above, below = number.as_integer_ratio()
-    return ((above << (bits + 1)) + below) // (2 * below)

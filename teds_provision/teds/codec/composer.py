@@ -205,17 +205,13 @@ def _leaf(field: Field, spec: FieldSpec | None, edition: Edition) -> bytes:
     if spec is None or field.value is None or not field.name:
         return field.raw
     if isinstance(field.value, Units):
-        return _packed(field, spec, field.value)
+        packed = values.pack_units(spec, field.value)
+        return packed[: len(field.raw)] if field.raw[10:] in {b"", packed[10:]} else field.raw
     if isinstance(field.value, int) and spec.kind in {"u8", "u16", "u32"}:
         return field.value.to_bytes(len(field.raw), "big")
     if spec.kind in {"uuid", "f32[]", "u16[]"} or (spec.octets and len(field.raw) not in spec.octets):
         return field.raw
     return _written(field, spec, edition)
-
-
-def _packed(field: Field, spec: FieldSpec, units: Units) -> bytes:
-    packed = values.pack_units(spec, units)
-    return packed[: len(field.raw)] if field.raw[10:] in {b"", packed[10:]} else field.raw
 
 
 def _written(field: Field, spec: FieldSpec, edition: Edition) -> bytes:

@@ -115,7 +115,7 @@ def _is_message(octets: bytes) -> bool:
     tedsid = octets[:2] in _TEDSIDS
     if _is_service(octets) and not (tedsid and octets[3]):
         return True
-    return not tedsid and (_is_command(octets) or _is_reply(octets))
+    return not tedsid and (_is_command(octets) or (_counts(octets, 1) and octets[0] <= 1))
 
 
 def _counts(octets: bytes, at: int) -> bool:
@@ -131,8 +131,3 @@ def _is_service(octets: bytes) -> bool:
 def _is_command(octets: bytes) -> bool:
     """A command of 2007: channel u16, class 1 to 7 or a maker's, function, length."""
     return _counts(octets, 4) and octets[3] != 0 and (1 <= octets[2] <= 7 or octets[2] >= 128)
-
-
-def _is_reply(octets: bytes) -> bool:
-    """A reply of 2007: flag 0 or 1, length."""
-    return _counts(octets, 1) and octets[0] <= 1

@@ -29,7 +29,11 @@ def check(table: Table, fields: tuple[Field, ...], find: Find, octets: bytes, fr
     if code in (AccessCode.CHANNEL, AccessCode.CALIBRATION):
         _limits(fields, find)
     if code == AccessCode.CHANNEL:
-        _sample(fields, find)
+        for field in fields:
+            if field.type == _SAMPLING:
+                _sampling(field, find)
+            elif field.type == _SAMPLE:
+                _sample_form(field, find)
     elif code == AccessCode.SECURITY:
         _security(fields, find, octets, framed)
     elif code == AccessCode.SECURITY_2024:
@@ -144,14 +148,6 @@ def _uncertainty(fields: tuple[Field, ...], find: Find) -> None:
         if field.name == "OError" and isinstance(field.value, float) and field.value < 0:
             message = "The uncertainty OError is negative."
             find("warning", "negative", message, field.offset, "OError", ">= 0", field.value)
-
-
-def _sample(fields: tuple[Field, ...], find: Find) -> None:
-    for field in fields:
-        if field.type == _SAMPLING:
-            _sampling(field, find)
-        elif field.type == _SAMPLE:
-            _sample_form(field, find)
 
 
 def _sample_form(field: Field, find: Find) -> None:

@@ -345,7 +345,9 @@ def _text(value: object) -> tuple[str, bytes, int]:
 
 def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., None]) -> tuple[bytes, ...]:
     """Texts behind the directory, without their checksums; deviations go to ``find``."""
-    known = _lengths(fields)
+    # octets of each text, as the directory counts them
+    entries = (child for field in fields if field.name == "DirBlock" for child in field.children)
+    known = [child.value for child in entries if child.type == 22 and isinstance(child.value, int)]
     if known and sum(known) == len(area) and min(known) >= 2:
         return _cut(area, known, at, find)
     if known and sum(known) + 2 * len(known) == len(area):
@@ -360,12 +362,6 @@ def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., No
         message = f"The directory counts {sum(known)} octets of text, {len(area)} are there."
         find("warning", "text-length", message, at, "Length", len(area), sum(known))
     return (area,) if area else ()
-
-
-def _lengths(fields: list[Field]) -> list[int]:
-    """Octets of each text, as the directory counts them."""
-    entries = (child for field in fields if field.name == "DirBlock" for child in field.children)
-    return [child.value for child in entries if child.type == 22 and isinstance(child.value, int)]
 
 
 def _cut(area: bytes, lengths: list[int], at: int, find: Callable[..., None]) -> tuple[bytes, ...]:

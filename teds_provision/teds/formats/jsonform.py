@@ -72,7 +72,9 @@ def entry_to_json(entry: Entry) -> dict[str, Any]:
 def value_to_json(value: object) -> Any:
     """JSON of a field's value: octets as hex digits, numbers that JSON has no word for as NaN, INF, -INF in quotes."""
     if isinstance(value, float):
-        return _float_to_json(value)
+        if math.isfinite(value):
+            return value
+        return "NaN" if math.isnan(value) else "INF" if value > 0 else "-INF"
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, Units):
@@ -81,12 +83,6 @@ def value_to_json(value: object) -> Any:
         sign = {"negative": True} if value.negative else {}
         return {"seconds": value.seconds, "nanoseconds": value.nanoseconds, **sign}
     return [value_to_json(part) for part in value] if isinstance(value, tuple) else value
-
-
-def _float_to_json(value: float) -> float | str:
-    if math.isfinite(value):
-        return value
-    return "NaN" if math.isnan(value) else "INF" if value > 0 else "-INF"
 
 
 def _block(entry: object, number: int) -> Block:
@@ -152,7 +148,7 @@ def _value(kind: object, value: object, where: str) -> tuple[Kind, EntryValue]:
         case "integers", list() if set(map(type, value)) <= {int}:
             return "integers", tuple(value)
         case "numbers", list():
-            return "numbers", _floats(value, where)
+            return "numbers", tuple(_float(part, where) for part in value)
         case "number", _:
             return "number", _float(value, where)
         case "integer" | None, int() if type(value) is int:
@@ -167,10 +163,6 @@ def _time(value: Mapping[str, object], where: str) -> TimeInstance:
         _number(value.get(part, 0), (1 << 48) - 1, f"{part} of {where}") or 0 for part in ("seconds", "nanoseconds")
     )
     return TimeInstance(seconds, nanoseconds, value.get("negative") is True)
-
-
-def _floats(value: list[object], where: str) -> tuple[float, ...]:
-    return tuple(_float(part, where) for part in value)
 
 
 def _float(value: object, where: str) -> float:

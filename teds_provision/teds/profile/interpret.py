@@ -29,6 +29,7 @@ from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 MAXIMUM_CHANNEL: Final = 255
 _RANGE: Final = re.compile(r"(\d+)(?:-(\d+))?\Z")
+_FRAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z")
 _KEY_CHOICES: Final = {"auto": -1, **CALIBRATION_KEYS}
 _KEY: Final = Key("calibration-key", "CalKey", Kind.CHOICE, "who applies the calibration", choices=_KEY_CHOICES)
 
@@ -96,11 +97,16 @@ def _channel(section: Section, number: int) -> ChannelProfile | None:
     if display and unit and parse_unit_or_report(section, "display-unit", display, unit) is None:
         display = None
     name = section.name("name").replace("{channel}", str(number))
+    frame = section.text("frame").replace("{channel}", str(number))
+    if frame and not _FRAME.fullmatch(frame.replace("{node}", "n")):
+        section.error("frame", 'letters, digits, _ and / are expected, and {node} for the node: "{node}_link".')
     demand = _demand(section, unit)
     section.finish()
     if len(section.problems.errors) > before or unit is None:
         return None
-    channel = ChannelProfile(number, name, unit, fields, demand, None if key in (None, -1) else cast(int, key), display)
+    channel = ChannelProfile(
+        number, name, unit, fields, demand, None if key in (None, -1) else cast(int, key), display, frame
+    )
     _check_channel(section, channel)
     return channel
 

@@ -45,7 +45,10 @@ class CalibrationDemand:
 
 @dataclass(frozen=True)
 class ChannelProfile:
-    """One TransducerChannel; ``fields`` by TEDS name are ready to be composed (SI units); CalKey is not in it."""
+    """One TransducerChannel; ``fields`` by TEDS name are ready to be composed (SI units); CalKey is not in it.
+
+    ``frame`` is the coordinate frame of its values for robots, ``{node}`` in it stands for the node's name.
+    """
 
     number: int
     name: str
@@ -54,6 +57,7 @@ class ChannelProfile:
     calibration: CalibrationDemand = CalibrationDemand()
     calibration_key: int | None = None
     display: str | None = None
+    frame: str = ""
 
     @property
     def units(self) -> Units:
@@ -248,5 +252,5 @@ def _calibration_warnings(channel: ChannelProfile, given: Calibration | None, no
     if channel.calibration_key == _CAL_NONE:
         warnings.append(f"{where} has a calibration, but its calibration key says that there is none.")
     if demand.method and demand.method != given.method:
-        warnings.append(f"{where}: its type asks for the method {demand.method}; the calibration is {given.method}.")
+        warnings.append(f"{where}: this type expects the calibration method {demand.method}, but got {given.method}.")
     return warnings

@@ -380,7 +380,9 @@ class Section:
             case Kind.NUMBER:
                 return finite(_number(value))
             case Kind.FLAG:
-                return _flag(value)
+                if not isinstance(value, bool):
+                    raise _Wrong(f"true or false is expected, not {_shown(value)}.")
+                return int(value)
             case Kind.CHOICE:
                 return _choice(key, value)
             case Kind.CHOICES:
@@ -405,12 +407,6 @@ def finite(value: float) -> float:
     if not math.isfinite(value) or abs(value) > FLOAT32_MAXIMUM:
         raise _Wrong(f"{value} does not fit a Float32.")
     return value
-
-
-def _flag(value: object) -> int:
-    if not isinstance(value, bool):
-        raise _Wrong(f"true or false is expected, not {_shown(value)}.")
-    return int(value)
 
 
 def _not_negative(value: float) -> float:

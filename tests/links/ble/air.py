@@ -84,7 +84,7 @@ class Everything:
 
     def __init__(self) -> None:
         self.link = Air()
-        self.nodes: list[Cut] = []
+        self.nodes: list[Any] = []
         self.virtual: list[VirtualNode] = []
         self.pulse = Pulse()
         self.bluez: Any = None
@@ -96,7 +96,7 @@ class Everything:
         self.pulse.start()
         self.stranger_seconds = config.get("stranger_seconds", 10.0)
         for number, folder in enumerate(config.get("nodes", [])):
-            await self.add(number, Path(folder))
+            await (self.add_in_c if config.get("in_c") else self.add)(number, Path(folder))
         for port in config.get("hci", []):
             transport = await open_transport(f"tcp-server:127.0.0.1:{port}")
             self.keep.append((transport, self.controller(f"H{port}", transport)))
@@ -132,6 +132,14 @@ class Everything:
         node.streams_over(send, "ble")
         self.nodes.append(peripheral)
         self.virtual.append(node)
+
+    async def add_in_c(self, number: int, folder: Path) -> None:
+        """The same node as firmware: the C library takes over what the folder holds."""
+        from tests.firmware.ble_board import CPeripheral
+
+        peripheral = CPeripheral(folder)
+        await peripheral.power_on(self.host(f"N{number}", f"00:D8:57:00:{number >> 8:02X}:{number & 255:02X}"))
+        self.nodes.append(peripheral)
 
     async def stand_in(self, bus_address: str, manners: dict[str, Any]) -> None:
         from dbus_fast.aio import MessageBus

@@ -35,6 +35,7 @@ class Radio:
         manners: dict[str, Any] | None = None,
         hci: list[int] | None = None,
         stranger_seconds: float = 10.0,
+        in_c: bool = False,
     ) -> None:
         self.path = folder / "bus"
         self._processes: list[subprocess.Popen[str]] = []
@@ -52,6 +53,7 @@ class Radio:
                 "manners": manners or {},
                 "hci": hci or [],
                 "stranger_seconds": stranger_seconds,
+                "in_c": in_c,
             }
         )["nodes"]
 

@@ -306,7 +306,7 @@ def test_who_has_a_session_stays(air: Air, port: Ports) -> None:
 def test_a_new_node_advertises_only_after_a_tap(air: Air, port: Ports, tmp_path: Path) -> None:
     described.create(tmp_path / "new", profile=ANGLE)
     radio = air([tmp_path / "new"])
-    with pytest.raises(NoNode, match="No such node was met"):
+    with pytest.raises(NoNode, match="The node did not answer"):
         find(port(), seconds=1.5)
     radio.do("tap", 0)
     assert find(port()).identity

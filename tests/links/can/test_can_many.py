@@ -6,17 +6,19 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from teds_provision.doctor import links as doctor
 from teds_provision.doctor.registry import System
-from teds_provision.errors import LinkFailure, UsageFailure
+from teds_provision.errors import LinkFailure, NodeSilent, UsageFailure
 from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
+from teds_provision.protocol.messages.identity import Identity
 from tests.links.can.hub import Hub
 from tests.links.can.test_can_loss import assert_all_found
 from tests.pace import PATIENCE, best_of, until
@@ -94,6 +96,41 @@ def test_everyone_is_asked_while_exchanges_run(hub: Hub, nodes: Start) -> None:
     assert results[4] is True, results[4]
     assert all(isinstance(count, int) and count for count in results[:4]), results
     port.close()
+
+
+def test_a_question_is_given_up_when_the_node_announces_itself(hub: Hub, nodes: Start) -> None:
+    """It has not heard the question; whoever asks it now need not wait for the old one."""
+    with closing(CanPort(hub.spec)) as port:
+        found: list[Identity | None] = []
+        asking = threading.Thread(
+            target=lambda: found.append(port.identify(0x21, seconds=5 * PATIENCE, until_announced=True))
+        )
+        with closing(Bus(parse_spec(hub.spec))) as beside:
+            asking.start()
+            until(lambda: (frame := beside.receive(0.1)) is not None and frame.identifier >> 8 & 0xFF == 0x21)
+        nodes(hub.spec, 0x21)
+        asking.join(PATIENCE)
+        assert found == [None]
+        assert port.identify(0x21, seconds=PATIENCE) is not None
+
+
+def test_an_exchange_is_given_up_when_nobody_hopes_for_its_reply(hub: Hub) -> None:
+    with closing(CanPort(hub.spec)) as port:
+        link, over = port.link(0x21), threading.Event()
+        link.hopeless = over.is_set
+        ended: list[type] = []
+
+        def ask() -> None:
+            try:
+                link.ask(write(b"x"), tries=3, seconds=5 * PATIENCE)
+            except LinkFailure as failure:
+                ended.append(type(failure))
+
+        asking = threading.Thread(target=ask)
+        asking.start()
+        over.set()
+        asking.join(PATIENCE)
+        assert ended == [NodeSilent]
 
 
 def test_a_listener_hears_what_it_wants_beside_an_exchange(hub: Hub, nodes: Start) -> None:

@@ -208,7 +208,8 @@ def test_other_records_and_services_beside_ours_do_not_matter(start_node: StartN
 def test_another_node_is_waited_past_and_named(start_node: StartNode, port: Port, notices: list) -> None:
     start_node()
     waited_past(port, notices, OTHER)
-    assert [UUID.lower() in notice.text for notice in notices] == [True]
+    named = [UUID.lower() in notice.text for notice in notices if notice.kind != "retry"]  # a busy machine tries again
+    assert named == [True]
 
 
 def test_an_empty_reader_gives_no_node_in_time(port: Port, notices: list) -> None:

@@ -1,0 +1,77 @@
+"""A lab's own datasheet XML becomes a type by a small mapping file; what is wrong in either is named."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import BadData
+from teds_provision.teds.formats.mapped import profile_from_xml
+from teds_provision.teds.profile.load import parse_profile
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "xml"
+MAP = 'channel = "c"\n[channel-keys]\nname = "n"\n'
+XML = b"<d><c><n>force</n></c></d>"
+
+
+@pytest.mark.parametrize(
+    ("name", "channels"),
+    [
+        ("angle", {1: ("angle", "degree", 0.0, 6.2831853)}),
+        ("virtual", {1: ("force x", "N", -5.0, 5.0), 2: ("force z", "N", -20.0, 20.0),
+                     3: ("temperature", "degC", 273.15, 333.15)}),
+    ],
+)  # fmt: skip
+def test_the_examples_become_types_with_limits_in_their_units(
+    name: str, channels: dict[int, tuple[str, str, float, float]]
+) -> None:
+    mapping = (EXAMPLES / f"{name}-map.toml").read_text()
+    text = profile_from_xml((EXAMPLES / f"{name}.xml").read_bytes(), mapping, name=name)
+    profile = parse_profile(text, name)
+    found = {one.number: (one.name, one.unit.text) for one in profile.channels}
+    assert found == {number: wanted[:2] for number, wanted in channels.items()}
+    for one in profile.channels:
+        ends = (one.fields["LowLimit"], one.fields["HiLimit"])
+        assert ends == pytest.approx(channels[one.number][2:], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("xml", "mapping", "words"),
+    [
+        (XML, "", "channel is missing"),
+        (XML, 'channel = "x"', "no element 'x'"),
+        (XML, 'channel = "c"\n[channels]\n', "unknown key 'channels'"),
+        (XML, 'channel = "c"\n[channel-keys]\nname = "m"\n', "nothing at 'm'"),
+        (XML, 'channel = "c"\n[channel-keys]\nlow-limit = { at = "n", unit = "N" }\n', "'force' at 'n' is no number"),
+        (XML, 'channel = "c"\n[channel-keys]\nnumber = "n"\n', "'force' is no channel number"),
+        (XML, 'channel = "c["\n', "is no path"),
+        (XML, 'channel = "c"\n[channel-keys]\nname = 3\n', "name is no place"),
+        (b"<d>" + b"<c/>" * 256 + b"</d>", 'channel = "c"\n', "at most 255"),
+        (b"<d><c></d>", MAP, "is not XML"),
+        (b'<?xml version="1.0" encoding="no-such"?><d/>', MAP, "is not XML"),
+        (b'<d><c n="' + b"x" * 300 + b'"/></d>', 'channel = "c"\n[channel-keys]\nname = "@n"\n', "more than 200"),
+    ],
+)
+def test_what_is_wrong_is_named(xml: bytes, mapping: str, words: str) -> None:
+    with pytest.raises(BadData, match=words):
+        profile_from_xml(xml, mapping, name="lab")
+
+
+@pytest.mark.parametrize(
+    "bomb",
+    [
+        b'<!DOCTYPE d [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><d><c><n>&b;</n></c></d>',
+        b'<!DOCTYPE d [<!ENTITY a SYSTEM "file:///etc/passwd">]><d><c><n>&a;</n></c></d>',
+        b"<d>" * 2_000_000,
+        b"<d " + b'a="" ' * 3_000_000 + b"/>",
+        b"<d><c><n>" + b"x" * 70_000_000 + b"</n></c></d>",
+    ],
+    ids=["entities", "a file", "depth", "attributes", "length"],
+)
+def test_a_bomb_costs_little(bomb: bytes) -> None:
+    began = time.process_time()
+    with pytest.raises(BadData):
+        profile_from_xml(bomb, MAP, name="lab")
+    assert time.process_time() - began < 1
