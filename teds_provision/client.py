@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote, urlencode, urlsplit
 
 from teds_provision.errors import LinkFailure, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.files import short_path
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
         Group,
         Measurement,
         Node,
+        Past,
+        Plant,
         Provisioning,
         Sheet,
         SheetPlan,
@@ -176,6 +178,11 @@ class Client:
         found: Mode = self.request("PUT", "/detection", {"mode": mode})["mode"]
         return found
 
+    def plant(self) -> Plant:
+        """The plant that the station belongs to; raises ApiError (404) where it joined none."""
+        found: Plant = self.request("GET", "/plant")
+        return found
+
     def discover(self) -> list[Node]:
         """Ask every link now."""
         return list(self.request("POST", "/discover", {})["nodes"])
@@ -194,6 +201,15 @@ class Client:
     def node(self, node: str) -> Node:
         """One node, by UUID, prefix or name."""
         found: Node = self.request("GET", f"/nodes/{quote(node, safe='')}")
+        return found
+
+    def past(
+        self, node: str, channel: int, *, since: float | None = None, until: float | None = None, points: int = 600
+    ) -> Past:
+        """The last hour of a channel, thinned to ``points`` bins; moments in unix seconds (None: an hour ago, now)."""
+        asked = {"channel": channel, "points": points, "from": since, "until": until}
+        words = urlencode({name: value for name, value in asked.items() if value is not None})
+        found: Past = self.request("GET", f"/nodes/{quote(node, safe='')}/past?{words}")
         return found
 
     def teds(self, node: str) -> Sheet:
@@ -228,14 +244,22 @@ class Client:
         name: str | None = None,
         calibration: str | None = None,
         calibration_name: str | None = None,
+        adopt: bool = False,
+        accept_calibration: str | None = None,
         cancel: bool = False,
     ) -> Provisioning:
-        """Provision a node, or the next that is tapped; ``calibration`` is the content of a file of that name."""
+        """Provision a node, or the next that is tapped; ``calibration`` is the content of a file of that name.
+
+        ``adopt``: in place of a profile the datasheet that the board brought is signed; ``accept_calibration`` says why
+        it is right where something was found.
+        """
         body = {
             "profile": profile,
             "name": name,
             "calibration": calibration,
             "calibration_name": calibration_name,
+            "adopt": adopt,
+            "accept_calibration": accept_calibration,
             "cancel": cancel,
         }
         found: Provisioning = self.request("POST", f"/nodes/{quote(node, safe='')}/provision", body)

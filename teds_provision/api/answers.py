@@ -84,6 +84,23 @@ class Channel(TypedDict):
     actuator: ActuatorState | None
 
 
+class Past(TypedDict):
+    """The last hour of a channel, thinned; a bin in which nothing happened is left out."""
+
+    uuid: Uuid
+    channel: int
+    rate: Annotated[float, Meta(description="samples a second that come now")] | None
+    since: Time
+    until: Time
+    bin: Annotated[float, Meta(description="width of a bin in seconds")]
+    time: Annotated[list[float], Meta(description="when each bin begins, unix seconds")]
+    low: Annotated[list[float | None], Meta(description="least valid value of the bin, SI")]
+    high: Annotated[list[float | None], Meta(description="greatest valid value of the bin, SI")]
+    count: Annotated[list[int], Meta(description="samples that came")]
+    invalid: list[int]
+    lost: list[int]
+
+
 class Invalid(TypedDict):
     """Samples of a channel that are not valid, by reason."""
 
@@ -132,6 +149,9 @@ class Node(TypedDict):
     mode: NotRequired[Literal["idle", "measuring"] | None]
     whitelisted: bool
     virtual: bool
+    unverified: Annotated[
+        bool, Meta(description="name, channels and values are what it says itself; nobody signed that")
+    ]
     fingerprint: NotRequired[str | None]
     epoch: NotRequired[int]
     sequence: NotRequired[int]
@@ -250,6 +270,7 @@ class Status(TypedDict):
     sinks: list[Sink]
     clock_error: float | None
     budget: Budget
+    plant: bool
     write: Annotated[bool, Meta(description="whether this token may change anything")]
 
 
@@ -410,6 +431,53 @@ class DetectionMode(TypedDict):
     """Which nodes the station looks at."""
 
     mode: Mode
+
+
+class PlantStation(TypedDict):
+    """Where a station of the plant stands: its newest page that counts, and seconds since that was made."""
+
+    name: str
+    fingerprint: str
+    roles: list[str]
+    page: int
+    age: int | None
+    state: str
+
+
+class PlantConflict(TypedDict):
+    """A node on which stations do not agree."""
+
+    uuid: Uuid
+    conflict: str
+    detail: str
+
+
+class PlantAlarm(TypedDict):
+    """What a person has to know of the plant, or to decide."""
+
+    code: str
+    about: str
+    why: str
+    at: str
+    seen: bool
+
+
+class Plant(TypedDict):
+    """The plant that this station belongs to; ``age`` in seconds since the last sync."""
+
+    registry: str
+    name: str
+    roster: int
+    expires: Time
+    state: str
+    why: str
+    synced: Time | None
+    age: float | None
+    unsent: int
+    to_rotate: int
+    stations: list[PlantStation]
+    conflicts: list[PlantConflict]
+    alarms: list[PlantAlarm]
 
 
 class Found(TypedDict):

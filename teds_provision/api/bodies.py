@@ -59,6 +59,12 @@ class Order:
     name: str | None = None
     calibration: Annotated[str, Meta(description="the content of a calibration file")] | None = None
     calibration_name: Annotated[str, Meta(description="the name of that file")] | None = None
+    adopt: (
+        Annotated[bool, Meta(description="sign the datasheet that the board brought, in place of a profile")] | None
+    ) = None
+    accept_calibration: (
+        Annotated[str, Meta(description="why a datasheet with findings of severity error is right")] | None
+    ) = None
     cancel: Annotated[bool, Meta(description="stop waiting for a tap")] | None = None
 
 

@@ -16,8 +16,12 @@ MOST_ENTRIES: Final = 10_000
 """Entries of the log in one answer."""
 FURTHEST: Final = 10_000_000
 LONGEST_TEXT: Final = 200
+LAST_CHANNEL: Final = 255
+MOST_POINTS: Final = 3600
+"""Bins of the past of a channel in one answer."""
 
 _TEXT: Final[Schema] = {"type": "string"}
+_MOMENT: Final[Schema] = {"type": "string", "description": "ISO 8601, or unix seconds"}
 
 
 @dataclass(frozen=True)
@@ -46,10 +50,14 @@ OPERATIONS: Final = (
     Operation("GET", "/detection", "Get the detection mode.", answers.DetectionMode),
     Operation("PUT", "/detection", "Set the detection mode, and look at every link again.", answers.DetectionMode,
               bodies.Detection),
+    Operation("GET", "/plant", "Get the plant that this station belongs to; 404 where it joined none.", answers.Plant),
     Operation("POST", "/discover", "Ask every link now.", answers.Found, bodies.Nothing),
     Operation("GET", "/nodes", "List nodes, those that are present first.", answers.Nodes,
               query={"limit": _integer(1, MOST_NODES), "offset": _integer(0, FURTHEST)}),
     Operation("GET", "/nodes/{uuid}", "Get a node, by UUID, prefix or name.", answers.Node),
+    Operation("GET", "/nodes/{uuid}/past", "Get the last hour of a channel: least, greatest, count, invalid, lost.",
+              answers.Past, query={"channel": _integer(1, LAST_CHANNEL), "from": _MOMENT, "until": _MOMENT,
+                                   "points": _integer(1, MOST_POINTS)}),
     Operation("GET", "/nodes/{uuid}/teds", "Read a node's datasheet: decoded and checked, or as a document.",
               (answers.Sheet, answers.Document),
               query={"format": {"type": "string", "enum": ["json", "xml", "hex"]}}, document=True),
@@ -85,7 +93,7 @@ OPERATIONS: Final = (
             "text": {"type": "string", "maxLength": LONGEST_TEXT},
             "act": _TEXT,
             "failed": _TEXT,
-            "since": {"type": "string", "description": "ISO 8601, or unix seconds"},
+            "since": _MOMENT,
         },
     ),
     Operation("POST", "/login-link", "Get the page's address with a token that works once (Unix socket only).",

@@ -25,6 +25,7 @@ from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.nodes.sheets import Sheets
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.nodes.watching import Watch
+from teds_provision.ncap.plant import PlantWatch
 from teds_provision.ncap.settings import Detection, Settings, own_source, with_source
 from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.web.tokens import Tokens
@@ -56,10 +57,11 @@ class Daemon:
         self.measuring = Measuring(
             station, self.roster, self.live, self.turns, self.buses, sinks, self._admits, dead_man=settings.dead_man
         )
+        self.turns.given = self._free_again
         self._takes_set_points = sinks.take_set_points
         self.names = Names(station, self.roster, self.live, self.measuring.is_measured, self.measuring.facts_of)
         self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
-        self.provisioning = Provisioning(station, self.roster, self.live, self.desk)
+        self.provisioning = Provisioning(station, self.roster, self.live, self.desk, self.measuring.apart)
         self.holding = Holding(
             station,
             self.live,
@@ -70,7 +72,10 @@ class Daemon:
             dead_man=settings.dead_man,
         )
         self.virtuals = Virtuals(station, self.live)
-        self.adopting = Adopting(station, self.roster, self.live, self.virtuals, lambda: self._adopts)
+        self.plant = PlantWatch(station, self.live, self._plant_changed)
+        self.adopting = Adopting(
+            station, self.roster, self.live, self.virtuals, lambda: self._adopts, signs=settings.yes
+        )
         self.roster.topic, self.roster.actuator = self.names.topic, self.holding.state
         self.roster.virtual = lambda uuid: uuid in self.virtuals
         self.url: str | None = None
@@ -91,11 +96,16 @@ class Daemon:
             self.set_detection(self.settings.detection)
         self.roster.refresh()
         self._observer.start()
+        self.live.past.start()
         for watch in self.watches:
             watch.start()
         if self.virtuals.all():
             self._start_virtuals()
         self.measuring.start()
+        if self.settings.unverified:
+            self.measuring.unverified(rate=self.settings.rate)
+        if self.settings.registry:
+            self.plant.start()
         if self.settings.measure is not None:
             self.measuring.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
         try:
@@ -106,6 +116,7 @@ class Daemon:
     def _end(self) -> None:
         """Actuators safe first, then claims released and files closed, then links, then the virtual nodes."""
         self._stop.set()
+        self.plant.stop()
         self.holding.end()
         self.measuring.stop()
         for watch in self.watches:
@@ -115,6 +126,7 @@ class Daemon:
         for watch in self.watches:
             watch.join(max(0.1, until - time.monotonic()))
         self.virtuals.stop()
+        self.live.past.close()
         self._observer.join(_LOOK)
 
     async def serve(self, begin: Callable[[], Any], stop: asyncio.Event) -> None:
@@ -127,6 +139,11 @@ class Daemon:
             fan.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await fan
+
+    def _plant_changed(self) -> None:
+        """Pages, keys or a roster came: pins, bans and verdicts may be others."""
+        self.roster.refresh()
+        self.live.event("store", state="changed")
 
     def _watch(self, place: str) -> Watch:
         def transparent() -> bool:
@@ -165,6 +182,11 @@ class Daemon:
             if watch.port is sighting.port:
                 watch.saw(sighting)
 
+    def _free_again(self, uuid: str) -> None:
+        """A node was looked at, or provisioned: now it may be one that is measured."""
+        if self.roster.seen(uuid).present:
+            self.measuring.saw(uuid)
+
     def serve_node(self, node: Conversation) -> bool:
         """Whether somebody asked for this node, or it is to be taken up; then that was done."""
         return self.desk.serve(node) or self.adopting.serve(node)
@@ -196,6 +218,7 @@ class Daemon:
             "sinks": self.measuring.sinks(),
             "clock_error": self.measuring.clock_error(),
             "budget": self.measuring.budget(),
+            "plant": self.station.plant.joined is not None,
         }
 
     def _admits(self, set_point: Command) -> bool:
@@ -236,6 +259,7 @@ class Daemon:
         with self.station.durable("detection"):
             self.station.measurements.detection = mode  # type: ignore[assignment]
             self.station.audit("detection", None, "set", mode=mode)
+        self.measuring.look_who_is_meant()
         self.live.event("detection", state=mode)
         for watch in self.watches:
             if changes:
@@ -323,6 +347,7 @@ class Daemon:
 
     def _group_changed(self, name: str) -> None:
         self.roster.refresh()
+        self.measuring.look_who_is_meant()
         self.live.event("group", state="changed", name=name)
 
     # -- virtual transducers -----------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.lazy import late
 from teds_provision.measure.sinks.lines import plain
+from teds_provision.ncap.past import Past
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN
 
@@ -104,9 +105,13 @@ class _Channel:
 
 
 class Live:
-    """The fan-out. ``block`` and ``event`` may be called from any thread and return at once."""
+    """The fan-out. ``block`` and ``event`` may be called from any thread and return at once.
+
+    ``past`` keeps the last hour of what comes.
+    """
 
     def __init__(self) -> None:
+        self.past = Past()
         self._lock = threading.Lock()
         self._waiting: deque[Block] = deque()
         self._channels: dict[Key, _Channel] = {}
@@ -123,6 +128,7 @@ class Live:
 
     def block(self, block: Block) -> None:
         """Samples of a stream."""
+        self.past.block(block)
         with self._lock:
             if len(self._waiting) >= _WAITING:
                 self._waiting.popleft()

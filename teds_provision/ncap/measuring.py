@@ -9,14 +9,23 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
-from teds_provision.errors import Frozen, NodeBusy, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import (
+    Frozen,
+    LinkFailure,
+    NodeBusy,
+    NotFound,
+    PolicyRefused,
+    TedsProvisionError,
+    UsageFailure,
+)
 from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport, StationFacts
 from teds_provision.measure.buses import Buses
-from teds_provision.measure.matching import Match, why_not_measured
+from teds_provision.measure.lookout import Lookout
+from teds_provision.measure.matching import Match, Of, Unsigned, why_not_measured
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
@@ -35,7 +44,9 @@ from teds_provision.store import Measurement
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 
+_ADOPTED: Final = "adopted"
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; whoever asks waits 5
+ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 SCALAR_RATE: Final = 10.0
 """Values a second on a topic of one value, where a measurement does not say."""
@@ -86,6 +97,8 @@ class Measuring:
         dead_man: int = DEAD_MAN,
     ) -> None:
         self._station, self._roster, self._live, self._turns = station, roster, live, turns
+        self._unverified: Unsigned | None = None
+        self._adopted: set[bytes] = set()
         self._buses, self._sinks, self._admits = buses, sinks, admits
         self._dead_man = dead_man
         self._running: dict[str, Running] = {}
@@ -113,12 +126,47 @@ class Measuring:
             return  # it is kept already
         self._begin(Measurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
 
+    def unverified(self, *, rate: float | None = None) -> None:
+        """Measure every node that describes itself by what nobody has signed, marked so (``--adopt --unverified``).
+
+        One that is signed meanwhile is measured on as what it is then, where no other measurement takes it.
+        """
+        self._unverified = Unsigned()
+        for name in (self._unverified.text, _ADOPTED):
+            self._begin(Measurement(name, match=name, rate=rate, dead_man=self._dead_man))
+
+    @contextmanager
+    def apart(self, uuid: str, why: str) -> Iterator[None]:
+        """A node that is measured unverified is nobody's for the length of the block, in which it may be signed."""
+        loan = Loan(uuid, why)
+        with self._guard:
+            every = [one for one in self._running.values() if one.newcomers is not None and uuid in one.uuids]
+        mine = [one.newcomers for one in every if one.kept.id == Unsigned.text and one.newcomers is not None]
+        with self._lending:
+            self._loans.setdefault(uuid, []).append(loan)
+        try:
+            for newcomers in mine:
+                newcomers.part(uuid, why)
+            until = time.monotonic() + LETTING_GO
+            while mine and self.of(uuid) is not None and time.monotonic() < until:
+                time.sleep(0.05)
+            yield
+        finally:
+            self.give_back(loan)
+
     def saw(self, uuid: str) -> None:
         """A node answered on a bus; called before anybody else looks at it."""
         with self._guard:
             every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
         for newcomers in every:
             newcomers.saw(uuid)
+
+    def look_who_is_meant(self) -> None:
+        """What an expression may name was changed by this process: a group, the detection mode."""
+        with self._guard:
+            every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
+        for newcomers in every:
+            newcomers.look_who_is_meant()
 
     def stop(self) -> None:
         """End all of them in order; what is kept stays kept."""
@@ -198,6 +246,11 @@ class Measuring:
 
     def _require_plan(self, uuid: bytes, kept: Measurement) -> None:
         """Raise BadData or PolicyRefused where the datasheet that is known says that it can never be measured so."""
+        why = why_not_measured(self._station, uuid)
+        if why:
+            raise PolicyRefused(
+                f"Node {uuid.hex()} cannot be measured: {why}.", hint=f"Provision it first: provision {uuid.hex()}"
+            )
         image = self._station.nodes.datasheet(uuid)
         if image is None:
             return
@@ -294,6 +347,7 @@ class Measuring:
 
     def give_back(self, loan: Loan) -> None:
         """Measure it again, unless somebody else still has it."""
+        self._ask_where_it_is(bytes.fromhex(loan.uuid))
         with self._lending:
             loan.ended = True
             loans = self._loans.get(loan.uuid, [])
@@ -309,6 +363,16 @@ class Measuring:
                 return
         if self._roster.seen(loan.uuid).present:
             self.saw(loan.uuid)
+
+    def _ask_where_it_is(self, uuid: bytes) -> None:
+        """A node that was given another address does not announce it: it is asked there, as the store knows it."""
+        seen, record = self._buses.sightings.seen_at(uuid), self._station.nodes.get(uuid)
+        if seen is None or record is None or record.can_address in (None, seen.address):
+            return
+        lookout = self._buses.of(seen).lookout
+        if isinstance(lookout, Lookout):
+            with suppress(LinkFailure):
+                lookout.ask(record.can_address, ANSWERING)
 
     def sheet(self, uuid: str) -> Image | None:
         """The datasheet of a node that is measured: the one that its session verified, and that nobody may change."""
@@ -401,13 +465,24 @@ class Measuring:
                 self._turns.give(uuid)
                 self._roster.note(uuid, "idle", measurement=None, report=None)
 
-    def _new_job(self, one: Running) -> Job:
+    def _who(self, kept: Measurement) -> Match | Unsigned | Of:
+        if self._unverified is not None and kept.id in (Unsigned.text, _ADOPTED):
+            return self._unverified if kept.id == Unsigned.text else Of(self._adopted)
+        return Match.parse(kept.match or "")
+
+    def _is_for(self, uuid: str, one: Running) -> bool:
+        """Whether a node is another measurement's: what nobody has signed is that of what is unverified."""
+        if self._unverified is None or one.kept.id == Unsigned.text:
+            return False
+        return not self._unverified.why_not(self._station, bytes.fromhex(uuid))
+
+    def _new_job(self, one: Running, *, unverified: bool = False) -> Job:
         return Job(
             self._station,
             one.kept,
             more=lambda take: self._sinks.more(one.kept, take),
             admits=self._admits if self._sinks.moves(one.kept) else None,
-            request=MeasurementRequest(patient=True, by="ncap"),
+            request=MeasurementRequest(patient=True, by="ncap", unverified=unverified),
             opened=self._sinks.open,
         )
 
@@ -441,6 +516,8 @@ class Measuring:
             with self._guard:
                 one.uuids = (*one.uuids, uuid)
             self._roster.note(uuid, measurement=one.kept.id)
+            if unverified:
+                self._adopted.add(bytes.fromhex(uuid))
 
         def left(uuid: str) -> None:
             with self._guard:
@@ -454,15 +531,16 @@ class Measuring:
             self._live.event("measurement", state="waiting", id=one.kept.id, uuid=uuid, why=why)
 
         try:
-            job = one.job = self._new_job(one)
+            unverified = one.kept.id == Unsigned.text
+            job = one.job = self._new_job(one, unverified=unverified)
             newcomers = Newcomers(
                 self._station,
                 self._roster,
                 self._turns,
                 self._buses,
                 job,
-                Match.parse(one.kept.match),
-                elsewhere=lambda uuid: self.of(uuid) is not None or uuid in self._loans,
+                self._who(one.kept),
+                elsewhere=lambda uuid: self.of(uuid) is not None or uuid in self._loans or self._is_for(uuid, one),
                 listed=lambda: self._station.measurements.detection == "whitelist",
                 joined=joined,
                 left=left,
@@ -523,7 +601,11 @@ class Measuring:
         def note(text: str) -> None:
             self._live.event("measurement", state="note", id=one.kept.id, why=text)
 
-        return Watcher(self._live.block, facts, report, sink, note)
+        def read(uuid: bytes) -> None:
+            self._roster.refresh([uuid.hex()])
+            self._roster.note(uuid.hex(), "verified", looked=time.time())
+
+        return Watcher(self._live.block, facts, report, sink, note, read)
 
     def _report(self, one: Running, said: NodeReport) -> None:
         names = ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid", "clock_error")
@@ -557,7 +639,9 @@ class Measuring:
             state = "waiting"
         else:
             return
-        self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=said.why)
+        ended = state == "left" and one.stop.is_set()
+        why = said.why or ("the measurement ended" if ended else "")
+        self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=why)
 
 
 def _state_of_open(one: Running, job: Job) -> tuple[str, str]:

@@ -96,11 +96,12 @@ class Names:
 
     def _made(self, station: StationFacts) -> Topics:
         topics = Topics(station)
-        topics.learn(
-            ChannelFacts(uuid, self._roster.name(uuid), number, name)
-            for uuid in self._roster.uuids()
-            for number, name in self._roster.channel_names(uuid)
-        )
+        for uuid in self._roster.uuids():
+            called, unverified = self._roster.called(uuid)
+            topics.learn(
+                ChannelFacts(uuid, called, number, name, unverified=unverified)
+                for number, name in self._roster.channel_names(uuid)
+            )
         return topics
 
     def _topics_of(self, uuid: str, now: Topics) -> Topics:

@@ -21,7 +21,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.keeper import NodeKeeper
 from teds_provision.measure.lookout import Lookout
-from teds_provision.measure.matching import Load, Match, load_of, why_not_measured
+from teds_provision.measure.matching import Load, Match, Of, Unsigned, load_of, why_not_measured
 from teds_provision.measure.runner import Measurement
 from teds_provision.measure.running.job import Job
 from teds_provision.measure.sightings import Sighting
@@ -86,7 +86,7 @@ class Newcomers:
         turns: Turns,
         buses: Buses,
         job: Job,
-        match: Match,
+        match: Match | Unsigned | Of,
         *,
         elsewhere: Callable[[str], bool],
         listed: Callable[[], bool],
@@ -98,13 +98,14 @@ class Newcomers:
         self._station, self._roster, self._turns, self._buses, self._job = station, roster, turns, buses, job
         self._match, self._elsewhere, self._listed, self._budget = match, elsewhere, listed, budget
         self._told_joined, self._told_left, self._told_waiting = joined, left, waiting
-        self.news = threading.Event()
+        self.news, self._anew = threading.Event(), threading.Event()
         self._guard = threading.Lock()
         self._members: dict[str, _Member] = {}
         self._arrived: dict[str, float] = {}  # whose turn is taken, and who is to be started
         self._busy: dict[str, float] = {}  # who is worked with by somebody else, and when to look again
         self._waits: dict[str, _Waits] = {}
         self._lost: dict[str, _Lost] = {}
+        self._places: dict[str, Sighting] = {}  # where each was measured, or was to be
         self._version: object = None
         self._welcomed, self._followed = -WELCOMING, -FOLLOWING
         self._began = time.monotonic()
@@ -142,6 +143,17 @@ class Newcomers:
             self._busy.pop(uuid, None)
             self._arrived[uuid] = time.monotonic()
         self.news.set()
+
+    def look_who_is_meant(self) -> None:
+        """See anew who is meant, as after a change by another process; from any thread."""
+        self._anew.set()
+
+    def part(self, uuid: str, why: str) -> None:
+        """Let a node go for good; it may come again."""
+        with self._guard:
+            member = self._members.get(uuid)
+        if member is not None and member.keeper is not None:
+            member.keeper.stop(why)
 
     # -- the measurement's thread ------------------------------------------------------------------------------------
 
@@ -204,15 +216,21 @@ class Newcomers:
             self._welcomed = now
             held = {uuid for uuid, *_ in self._station.keys.each_name()}
             self._buses.sightings.welcome(held)
-        if version == self._version or now - self._followed < FOLLOWING:
+        changed = version != self._version or self._anew.is_set()
+        if not changed or now - self._followed < FOLLOWING:
             return
+        self._anew.clear()
         self._version, self._followed = version, now
         for uuid, member in list(self._members.items()):
             why = self._why_not(uuid)
             if why and member.keeper is not None:
                 member.keeper.stop(why)
-        for sighting in self._buses.sightings.all():
-            uuid = sighting.uuid.hex()
+        mended = [
+            uuid for uuid, waits in self._waits.items() if waits.room is None
+        ]  # it may be, what it was refused for
+        for uuid in mended:
+            del self._waits[uuid]
+        for uuid in dict.fromkeys((*mended, *(sighting.uuid.hex() for sighting in self._buses.sightings.all()))):
             if uuid not in self._waits and self._roster.seen(uuid).present:
                 self.saw(uuid)
 
@@ -243,6 +261,8 @@ class Newcomers:
         sighting = self._buses.sightings.seen_at(octets)
         if sighting is None or self._why_not(uuid):
             self._release(uuid)
+            if sighting is None and uuid in self._places:  # a session failed there: whoever answers there joins
+                self._askers.submit(self._ask, self._places[uuid])
             return
         room = self._buses.of(sighting).share.room
         why = self._lacks_room(uuid, room)
@@ -272,6 +292,8 @@ class Newcomers:
             return
         error, sighting = keeper.error, self._buses.sightings.seen_at(keeper.uuid)
         last = keeper.sighting
+        if last is not None:
+            self._places[uuid] = last
         self._release(uuid)
         if isinstance(error, NoRoom) and sighting is not None:
             self._waits[uuid] = _Waits(now + AGAIN, self._buses.of(sighting).share.room)
@@ -289,7 +311,7 @@ class Newcomers:
             return
         member.stack.close()
         for bus in self._buses.all():
-            bus.share.gone(bytes.fromhex(uuid))
+            bus.share.leave(bytes.fromhex(uuid))
         self._turns.give(uuid)
         self._told_left(uuid)
 

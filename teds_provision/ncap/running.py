@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from teds_provision.client import SOCKET
 from teds_provision.errors import StoreLocked
-from teds_provision.files import listen_alone
+from teds_provision.files import listen_alone, open_lock
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.settings import Settings, require_safe
 from teds_provision.ncap.web.app import build
@@ -27,14 +27,14 @@ LOCK: Final = "ncap.lock"
 
 
 class Presence:
-    """``with Presence(home):`` is the one daemon of this home; raises StoreLocked (7) where there is one."""
+    """``with Presence(home):`` is the one daemon of this home; raises StoreLocked where there is one, StoreFailure."""
 
     def __init__(self, home: Path) -> None:
         self._home = home
         self._descriptor = -1
 
     def __enter__(self) -> Presence:
-        descriptor = os.open(self._home / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        descriptor = open_lock(self._home / LOCK)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -44,8 +44,9 @@ class Presence:
                 f"A base station is already running for {self._home} (pid {pid or 'unknown'}).",
                 hint="Show it: teds-provision ncap status. Stop it: kill -TERM PID.",
             ) from None
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        with suppress(OSError):  # who holds it is for people; a full disk has its own, better messages
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         self._descriptor = descriptor
         return self
 

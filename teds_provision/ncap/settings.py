@@ -29,17 +29,21 @@ _MOST_PEM: Final = 1 << 20
 class Settings:
     """``places`` are links as ``can:…`` and ``nfc:…``; ``detection`` None: as it was last set, else ``whitelist``.
 
+    ``adopt``: factory nodes of a wired bus get a key; ``yes``: what such a node says of itself is signed at once.
+    ``unverified``: they are measured by what they say of themselves, marked so.
     ``http`` is (host, port) or None: then only the Unix socket of the home is served. ``sinks`` take what is measured,
     beside those of each measurement; ``brokers`` are URLs by the names under which a measurement may name them;
-    ``record`` is a folder for a recording of each measurement. ``actuators``: whether
-    set points may come by topics of ROS. ``measure`` says whom to measure as they come, at ``rate`` in Hz
-    at most; ``frozen``: only those who are meant at the start. ``dead_man`` in ms holds for whatever is moved, where a
-    measurement says no other. ``trace`` is an open one: every frame of every link is written to it.
+    ``record`` is a folder for a recording of each measurement. ``actuators``: whether set points may come by topics of
+    ROS. ``measure`` says whom to measure as they come, at ``rate`` in Hz at most; ``frozen``: only those who are meant
+    at the start. ``dead_man`` in ms holds for whatever is moved, where a measurement says no other. ``registry``:
+    whether the registry that was joined is followed. ``trace`` is an open one: every frame of every link is written.
     """
 
     places: tuple[str, ...] = ()
     detection: Detection | None = None
     adopt: bool = False
+    yes: bool = False
+    unverified: bool = False
     http: tuple[str, int] | None = None
     allow: tuple[str, ...] = ()
     certificate: Path | None = None
@@ -52,6 +56,7 @@ class Settings:
     measure: str | None = None
     rate: float | None = None
     frozen: bool = False
+    registry: bool = False
     metrics: bool = False
     clause_12: bool = False
     trace: Trace | None = None

@@ -211,7 +211,15 @@ def test_a_measurement_gives_values_freezes_its_nodes_and_ends(service: Service,
     one = until(running)
     assert one["rate"] == 50
     until(lambda: asked.request("GET", "/measurements")["measurements"][0]["nodes"][0]["samples"] > 20)
+    past = asked.past(hand, 2)
+    assert past["count"][-1] > 0
+    assert 0 <= (past["low"][-1] or 0) <= (past["high"][-1] or 0) <= 0.11
+    assert all(len(past[name]) == len(past["time"]) for name in ("low", "high", "count", "invalid", "lost"))
     asked.end_measurement(made["id"])
+    assert asked.past(hand, 2, since=time.time() - 30, points=9)["time"], "it is kept when the measurement has ended"
+    refused(asked, 404, "not-found", "GET", f"/nodes/{hand}/past?channel=200")
+    for words in ("channel=0", "channel=x", "points=0", "points=3601", "from=yesterday"):
+        refused(asked, 422, "usage", "GET", f"/nodes/{hand}/past?{words}")
     assert asked.request("GET", "/measurements")["measurements"] == []
     file = service.station.home / "recordings" / "run.csv"
     assert [str(file)] == one["files"]

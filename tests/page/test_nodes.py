@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from teds_provision import client
 from tests.e2e.desk import ANGLE
+from tests.ncap.test_adopting import brings
+from tests.pace import until
 
 from .lab import Lab, opened
 
@@ -50,7 +53,8 @@ def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Br
         page.get_by_role("link", name="Create a virtual transducer").wait_for()
         page.goto(f"{fresh.url}/#/station")
         page.get_by_role("heading", name="Links").wait_for()
-        fresh.power("oven", nfc=True)  # laid on the reader while the person looks at something else
+        fresh.power("oven", nfc=True)  # laid on the reader while the person looks at something else: the view stays
+        page.get_by_role("link", name="Open it").click()
         page.get_by_text("This one was just tapped").or_(page.locator(".node-head.tapped")).first.wait_for()
         assert fresh.nodes["oven"].uuid in page.url
         page.get_by_role("status").filter(has_text="Tapped").first.wait_for(state="attached")
@@ -187,3 +191,18 @@ def test_a_lost_connection_is_seen_within_two_seconds_and_healed(
             fresh.run()
         page.locator("#connection", has_text="Live").wait_for()
         assert seen < 3  # two seconds, and what a loaded machine adds to this test
+
+
+def test_what_describes_itself_is_shown_unverified_and_signed_by_a_button(browser: Browser, fresh: Lab) -> None:
+    fresh.run("--detection", "transparent", "--adopt", "--unverified", "--rate", "20")
+    node = brings(fresh.desk, "shaft 40 mm", can=fresh.can)
+    with client.connect(home=fresh.station.home) as asked:
+        until(lambda: any(one["uuid"] == node.uuid and one["unverified"] for one in asked.nodes()))
+    with opened(browser, fresh, route=f"nodes/{node.uuid}/datasheet") as page:
+        page.get_by_text("Unverified", exact=True).first.wait_for()
+        page.get_by_role("heading", name="shaft 40 mm", exact=True).wait_for()
+        brought = page.get_by_role("group", name="Datasheet of the board itself")
+        brought.get_by_text("nobody has signed it").wait_for()
+        brought.get_by_role("button", name="Sign this datasheet").click()
+        page.get_by_text("This node is ready.").wait_for()
+        page.get_by_text("Authentic", exact=True).first.wait_for()

@@ -27,9 +27,10 @@ WAIT = 20.0
 
 
 class Turns:
-    """Who works on which node (UUID in hex)."""
+    """Who works on which node (UUID in hex). ``given`` is told each that is free after other work than measuring."""
 
     def __init__(self) -> None:
+        self.given: Callable[[str], None] = lambda _uuid: None
         self._news = threading.Condition()
         self._holders: dict[str, str] = {}
         self._frozen: set[str] = set()
@@ -61,8 +62,11 @@ class Turns:
         """End."""
         with self._news:
             self._holders.pop(uuid, None)
+            measured = uuid in self._frozen
             self._frozen.discard(uuid)
             self._news.notify_all()
+        if not measured:
+            self.given(uuid)
 
     @contextmanager
     def of(self, uuid: str, what: str, *, wait: float = WAIT) -> Iterator[None]:

@@ -10,16 +10,16 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import NodeRefused, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadData, NodeRefused, NotFound, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk, Errand
-from teds_provision.ncap.nodes.looking import as_problem
+from teds_provision.ncap.nodes.looking import STRANGERS_TEDS, as_problem
 from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
@@ -30,6 +30,7 @@ from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.document import write_sheet
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, newcomer, provision
+from teds_provision.steps.read import list_blocks
 from teds_provision.steps.verify import Verified, require_authentic
 from teds_provision.store.audit import ACTOR
 from teds_provision.talk.conversation import Conversation, SessionLost
@@ -63,8 +64,16 @@ class Run:
 class Provisioning:
     """The requests of one daemon, one for each node at a time."""
 
-    def __init__(self, station: Station, roster: Roster, live: Live, desk: Desk) -> None:
+    def __init__(
+        self,
+        station: Station,
+        roster: Roster,
+        live: Live,
+        desk: Desk,
+        apart: Callable[[str, str], AbstractContextManager[None]] = lambda _uuid, _why: nullcontext(),
+    ) -> None:
         self._station, self._roster, self._live, self._desk = station, roster, live, desk
+        self._apart = apart
         self._runs: dict[str, Run] = {}
         self._guard = threading.Lock()
 
@@ -77,9 +86,19 @@ class Provisioning:
         return run.as_json()
 
     def begin(
-        self, uuid: str, *, profile: str | None, name: str | None, calibration: str | None, calibration_name: str | None
+        self,
+        uuid: str,
+        *,
+        profile: str | None,
+        name: str | None,
+        calibration: str | None,
+        calibration_name: str | None,
+        adopt: bool = False,
+        accept: str | None = None,
     ) -> dict[str, Any]:
         """Ask for it; ``uuid`` may be ``next``: whichever node is tapped next. Returns what is waited for.
+
+        ``adopt``: the datasheet that the board brought is signed; ``accept`` says why it is right in spite of findings.
 
         Raises UsageFailure, NotFound, BadData, PolicyRefused for what cannot be built, before anybody is waited for.
         """
@@ -91,7 +110,11 @@ class Provisioning:
         folder = tempfile.TemporaryDirectory(prefix="ncap-")
         try:
             order = BuildOrder(
-                profile=profile, calibration=_file(Path(folder.name), calibration, calibration_name), name=name
+                profile=profile,
+                calibration=_file(Path(folder.name), calibration, calibration_name),
+                name=name,
+                adopt=adopt,
+                accept_calibration=accept,
             )
             prepare(self._station, order, None if uuid == NEXT else bytes.fromhex(uuid))
         except BaseException:
@@ -155,7 +178,8 @@ class Provisioning:
 
     def _on_the_bus(self, run: Run, work: Callable[[Conversation], None], clean: Callable[[], None]) -> None:
         try:
-            self._desk.with_node(run.uuid, "it is provisioned", work)
+            with self._apart(run.uuid, "let go for provision"):
+                self._desk.with_node(run.uuid, "it is provisioned", work)
             clean()
         except NodeRefused as refusal:
             if refusal.reason != Reason.NOT_PERMITTED:
@@ -180,7 +204,9 @@ class Provisioning:
         reporter = _Told(run, self._live)
         try:
             # Whoever asks for this very node, or for the one that they are about to tap, has accepted its key.
-            done: Provisioned = provision(self._station, node, order, accept=lambda _who: None, reporter=reporter)
+            done: Provisioned = provision(
+                self._station, node, order, accept=lambda _who: None, reporter=reporter, adopt=lambda _brought: None
+            )
         except SessionLost as lost:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
@@ -252,19 +278,34 @@ def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
 
 
 class Adopting:
-    """Takes up what may be; ``adopts`` says whether factory nodes of a bus are among it."""
+    """Takes up what may be; ``adopts`` says whether factory nodes of a bus are among it.
+
+    ``signs``: whether the datasheet that such a node brought is signed at once, by a person's word at the start, where
+    nothing is wrong with it. What was refused is not tried again while the node stays as it is.
+    """
 
     def __init__(
-        self, station: Station, roster: Roster, live: Live, virtuals: Virtuals, adopts: Callable[[], bool]
+        self,
+        station: Station,
+        roster: Roster,
+        live: Live,
+        virtuals: Virtuals,
+        adopts: Callable[[], bool],
+        *,
+        signs: bool = False,
     ) -> None:
         self._station, self._roster, self._live = station, roster, live
-        self._virtuals, self._adopts = virtuals, adopts
+        self._virtuals, self._adopts, self._signs = virtuals, adopts, signs
+        self._refused: dict[str, TedsProvisionError] = {}
 
     def serve(self, node: Conversation) -> bool:
         """Take up a node in factory state; False where it is not to be, or has been. Raises as the steps do."""
-        if node.tapped or node.identity.state != NodeState.FACTORY:
-            return False
         uuid = node.uuid.hex()
+        if node.tapped or node.identity.state == NodeState.PROVISIONED:
+            return False
+        if node.identity.state == NodeState.KEYED:
+            return self._sign_own(node)
+        self._refused.pop(uuid, None)
         if uuid in self._virtuals:
             verified = self._virtual(node, uuid)
             self._roster.show_sheet(uuid, None)
@@ -277,12 +318,45 @@ class Adopting:
             and self._station.policy.tombstone(node.uuid) is None
         ):
             who = identify(self._station, node)
+            listed = len(list_blocks(node))
+            if listed > STRANGERS_TEDS:  # once it has a key, all of them would be read, again and again
+                raise BadData(f"Node {uuid} lists {listed} TEDS; one with more than {STRANGERS_TEDS} is not adopted.")
             entry = None if who.whitelisted is not None else newcomer(self._station, node, who)
             with self._station.turn(node.uuid):
-                agree(self._station, node, who, newcomer=entry)
+                agreed = agree(self._station, node, who, newcomer=entry)
+            # else it would be looked at as the stranger that it was, and found unproven
+            node.identity = replace(node.identity, state=NodeState.KEYED, epoch=agreed.epoch)
             self._station.audit("adopt", node.uuid, "done", fingerprint=who.fingerprint)
             self._live.event("node", uuid=uuid, state="adopted")
-        return False  # it has a key now, and is looked at like any other
+            return self._sign_own(node)
+        return False
+
+    def _sign_own(self, node: Conversation) -> bool:
+        """Sign what a keyed node brought, where that was said at the start; False: it is looked at like any other."""
+        uuid = node.uuid.hex()
+        signs = self._signs and self._adopts() and uuid not in self._virtuals and node.contact.link.capabilities.wired
+        if not signs or not self._station.keys.held(node.uuid) or self._station.pins.entry(node.uuid) is None:
+            return False
+        if uuid in self._refused:
+            return False
+        try:
+            done = provision(
+                self._station,
+                node,
+                BuildOrder(adopt=True),
+                accept=lambda _who: None,
+                reporter=Silent(),
+                adopt=lambda _brought: None,
+            )
+        except (BadData, PolicyRefused) as error:
+            self._refused[uuid] = error
+            self._live.event("node", uuid=uuid, state="not adopted", problem=as_problem(error))
+            return False
+        self._roster.show_sheet(uuid, None)
+        self._roster.refresh([uuid])
+        verdict = done.verified.verdict
+        self._roster.note(uuid, "verified", problem=None, verdict=verdict, heard=None, looked=time.time())
+        return True
 
     def _virtual(self, node: Conversation, uuid: str) -> Verified:
         """A virtual transducer gets the datasheet that it was made from."""

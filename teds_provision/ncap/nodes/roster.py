@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from teds_provision.api.operations import MOST_NODES
 from teds_provision.ncap.live import Live
+from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.inventory import with_verdicts
 from teds_provision.steps.reading import Judged
@@ -61,6 +62,7 @@ class Roster:
         self._rows: dict[str, dict[str, Any]] = {}
         self._judged: dict[str, Judged | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
+        self._own_names: dict[str, str] = {}  # as the datasheet of each says
         self.changes = 0  # grows with each change of a node's name or datasheet
         self._strangers: dict[str, set[str]] = {}
         self._texts: dict[str, tuple[tuple[int, int], str]] = {}
@@ -91,10 +93,13 @@ class Roster:
         if known is not None and known[0] in (digest, _READ_NOW):
             return known[1]
         image = self._station.nodes.datasheet(bytes.fromhex(uuid))
-        channels = [channel_facts(one) for one in Sheet.of(image).channels] if image is not None else []
+        shown = shown_units(self._station, bytes.fromhex(uuid))
+        sheet = Sheet.of(image).shown_in(shown) if image is not None else None
+        channels = [channel_facts(one) for one in sheet.channels] if sheet is not None else []
         with self._lock:
             self.changes += 1
             self._channels[uuid] = digest, channels
+            self._own_names[uuid] = sheet.meta.name if sheet is not None else ""
         return channels
 
     def show_sheet(self, uuid: str, sheet: Sheet | None) -> None:
@@ -104,7 +109,9 @@ class Roster:
             if sheet is None:
                 self._channels.pop(uuid, None)
             else:
-                self._channels[uuid] = _READ_NOW, [channel_facts(one) for one in sheet.channels]
+                known = sheet.shown_in(shown_units(self._station, bytes.fromhex(uuid)))
+                self._channels[uuid] = _READ_NOW, [channel_facts(one) for one in known.channels]
+                self._own_names[uuid] = sheet.meta.name
 
     # -- what links and measurements say -----------------------------------------------------------------------------
 
@@ -126,7 +133,7 @@ class Roster:
     def _forget_strangers(self) -> None:
         gone = [uuid for uuid, seen in self._seen.items() if not seen.present and uuid not in self._rows]
         for uuid in gone[:-MOST_GONE]:
-            for kept in (self._seen, self._channels, self._texts):
+            for kept in (self._seen, self._channels, self._own_names, self._texts):
                 kept.pop(uuid, None)
 
     def seen(self, uuid: str) -> Seen:
@@ -172,6 +179,15 @@ class Roster:
         """The name of a node in the store, "" where it has none."""
         with self._lock:
             return self._rows.get(uuid, {}).get("name") or ""
+
+    def called(self, uuid: str) -> tuple[str, bool]:
+        """The name under which a node is published, and whether it is only what the node says itself (unverified)."""
+        channels = self._sheet(uuid)
+        with self._lock:
+            judged = self._verdicts(uuid, self._seen.get(uuid) or Seen())["verdict"]
+            if channels and judged is not None and judged["verdict"] == "unsigned":
+                return self._own_names.get(uuid, ""), True
+        return self.name(uuid), False
 
     def channel_names(self, uuid: str) -> list[tuple[int, str]]:
         """Number and name of every channel."""
@@ -244,6 +260,10 @@ class Roster:
                 "measuring": seen.report,
                 "power": seen.power,
             }
+        called, unverified = self.called(uuid)
+        out["unverified"] = unverified
+        if unverified:  # what it calls itself, marked
+            out["name"] = out["name"] or called or None
         out["virtual"] = self.virtual(uuid)
         out["mode"] = "measuring" if seen.measurement else "idle" if seen.present else None
         out["channels"] = [{**one, **self._now(uuid, one["number"])} for one in channels]
@@ -281,7 +301,7 @@ def channel_facts(one: Channel) -> dict[str, Any]:
 
     ``shown`` is the unit for people: its number is the SI value × ``factor`` + ``offset``.
     """
-    unit = one.unit
+    unit = one.shown
     zero = unit.from_si(0.0)
     now = datetime.now(UTC)
     return {

@@ -68,7 +68,8 @@ class StillThere:
     def _ask(self, last: Sighting) -> Sighting | None:
         for seconds in PATIENCE:
             try:
-                identity = self._port.identify(last.address, seconds=seconds)
+                first = seconds == PATIENCE[0]
+                identity = self._port.identify(last.address, seconds=seconds, until_announced=first)
             except AddressConflict:  # somebody is there, and that two are is told by whoever finds out
                 return Sighting(last.identity, last.address, last.port, time.monotonic())
             except LinkFailure:
@@ -255,8 +256,9 @@ class Watch:
             oldest, *_ = list(self._known)
             self._gone(oldest)
         if before is not None:
-            same = (before.address, before.identity.state) == (sighting.address, identity.state)
             seen = self._roster.seen(uuid)
+            here = seen.place == self.place  # it may have been on another bus meanwhile
+            same = here and (before.address, before.identity.state) == (sighting.address, identity.state)
             retry = seen.problem is not None and time.time() - seen.seen > LOOK_AGAIN
             if same and not retry and uuid not in self._looked_for:
                 return
@@ -318,7 +320,9 @@ class Watch:
             self._tell(notice)
 
     def _left(self, uuid: str) -> None:
-        if not self._roster.stranger(self.place, uuid, there=False) and self._turns.holder(uuid) is None:
+        if self._roster.stranger(self.place, uuid, there=False) or self._turns.holder(uuid) is not None:
+            return
+        if self._roster.seen(uuid).place == self.place:  # else it was carried to another link
             self._roster.note(uuid, "left", present=False)
 
     def _tell(self, notice: Notice) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from typing import Any, Final
 
 from starlette.requests import Request
@@ -31,6 +32,9 @@ _HELP: Final = {
     "teds_sink_failed": ("gauge", "1 where a sink has ended with an error."),
     "teds_messages_per_second": ("gauge", "Messages to ROS and MQTT now."),
     "teds_live_clients": ("gauge", "Clients of the live channel."),
+    "teds_registry_age_seconds": ("gauge", "Since the last sync with the registry."),
+    "teds_registry_unsent": ("gauge", "Events that wait for a sync."),
+    "teds_registry_alarms": ("gauge", "Alarms that nobody has seen."),
 }
 
 
@@ -38,15 +42,15 @@ def route(daemon: Daemon) -> Route:
     """GET /metrics."""
 
     def metrics(_request: Request) -> Response:
-        return Response(text(daemon.status()), media_type=TYPE)
+        return Response(text(daemon.status(), daemon.plant.status()), media_type=TYPE)
 
     return Route("/metrics", metrics)
 
 
-def text(status: dict[str, Any]) -> str:
-    """The status as Prometheus reads it."""
+def text(status: dict[str, Any], plant: dict[str, Any] | None = None) -> str:
+    """The status, and that of the plant where one was joined, as Prometheus reads it."""
     lines: dict[str, list[str]] = {name: [] for name in _HELP}
-    for name, labels, value in _lines(status):
+    for name, labels, value in chain(_lines(status), _registry(plant) if plant is not None else ()):
         inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in labels.items())
         lines[name].append(f"{name}{{{inner}}} {value:g}" if inner else f"{name} {value:g}")
     out = []
@@ -79,6 +83,13 @@ def _lines(status: dict[str, Any]) -> Iterator[Line]:
         yield "teds_sink_failed", labels, sink["state"] == "failed"
     yield "teds_messages_per_second", {}, status["budget"]["used"]
     yield "teds_live_clients", {}, status["clients"]
+
+
+def _registry(plant: dict[str, Any]) -> Iterator[Line]:
+    if plant["age"] is not None:
+        yield "teds_registry_age_seconds", {}, plant["age"]
+    yield "teds_registry_unsent", {}, plant["unsent"]
+    yield "teds_registry_alarms", {}, sum(not one["seen"] for one in plant["alarms"])
 
 
 def _escaped(word: str) -> str:

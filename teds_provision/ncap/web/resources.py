@@ -15,7 +15,15 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from teds_provision.api import bodies
-from teds_provision.api.operations import FURTHEST, LONGEST_TEXT, MOST_ENTRIES, MOST_NODES, document
+from teds_provision.api.operations import (
+    FURTHEST,
+    LAST_CHANNEL,
+    LONGEST_TEXT,
+    MOST_ENTRIES,
+    MOST_NODES,
+    MOST_POINTS,
+    document,
+)
 from teds_provision.errors import NotFound, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.measuring import LONGEST_LOAN, Loan
@@ -43,9 +51,11 @@ class Resources:
         return [
             Route("/status", self.status),
             Route("/detection", self.detection, methods=["GET", "PUT"]),
+            Route("/plant", self.plant),
             Route("/discover", self.discover, methods=["POST"]),
             Route("/nodes", self.nodes),
             Route("/nodes/{uuid}", self.node),
+            Route("/nodes/{uuid}/past", self.past),
             Route("/nodes/{uuid}/teds", self.teds, methods=["GET", "PUT"]),
             Route("/nodes/{uuid}/provision", self.provision, methods=["GET", "POST"]),
             Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["PUT"]),
@@ -84,6 +94,13 @@ class Resources:
             body = await body_of(request, bodies.Detection)
             await changing(self._daemon.set_detection, body.mode)
         return JSONResponse({"mode": await asyncio.to_thread(lambda: self._daemon.detection)})
+
+    async def plant(self, request: Request) -> Response:
+        """GET /plant."""
+        found = await asyncio.to_thread(self._daemon.plant.status)
+        if found is None:
+            raise NotFound("This station has joined no registry.", hint="Join one: teds-provision registry connect")
+        return _shown(request, found)
 
     async def discover(self, request: Request) -> Response:
         """POST /discover."""
@@ -213,6 +230,15 @@ class Resources:
         uuid = await self._node_of(request)
         return JSONResponse(await asyncio.to_thread(self._daemon.roster.node, uuid))
 
+    async def past(self, request: Request) -> Response:
+        """GET /nodes/UUID/past: the last hour of a channel."""
+        uuid = await self._node_of(request)
+        channel = _integer(request, "channel", 1, LAST_CHANNEL)
+        points = _integer(request, "points", 600, MOST_POINTS)
+        since, until = (_unix(request, name) for name in ("from", "until"))
+        past = self._daemon.live.past
+        return JSONResponse(await asyncio.to_thread(past.of, uuid, channel, since, until, points))
+
     async def teds(self, request: Request) -> Response:
         """GET, PUT /nodes/UUID/teds."""
         sheets = self._daemon.sheets
@@ -240,13 +266,19 @@ class Resources:
             return JSONResponse(await asyncio.to_thread(runs.of, uuid))
         if body.cancel:
             return JSONResponse(await changing(runs.cancel, uuid))
-        order = {
-            "profile": body.profile,
-            "name": body.name,
-            "calibration": body.calibration,
-            "calibration_name": body.calibration_name,
-        }
-        return JSONResponse(await changing(lambda: runs.begin(uuid, **order)), 202)
+
+        def begin() -> dict[str, Any]:
+            return runs.begin(
+                uuid,
+                profile=body.profile,
+                name=body.name,
+                calibration=body.calibration,
+                calibration_name=body.calibration_name,
+                adopt=bool(body.adopt),
+                accept=body.accept_calibration,
+            )
+
+        return JSONResponse(await changing(begin), 202)
 
     async def _uuid_of_a_label(self, word: str) -> str:
         """A node that nobody has seen yet is named by its whole UUID, as its label says it."""
@@ -350,6 +382,14 @@ def _integer(request: Request, name: str, default: int, most: int, least: int = 
     if not (text.isascii() and text.isdecimal() and len(text) <= _DIGITS and least <= int(text) <= most):
         raise UsageFailure(f"{name} must be a whole number from {least} to {most}.")
     return int(text)
+
+
+def _unix(request: Request, name: str) -> float | None:
+    """A moment in unix seconds, or as ISO 8601; None where it is left out."""
+    text = request.query_params.get(name)
+    if not text:
+        return None
+    return float(text) if _UNIX.fullmatch(text) else datetime.fromisoformat(_moment(text)).timestamp()
 
 
 def _moment(text: str) -> str:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from teds_provision.errors import NotFound, StoreFailure, UsageFailure
-from teds_provision.files import read_limited, write_whole
+from teds_provision.files import open_lock, read_limited, write_whole
 
 FILE: Final = "ncap-tokens.json"
 BROWSER_SECONDS: Final = 30 * 86_400.0
@@ -147,7 +147,7 @@ class Tokens:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        descriptor = os.open(self._home / f"{FILE}.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        descriptor = open_lock(self._home / f"{FILE}.lock")
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             now = time.time()

@@ -45,6 +45,7 @@ export const remove = (path) => ask("DELETE", path, {});
 
 export const paths = {
   node: (uuid) => at("nodes", uuid),
+  past: (uuid) => `${at("nodes", uuid)}/past`,
   teds: (uuid) => `${at("nodes", uuid)}/teds`,
   provision: (uuid) => `${at("nodes", uuid)}/provision`,
   channel: (uuid, number) => `${at("nodes", uuid)}/channels/${number}`,

@@ -145,8 +145,11 @@ function tapped() {
   const run = state.runs.get(uuid) ?? state.runs.get("next");
   // A whole provisioning may be over before this frame: whoever asked for it wants to see how it went.
   const asked = ["waiting", "running"].includes(run?.state) || performance.now() - (run?.heard ?? -Infinity) < 3000;
-  if (asked) location.hash = `#/nodes/${uuid}/provision`;
-  else if (!here) location.hash = `#/nodes/${uuid}`;
+  // Only where nothing else is open: whoever looks at a plot or another node keeps it, whatever is put on a reader.
+  const free = /^#?\/?(nodes\/?)?$/.test(location.hash) || location.hash.startsWith("#/nodes/next");
+  if (asked && (free || here)) location.hash = `#/nodes/${uuid}/provision`;
+  else if (free) location.hash = `#/nodes/${uuid}`;
+  else if (!here) toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, h("a", { href: `#/nodes/${uuid}` }, "Open it"));
   changed("nodes");
 }
 

@@ -1,7 +1,8 @@
 // Curves that move: one frame per unit, drawn from the rings, at most 20 times a second and less where drawing is slow.
 
 import { h, fill, text } from "./dom.js";
-import { count, figure } from "./format.js";
+import { count, figure, hertz, number } from "./format.js";
+import { between, columnsOf, Hour, seed } from "./past.js";
 import { changed, now, on, ringOf, state } from "./state.js";
 
 const FRAME = 50; // ms between two drawings
@@ -10,7 +11,11 @@ const BEHIND = 0.25; // s: the right edge lies so far back, so that what comes i
 const COLOURS = 8;
 const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3]];
 
-export const WINDOWS = [10, 30, 120];
+const LIVE = 120; // s that are drawn from what came to this page; more comes from the station's memory
+const ASK = 3000; // ms between two looks at that memory
+const POINTS = 900; // bins of a stretch that is looked at closely
+
+export const WINDOWS = [10, 30, 120, 600, 3600];
 
 /** Colours of the theme that is on now. */
 function theme() {
@@ -20,6 +25,8 @@ function theme() {
     lines: Array.from({ length: COLOURS }, (_, index) => read(`--line-${index + 1}`)),
     grid: read("--grid"),
     text: read("--muted"),
+    lost: read("--bad"),
+    invalid: read("--warn"),
     font: `12px ${read("--font")}`,
   };
 }
@@ -30,6 +37,10 @@ export class LivePlot {
     this.channels = channels;
     this.window = 30;
     this.paused = null; // the time at the right edge while it stands
+    this.range = null; // [from, to] of the stretch that is looked at closely
+    this.zoomed = new Map(); // its bins, by channel
+    this.hours = new Map(); // Hour by channel
+    this.onzoom = () => {};
     this.frames = [];
     this.drawn = 0;
     this.skipped = 0;
@@ -45,6 +56,7 @@ export class LivePlot {
     this.watcher.observe(this.charts);
     this.stop = on("connection", () => this.charts.classList.toggle("stale", state.connection !== "live"));
     this.build();
+    this.asking = setInterval(() => this.ask(), ASK);
     this.loop = (time) => {
       if (this.ended) return;
       this.draw(time);
@@ -59,6 +71,49 @@ export class LivePlot {
       && one.uuid === this.channels[at].uuid && one.number === this.channels[at].number && one.unit === this.channels[at].unit);
     this.channels = channels;
     if (!same) this.build();
+  }
+
+  hour(channel) {
+    const key = `${channel.uuid}/${channel.number}`;
+    let hour = this.hours.get(key);
+    if (!hour) {
+      this.hours.set(key, (hour = new Hour(channel.uuid, channel.number)));
+      hour.refresh();
+      const ring = state.rings.get(key);
+      if (!ring || ring.total < 200) seed(channel.uuid, channel.number).catch(() => {});
+    }
+    return hour;
+  }
+
+  /** What is new in the station's memory, for every channel that is shown. */
+  ask() {
+    if (document.hidden || state.connection !== "live") return;
+    this.channels.forEach((channel) => this.hour(channel).refresh());
+  }
+
+  /** Look closely at a stretch of time; null goes back to what moves. */
+  async zoom(range) {
+    this.range = range;
+    this.zoomed.clear();
+    this.onzoom();
+    if (!range) return;
+    await Promise.all(this.channels.map(async (channel) => {
+      const bins = await between(channel.uuid, channel.number, range[0], range[1], POINTS).catch(() => null);
+      if (bins && this.range === range) this.zoomed.set(`${channel.uuid}/${channel.number}`, bins);
+    }));
+  }
+
+  key(event) {
+    const [from, to] = this.range ?? [now() - this.window, now()];
+    const span = to - from;
+    const moves = { "+": [span / 4, -span / 4], "-": [-span / 2, span / 2], ArrowLeft: [-span / 4, -span / 4], ArrowRight: [span / 4, span / 4] };
+    if (event.key === "Escape") this.zoom(null);
+    else if (moves[event.key]) {
+      const [left, right] = moves[event.key];
+      const end = Math.min(now(), to + right);
+      this.zoom([Math.max(now() - 3600, Math.min(from + left, end - 0.1)), end]);
+    } else return;
+    event.preventDefault();
   }
 
   build() {
@@ -83,13 +138,28 @@ export class LivePlot {
       line.setAttribute("d", "M0 2h24");
       line.setAttribute("stroke-dasharray", dash(index).join(" "));
       swatch.append(line);
-      legend.append(h("li", {}, swatch, h("span", { class: "label" }, channel.label), value));
+      value.rate = h("span", { class: "hint rate" });
+      value.faults = h("span", { class: "faults" });
+      legend.append(h("li", {}, swatch, h("span", { class: "label" }, channel.label), value, value.rate, value.faults));
       return value;
     });
-    const canvas = h("div", { class: "canvas", role: "img", "aria-label": `Plot of ${channels.map((one) => one.label).join(", ")} in ${title}` });
-    const element = h("figure", {}, h("figcaption", {}, h("span", { class: "unit" }, title), legend), canvas);
-    const chart = new window.uPlot(options(channels, colours), [[], ...channels.map(() => [])], canvas);
-    return { element, canvas, chart, channels, values, shown: 0 };
+    const canvas = h("div", { class: "canvas", role: "img", tabindex: "0", onkeydown: (event) => this.key(event), ondblclick: () => this.zoom(null), "aria-label": `Plot of ${channels.map((one) => one.label).join(", ")} in ${title}. Keys: plus and minus zoom, arrows move, Escape goes back to live.` });
+    const when = h("span", { class: "hint when" });
+    const element = h("figure", {}, h("figcaption", {}, h("span", { class: "unit" }, title), legend, when), canvas);
+    const frame = { element, canvas, channels, values, when, shown: 0, marks: [] };
+    const setting = options(channels, colours);
+    setting.hooks = { draw: [(chart) => marks(chart, frame.marks, colours)], setSelect: [(chart) => this.selected(chart)], setCursor: [() => (frame.shown = 0)] };
+    frame.chart = new window.uPlot(setting, [[], ...channels.map(() => [])], canvas);
+    return frame;
+  }
+
+  /** A stretch was dragged over: it is looked at closely. */
+  selected(chart) {
+    const { left, width } = chart.select;
+    if (width < 8) return;
+    const range = [chart.posToVal(left, "x"), chart.posToVal(left + width, "x")];
+    chart.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+    this.zoom(range);
   }
 
   resize() {
@@ -103,7 +173,7 @@ export class LivePlot {
     if (document.hidden || time < this.next || !this.frames.length) return;
     const began = performance.now();
     if (this.next && time - this.next > FRAME) this.skipped += Math.floor((time - this.next) / FRAME);
-    const right = this.paused ?? now() - BEHIND;
+    const right = this.range?.[1] ?? this.paused ?? now() - BEHIND;
     for (const frame of this.frames) this.one(frame, right, time);
     const took = performance.now() - began;
     this.drawn += 1;
@@ -113,26 +183,38 @@ export class LivePlot {
   }
 
   one(frame, right, time) {
-    const left = right - this.window;
+    const left = this.range?.[0] ?? right - this.window;
     const columns = Math.max(50, Math.min(900, Math.floor(frame.chart.bbox.width / devicePixelRatio) || 300));
-    const width = this.window / columns;
+    const width = (right - left) / columns;
     // Bins stand still in time: their edges are multiples of their width, so that curves glide and do not shimmer.
     const from = Math.floor(left / width) * width;
     const times = Array.from({ length: 3 * columns }, (_, index) => from + (index * width) / 3);
     const courses = frame.channels.map((channel) => {
       const last = state.values.get(`${channel.uuid}/${channel.number}`);
       const silence = Math.max(0.5, 3 * (last?.period ?? 0));
-      return ringOf(channel.uuid, channel.number).bins(from, from + columns * width, columns, silence);
+      const [end, hour] = [from + columns * width, this.hour(channel)];
+      if (this.range) return columnsOf(this.zoomed.get(`${channel.uuid}/${channel.number}`) ?? hour.bins, from, end, columns, 3 / (hour.bins.rate || 10));
+      if (this.window > LIVE) return columnsOf(hour.bins, from, end, columns, 3 / (hour.bins.rate || 10));
+      return ringOf(channel.uuid, channel.number).bins(from, end, columns, silence);
     });
+    frame.marks = frame.channels.map((channel) => [this.hour(channel).bins, left, right]);
     frame.chart.batch(() => {
       frame.chart.setData([times, ...courses], false);
       frame.chart.setScale("x", { min: left, max: right });
     });
     if (time - frame.shown > 250) {
       frame.shown = time;
+      const place = frame.chart.cursor.left >= 0 ? Math.floor((frame.chart.posToVal(frame.chart.cursor.left, "x") - from) / width) : -1;
+      text(frame.when, place >= 0 ? `at ${exact(from + place * width, width)}` : "");
       frame.channels.forEach((channel, index) => {
         const last = state.values.get(`${channel.uuid}/${channel.number}`);
-        text(frame.values[index], figure(last, channel));
+        const value = frame.values[index];
+        text(value, place >= 0 ? there(courses[index], place, channel) : figure(last, channel));
+        const hour = this.hour(channel);
+        text(value.rate, hour.bins.rate ? hertz(hour.bins.rate) : "");
+        const { lost, invalid } = hour.faults(left, right);
+        text(value.faults, [lost ? `${lost} lost` : "", invalid ? `${invalid} invalid` : ""].filter(Boolean).join(", "));
+        value.faults.classList.toggle("bad", lost > 0);
       });
     }
   }
@@ -150,12 +232,19 @@ export class LivePlot {
     changed("plot");
   }
 
+  /** Show so many seconds, up to now. */
+  span(seconds) {
+    this.window = seconds;
+    if (this.range) this.zoom(null);
+  }
+
   pause(yes) {
     this.paused = yes ? now() - BEHIND : null;
   }
 
   end() {
     this.ended = true;
+    clearInterval(this.asking);
     this.stop();
     this.watcher.disconnect();
     this.scheme.removeEventListener("change", this.rebuild);
@@ -176,7 +265,7 @@ function options(channels, colours) {
     width: 300,
     height: 220,
     legend: { show: false },
-    cursor: { show: false },
+    cursor: { show: true, x: true, y: false, points: { show: false }, drag: { x: true, y: false, setScale: false }, focus: { prox: -1 } },
     padding: [8, 24, 0, 0],
     scales: { x: { time: true, auto: false }, y: { range: padded } },
     axes: [axis(colours, { space: 90, size: 30, values: (_, ticks) => ticks.map(hours) }), axis(colours, { size: 60, values: (_, ticks) => ticks.map(tick) })],
@@ -191,6 +280,35 @@ function options(channels, colours) {
       })),
     ],
   };
+}
+
+/** Seconds in which samples were lost or not valid, as marks along the lower edge. */
+function marks(chart, channels, colours) {
+  const { left, top, width, height } = chart.bbox;
+  const size = 5 * devicePixelRatio;
+  for (const [bins, from, to] of channels) {
+    for (let at = bins.time.length - 1; at >= 0 && bins.time[at] >= from - 1; at--) {
+      const colour = bins.lost[at] ? colours.lost : bins.invalid[at] ? colours.invalid : null;
+      if (!colour || bins.time[at] > to) continue;
+      const place = left + ((Math.max(bins.time[at], from) - from) / (to - from)) * width;
+      chart.ctx.fillStyle = colour;
+      chart.ctx.fillRect(place, top + height - size, Math.max(2 * devicePixelRatio, (bins.bin / (to - from)) * width), size);
+    }
+  }
+}
+
+/** What a curve says at a column: a value, or from the least to the greatest. */
+function there(course, place, channel) {
+  const [low, high] = [course[3 * place], course[3 * place + 1]].sort((one, other) => one - other);
+  if (typeof low !== "number") return low === null ? "not valid" : "nothing";
+  return low === high || typeof high !== "number" ? number(low, channel.uncertainty) : `${number(low, channel.uncertainty)} to ${number(high, channel.uncertainty)}`;
+}
+
+/** Clock time with as many digits as the columns are wide. */
+function exact(time, width) {
+  const digits = width >= 1 ? 0 : width >= 0.1 ? 1 : 3;
+  const part = digits ? (time % 1).toFixed(digits).slice(1) : "";
+  return `${hours(part.length && Number(`0${part}`) >= 1 ? Math.floor(time) : time)}${part}`;
 }
 
 const hours = (time) => (time === null ? "" : new Date(time * 1000).toTimeString().slice(0, 8));

@@ -26,6 +26,20 @@ export class Ring {
     this.next = this.held = 0;
   }
 
+  /** Put points [[time, value] …] before those that are held: what was measured before this page was opened. */
+  before(points) {
+    const start = (this.next + this.size - this.held) % this.size;
+    const held = Array.from({ length: this.held }, (_, step) => {
+      const place = (start + step) % this.size;
+      return [this.time[place], this.value[place]];
+    });
+    const first = held[0]?.[0] ?? Infinity;
+    const total = this.total;
+    this.clear();
+    for (const [time, value] of [...points.filter(([time]) => time < first), ...held]) this.push(time, value);
+    this.total = total;
+  }
+
   get newest() {
     return this.held ? this.time[(this.next + this.size - 1) % this.size] : NaN;
   }

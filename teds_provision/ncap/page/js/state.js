@@ -242,4 +242,4 @@ function takeStream(key, times, values) {
 }
 
 const PLAIN = { factor: 1, offset: 0 };
-const scaleOf = (uuid, number) => state.nodes.get(uuid)?.channels?.find((one) => one.number === number)?.scale ?? PLAIN;
+export const scaleOf = (uuid, number) => state.nodes.get(uuid)?.channels?.find((one) => one.number === number)?.scale ?? PLAIN;

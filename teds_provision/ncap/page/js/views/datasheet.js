@@ -1,7 +1,7 @@
 // The datasheet tab: read and decoded with its security check and curves; written from a file, the diff first.
 
-import { get, paths } from "../api.js";
-import { button, chip, empty, fill, h, say, trouble } from "../dom.js";
+import { get, paths, post } from "../api.js";
+import { button, chip, empty, field, fill, h, say, trouble } from "../dom.js";
 import { count, nameOf, verdict } from "../format.js";
 import { curvePlot } from "../plot.js";
 import { on, refresh, state } from "../state.js";
@@ -59,9 +59,37 @@ export class DatasheetTab {
       h("div", { class: "sheet-verdict" }, chip(tone, sign, words), h("span", {}, why), sheet.read_now === false ? chip("warn", "clock", "Last reading: the node is not connected now") : null),
       sheet.checks?.length ? h("details", { class: "checks", open: sheet.verdict !== "authentic" }, h("summary", {}, "Security check"), h("ul", {}, sheet.checks.map(checkLine))) : null,
       findings.length ? h("details", { class: "findings", open: findings.some((one) => one.severity === "error") }, h("summary", {}, `${count(findings.length, "finding")}`), h("ul", {}, findings.map(findingLine))) : null,
+      sheet.verdict === "unsigned" && sheet.read_now !== false && teds.some((one) => one.name === "ChanTEDS") ? this.brought(findings) : null,
       teds.length ? null : empty("The node has no datasheet.", h("p", {}, "Write one from a file below, or ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it"), " from a type.")),
       h("div", { class: "curves" }, (sheet.curves ?? []).map((curve) => figure(curve))),
       h("div", { class: "teds" }, teds.map((one) => tedsBlock(one, teds.length))),
+    );
+  }
+
+  /** The board brought this datasheet itself: a yes signs it; where something is wrong with it, with a reason. */
+  brought(findings) {
+    const wrong = findings.some((one) => one.severity === "error");
+    const reason = h("input", { type: "text", maxlength: "500", autocomplete: "off" });
+    const result = h("div", {});
+    const yes = button("Sign this datasheet", { class: "main" }, "good");
+    yes.disabled = state.connection !== "live" || state.status?.write === false;
+    yes.addEventListener("click", () =>
+      yes.busy(async () => {
+        try {
+          const answer = await post(paths.provision(this.uuid), { adopt: true, accept_calibration: reason.value.trim() || null });
+          state.runs.set(this.uuid, { steps: [], ...answer });
+          location.hash = `#/nodes/${this.uuid}/provision`;
+        } catch (error) {
+          fill(result, trouble(error));
+        }
+      }),
+    );
+    return h(
+      "div",
+      { class: "brought", role: "group", "aria-label": "Datasheet of the board itself" },
+      h("p", {}, "The board brought this datasheet itself; nobody has signed it. Look at it below. If it is right, sign it, and the node is in service."),
+      h("div", { class: "row" }, wrong ? field("Why it is right in spite of the findings", reason) : null, yes),
+      result,
     );
   }
 

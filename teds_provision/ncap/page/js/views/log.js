@@ -3,22 +3,24 @@
 import { get } from "../api.js";
 import { button, chip, empty, fill, h, keyed, text, trouble } from "../dom.js";
 import { clock, count, nameOf } from "../format.js";
-import { on, state } from "../state.js";
+import { now, on, state } from "../state.js";
 
 const EVERY = 5000; // ms between two looks for what is new
 const PAGE = 200; // entries in one answer
+const TIMES = [["All of it", 0], ["Last hour", 3600], ["Last day", 86400], ["Last 7 days", 604800]]; // s
 const TYPING = 250; // ms after the last key before the station is asked
 
 export function logView(main) {
   const search = h("input", { type: "search", placeholder: "Action, node or text", "aria-label": "Search the log", maxlength: "200" });
   const failed = h("input", { type: "checkbox" });
+  const since = h("select", { "aria-label": "Time" }, TIMES.map(([words, seconds]) => h("option", { value: seconds }, words)));
   const intact = h("span", {});
   const rows = h("tbody", {});
   const none = h("div", {});
   const total = h("span", { class: "hint" });
   const table = h("table", { class: "log" }, h("caption", { class: "unseen" }, "Audit log, newest first"), h("thead", {}, h("tr", {}, ["Time", "Action", "Node", "Details", "By"].map((words) => h("th", { scope: "col" }, words)))), rows);
   const older = button("Show older entries", { onclick: () => older.busy(() => load(Math.min(...entries.keys()))) });
-  main.append(h("div", { class: "panel-head view-head" }, h("h2", {}, "Log"), intact, search, h("label", { class: "tick" }, failed, h("span", {}, "Failures only")), total), h("section", { class: "panel", "aria-label": "Audit log" }, none, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Audit log" }, table), h("div", { class: "row" }, older)));
+  main.append(h("div", { class: "panel-head view-head" }, h("h2", {}, "Log"), intact, search, since, h("label", { class: "tick" }, failed, h("span", {}, "Failures only")), total), h("section", { class: "panel", "aria-label": "Audit log" }, none, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Audit log" }, table), h("div", { class: "row" }, older)));
 
   let entries = new Map(); // by sequence number: what was fetched under this search
   let asked = null; // the search that they belong to
@@ -31,6 +33,7 @@ export function logView(main) {
     const words = new URLSearchParams({ limit: PAGE });
     if (search.value.trim()) words.set("text", search.value.trim());
     if (failed.checked) words.set("failed", "1");
+    if (Number(since.value)) words.set("since", Math.floor((now() - Number(since.value)) / 60) * 60);
     const query = words.toString();
     if (before !== null) words.set("before", before);
     if (asked !== query) more = false;
@@ -54,7 +57,7 @@ export function logView(main) {
   function paint() {
     if (!told) return;
     const found = [...entries.values()].sort((one, other) => other.seq - one.seq);
-    const all = !search.value.trim() && !failed.checked;
+    const all = !search.value.trim() && !failed.checked && !Number(since.value);
     keyed(rows, found, (one) => one.seq, line, (element, one) => one.uuid && text(element.querySelector("a"), nameOf(state.nodes.get(one.uuid) ?? one)));
     const shown = told.intact ? ["good", "good", "Chain intact"] : ["bad", "bad", "Chain broken: the log was altered"];
     if (intact.textContent !== shown[2]) fill(intact, chip(...shown));
@@ -71,6 +74,7 @@ export function logView(main) {
     typing = setTimeout(() => load(), TYPING);
   });
   failed.addEventListener("change", () => load());
+  since.addEventListener("change", () => load());
   older.hidden = table.hidden = true;
   const offs = [on("log", () => load()), on("nodes", paint)];
   const ticking = setInterval(() => !document.hidden && state.connection === "live" && load(), EVERY);

@@ -5,10 +5,11 @@ import { grouped, nameOf, verdict } from "../format.js";
 import { on, state } from "../state.js";
 import { DatasheetTab } from "./datasheet.js";
 import { facts, checkLine } from "./facts.js";
+import { HistoryTab } from "./history.js";
 import { LiveTab } from "./values.js";
 import { ProvisionTab } from "./provision.js";
 
-const TABS = { live: ["Live", LiveTab], datasheet: ["Datasheet", DatasheetTab], provision: ["Provision", ProvisionTab] };
+const TABS = { live: ["Live", LiveTab], datasheet: ["Datasheet", DatasheetTab], provision: ["Provision", ProvisionTab], history: ["History", HistoryTab] };
 
 export class NodePanel {
   constructor(parent, uuid) {

@@ -1,46 +1,53 @@
 // The nodes that are there, and the one that is open.
 
-import { chip, empty, fill, h, icon, keyed, text } from "../dom.js";
+import { button, chip, empty, fill, h, icon, keyed, text } from "../dom.js";
 import { channelName, count, figure, nameOf, verdict } from "../format.js";
 import { isStale, lastOf, now, on, state } from "../state.js";
+import { Bulk } from "./bulk.js";
 import { facts } from "./facts.js";
+import { Filters } from "./filters.js";
 import { NodePanel } from "./node.js";
 import { ProvisionTab } from "./provision.js";
 
 const MARKED = 8000; // ms that a tapped node stays marked
 const SHOWN_VALUES = 3;
 const SEARCH_FROM = 7; // nodes
-const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || nameOf(one).localeCompare(nameOf(other));
+const DRAWN = 100; // cards that are drawn at once; a press draws as many more
+const { compare } = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
+const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || compare(nameOf(one), nameOf(other)) || compare(one.uuid, other.uuid);
 
 export function nodesView(main, rest) {
-  const search = h("input", { type: "search", placeholder: "Name or UUID", "aria-label": "Search nodes", oninput: () => paint() });
+  const filters = new Filters(() => ((drawn = DRAWN), paint()));
+  const bulk = new Bulk(() => listed, () => paint());
   const total = h("p", { class: "total" });
   const list = h("ul", { class: "cards" });
+  const more = button("", { class: "quiet", hidden: true, onclick: () => ((drawn += DRAWN), paint()) });
   const none = h("div", {});
   const detail = h("div", { class: "detail" });
-  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), search, list, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
+  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), filters.element, h("div", { class: "row tools-row" }, bulk.toggle), bulk.bar, list, more, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
   main.append(side, none, detail);
+  let drawn = DRAWN;
+  let listed = []; // the nodes that fit the filters, in their order
   let panel = null;
   let next = null; // the form for whichever node is tapped next
   let chosen = rest;
 
-  function matching() {
-    const words = search.value.trim().toLowerCase();
-    return [...state.nodes.values()].filter((node) => !words || nameOf(node).toLowerCase().includes(words) || node.uuid.includes(words)).sort(order);
-  }
-
   let first = null; // UUID of the node on top: open where none is chosen
 
   function paint() {
-    const nodes = matching();
+    const nodes = (listed = filters.of([...state.nodes.values()]).sort(order));
     first = nodes[0]?.uuid;
     const any = state.nodes.size > 0;
     side.hidden = !any;
-    search.hidden = state.nodes.size < SEARCH_FROM && !search.value;
+    filters.element.hidden = state.nodes.size < SEARCH_FROM && !filters.on;
+    bulk.toggle.hidden = state.nodes.size < 2;
+    bulk.paint();
     const strangers = state.status?.strangers ?? 0;
     const shown = state.total > state.nodes.size ? `${state.nodes.size} of ${count(state.total, "node")}` : count(state.nodes.size, "node");
-    text(total, `${shown}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
-    keyed(list, nodes, (node) => node.uuid, card, update);
+    text(total, `${filters.on ? `${nodes.length} of ` : ""}${shown}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
+    keyed(list, nodes.slice(0, drawn), (node) => node.uuid, (node) => card(node, bulk), update);
+    more.hidden = nodes.length <= drawn;
+    text(more.lastChild, `Show ${Math.min(DRAWN, nodes.length - drawn)} more of ${nodes.length}`);
     main.classList.toggle("one-open", Boolean(chosen[0]) && any);
     open();
     if (any || chosen[0]) none.replaceChildren();
@@ -90,7 +97,10 @@ export function nodesView(main, rest) {
     else element.firstChild.removeAttribute("aria-current");
     element.classList.toggle("tapped", state.tapped?.uuid === node.uuid && performance.now() - state.tapped.at < MARKED);
     element.classList.toggle("absent", node.present === false);
-    const told = JSON.stringify([node.name, node.verdict, node.from, node.busy, node.virtual, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
+    element.tick.hidden = !bulk.on;
+    element.tick.firstChild.checked = bulk.chosen.has(node.uuid);
+    element.tick.firstChild.setAttribute("aria-label", `Select ${nameOf(node)}`);
+    const told = JSON.stringify([node.name, node.verdict, node.unverified, node.from, node.busy, node.virtual, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
     if (element.told === told) return;
     element.told = told;
     const [tone, sign, words, why] = verdict(node);
@@ -138,8 +148,12 @@ export function nodesView(main, rest) {
   };
 }
 
-function card(node) {
-  return h("li", { class: "card" }, h("a", { href: `#/nodes/${node.uuid}` }));
+function card(node, bulk) {
+  const box = h("input", { type: "checkbox", onchange: () => bulk.choose(node.uuid, box.checked) });
+  const tick = h("label", { class: "card-tick" }, box);
+  const element = h("li", { class: "card" }, h("a", { href: `#/nodes/${node.uuid}` }), tick);
+  element.tick = tick;
+  return element;
 }
 
 const strangersWords = (many) => `${count(many, "node")} answered but not on the whitelist. Place a node on the reader to add it, or switch detection to Transparent to see them all.`;

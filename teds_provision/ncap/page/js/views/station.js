@@ -1,17 +1,25 @@
 // The station itself: links, where values go, clock, budget, published names.
 
-import { change } from "../api.js";
+import { change, get } from "../api.js";
 import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../dom.js";
 import { channelName, clock, count, grouped, nameOf, short } from "../format.js";
 import { on, refresh, state } from "../state.js";
 import { linkName } from "./facts.js";
 
+const NAMES = 40; // rows of published names; a press shows as many more
+
 export function stationView(main) {
   const links = h("ul", { class: "lines" });
   const sinks = h("ul", { class: "lines" });
   const noSink = h("div", {});
+  const plantFacts = h("dl", { class: "facts-list" });
+  const plant = h("ul", { class: "lines" });
+  const plantPanel = h("section", { class: "panel", "aria-label": "Plant", hidden: true }, h("h3", {}, "Plant"), plantFacts, plant);
   const facts = h("dl", { class: "facts-list" });
   const names = h("tbody", {});
+  const find = h("input", { type: "search", placeholder: "Node, channel or topic", "aria-label": "Search published names", oninput: () => ((most = NAMES), paint()) });
+  const further = button("", { class: "quiet", hidden: true, onclick: () => ((most += NAMES), paint()) });
+  let most = NAMES;
   const noName = h("div", {});
   const table = h("table", { class: "names" }, h("caption", { class: "unseen" }, "Published names"), h("thead", {}, h("tr", {}, ["Channel", "Topic"].map((words) => h("th", { scope: "col" }, words)))), names);
   main.append(
@@ -21,8 +29,9 @@ export function stationView(main) {
       { class: "grid" },
       h("section", { class: "panel", "aria-label": "Links" }, h("h3", {}, "Links"), links),
       h("section", { class: "panel", "aria-label": "About" }, h("h3", {}, "About"), facts),
+      plantPanel,
       h("section", { class: "panel", "aria-label": "Where values go" }, h("h3", {}, "Where values go"), noSink, sinks),
-      h("section", { class: "panel", "aria-label": "Published names" }, h("h3", {}, "Published names"), noName, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Published names" }, table)),
+      h("section", { class: "panel", "aria-label": "Published names" }, h("div", { class: "panel-head" }, h("h3", {}, "Published names"), find), noName, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Published names" }, table), further),
     ),
   );
 
@@ -40,10 +49,16 @@ export function stationView(main) {
     if ((status.sinks ?? []).length) noSink.replaceChildren();
     else if (!noSink.firstChild) fill(noSink, empty("Values are not recorded or published.", h("p", {}, "Start ncap run with --record, --ros1, --ros2 or --mqtt, or enter a file name when you start a group.")));
     about(status);
+    paintPlant();
     if (state.names.length) noName.replaceChildren();
     else if (!noName.firstChild) fill(noName, empty("No channels are published yet.", h("p", {}, "Names appear once a node has a datasheet.")));
+    const words = find.value.trim().toLowerCase();
+    const meant = words ? state.names.filter((one) => `${one.topic ?? ""} ${labelOf(one)}`.toLowerCase().includes(words)) : state.names;
+    find.hidden = state.names.length <= NAMES && !words;
+    further.hidden = meant.length <= most;
+    text(further.lastChild, `Show ${Math.min(NAMES, meant.length - most)} more of ${meant.length}`);
     table.hidden = !state.names.length;
-    keyed(names, state.names, (one) => `${one.uuid}/${one.channel}`, nameRow, (element, one) => element.paint(one));
+    keyed(names, meant.slice(0, most), (one) => `${one.uuid}/${one.channel}`, nameRow, (element, one) => element.paint(one));
   }
 
   function about(status) {
@@ -60,10 +75,53 @@ export function stationView(main) {
     again(facts, rows.map(([name, value]) => [name, value?.textContent ?? value]), () => rows.map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
   }
 
+  function paintPlant() {
+    plantPanel.hidden = !known;
+    if (!known) return;
+    const rows = [
+      ["Plant", `${known.name}, roster ${known.roster} until ${new Date(known.expires * 1000).toISOString().slice(0, 10)}`],
+      ["Last sync", known.age === null ? "never" : `${ago(known.age)} ago${known.why ? `: ${known.why}` : ""}`],
+      ["Unsent", count(known.unsent, "event")],
+      ["To rotate", known.to_rotate ? count(known.to_rotate, "node") : null],
+    ].filter(([, value]) => value !== null);
+    again(plantFacts, rows, () => rows.map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+    const lines = [
+      ...known.alarms.filter((one) => !one.seen).map((one) => ({ key: `alarm ${one.code} ${one.about} ${one.at}`, tone: "bad", word: one.code, name: one.about, told: one.why })),
+      ...known.stations.map((one) => ({ key: one.fingerprint, tone: TONES[one.state] ?? "warn", word: one.state, name: one.name, told: `${one.roles.join(" ")}, page ${one.page}${one.age === null ? "" : `, ${ago(one.age)} ago`}` })),
+      ...known.conflicts.map((one) => ({ key: `conflict ${one.uuid} ${one.conflict}`, tone: "warn", word: one.conflict, name: nameOf(state.nodes.get(one.uuid) ?? { uuid: one.uuid }), told: one.detail })),
+    ];
+    keyed(plant, lines, (one) => one.key, () => h("li", {}), (element, one) => again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${one.told}`)), chip(one.tone, one.tone === "good" ? "good" : "warn", one.word)]));
+  }
+
+  let known = null;
+  async function askPlant() {
+    try {
+      known = state.status?.plant ? await get("plant") : null;
+    } catch {
+      known = null; // it left meanwhile
+    }
+    paintPlant();
+  }
+  const asking = setInterval(askPlant, PLANT_EVERY);
+  askPlant();
+
   const off = on("status names nodes", paint);
   refresh("names", "status");
   paint();
-  return { end: off };
+  return {
+    end() {
+      clearInterval(asking);
+      off();
+    },
+  };
+}
+
+const PLANT_EVERY = 10000; // ms
+const TONES = { here: "good", heard: "good", retired: "plain", lost: "plain", stolen: "plain" };
+
+function ago(seconds) {
+  for (const [unit, length] of [["days", 86400], ["h", 3600], ["min", 60]]) if (seconds >= 2 * length) return `${Math.floor(seconds / length)} ${unit}`;
+  return `${Math.floor(seconds)} s`;
 }
 
 function again(element, facts, make) {
@@ -71,6 +129,13 @@ function again(element, facts, make) {
   if (element.told === told) return;
   element.told = told;
   fill(element, make());
+}
+
+/** What a published name belongs to. */
+function labelOf(one) {
+  const node = state.nodes.get(one.uuid) ?? { uuid: one.uuid };
+  const channel = node.channels?.find((each) => each.number === one.channel);
+  return one.channel ? `${nameOf(node)}: ${channel ? channelName(channel) : `channel ${one.channel}`}` : `${nameOf(node)} (the node)`;
 }
 
 function nameRow(one) {
@@ -91,9 +156,7 @@ function nameRow(one) {
   element.paint = (now) => {
     const before = known;
     known = now;
-    const node = state.nodes.get(now.uuid) ?? { uuid: now.uuid };
-    const channel = node.channels?.find((each) => each.number === now.channel);
-    text(label, now.channel ? `${nameOf(node)}: ${channel ? channelName(channel) : `channel ${now.channel}`}` : `${nameOf(node)} (the node)`);
+    text(label, labelOf(now));
     entry.setAttribute("aria-label", `Topic of ${label.textContent}`);
     if (document.activeElement !== entry && (before !== now || !entry.value)) entry.value = now.topic ?? "";
     keep.disabled = state.status?.write === false || state.connection !== "live";

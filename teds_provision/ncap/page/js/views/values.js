@@ -162,10 +162,10 @@ function calibrated(channel) {
 export function plotHead(plot, tag, title = "Plot") {
   const windows = h("div", { class: "switch", role: "group", "aria-label": "Time shown" });
   const show = (seconds) => {
-    plot.window = seconds;
+    plot.span(seconds);
     for (const choice of windows.children) choice.setAttribute("aria-pressed", String(Number(choice.dataset.seconds) === seconds));
   };
-  windows.append(...WINDOWS.map((seconds) => button(seconds < 60 ? `${seconds} s` : `${seconds / 60} min`, { "data-seconds": seconds, onclick: () => show(seconds) })));
+  windows.append(...WINDOWS.map((seconds) => button(seconds < 60 ? `${seconds} s` : seconds < 3600 ? `${seconds / 60} min` : "1 h", { "data-seconds": seconds, onclick: () => show(seconds) })));
   show(plot.window);
   const pause = button("Pause", {
     "aria-pressed": "false",
@@ -176,7 +176,9 @@ export function plotHead(plot, tag, title = "Plot") {
       text(pause.lastChild, yes ? "Resume" : "Pause");
     },
   });
-  return h("div", { class: "panel-head" }, h(tag, {}, title), windows, pause);
+  const back = button("Back to live", { hidden: true, onclick: () => plot.zoom(null) }, "play");
+  plot.onzoom = () => (back.hidden = !plot.range);
+  return h("div", { class: "panel-head plot-head" }, h(tag, {}, title), windows, pause, back);
 }
 
 /** Idle or measuring, and how fast. */

@@ -1,0 +1,181 @@
+"""The plant beside the service: syncs at its start, when the registry says that something is new, and each minute.
+
+A registry that fails stops nothing: that it does is told once, and once that it is back.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from teds_provision import plant
+from teds_provision.errors import LinkFailure, NotMember, RosterExpired, StoreLocked, TedsProvisionError
+from teds_provision.ncap.live import Live
+from teds_provision.plant.post import Post
+from teds_provision.plant.postgres import PostgresPost, Registry
+from teds_provision.station.station import Station
+
+EVERY: Final = 60.0
+"""Seconds between two syncs where nobody wakes us."""
+_SOON: Final = 1.0
+"""Seconds to wait after a failure of the connection that listens, and at most for the end of this."""
+_BUSY: Final = 2.0
+_EMPTY_PAGE: Final = 24 * 3600.0
+
+
+class PlantWatch:
+    """Follows the registry that this station joined; does nothing where it joined none."""
+
+    def __init__(self, station: Station, live: Live, changed: Callable[[], object]) -> None:
+        self._station, self._live, self._changed = station, live, changed
+        self._wake, self._stop = threading.Event(), threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._post: Post | None = None
+        self._listener: Registry | None = None
+        self._told = ("", "")
+
+    def start(self) -> None:
+        """Begin; raises PolicyRefused where no registry was joined."""
+        plant.folding.require_roster(self._station)
+        for run, name in ((self._run, "registry"), (self._listen, "registry listener")):
+            self._threads.append(threading.Thread(target=run, name=name, daemon=True))
+            self._threads[-1].start()
+
+    def stop(self) -> None:
+        """End: a sync that is under way is cut, and the next one carries on."""
+        self._stop.set()
+        self._wake.set()
+        for connection in (self._post, self._listener):
+            if isinstance(connection, PostgresPost | Registry):
+                connection.interrupt()
+        for thread in self._threads:
+            thread.join(_SOON)
+
+    def status(self) -> dict[str, Any] | None:
+        """api.md, `/plant`; None where this station joined no registry. Reads the store alone."""
+        record, roster = self._station.plant.joined, self._station.plant.roster
+        if record is None or roster is None:
+            return None
+        found = plant.status.status(self._station, record, roster)
+        synced = datetime.fromisoformat(record.synced).timestamp() if record.synced else None
+        return {
+            "registry": roster.registry,
+            "name": roster.name,
+            "roster": roster.version,
+            "expires": roster.expires.timestamp(),
+            "state": self._told[0] or "waiting",
+            "why": self._told[1],
+            "synced": synced,
+            "age": None if synced is None else max(0.0, time.time() - synced),
+            "unsent": found.unsent,
+            "to_rotate": plant.leaving.due(self._station),
+            "stations": [
+                {
+                    "name": one.name,
+                    "fingerprint": one.fingerprint,
+                    "roles": list(one.roles),
+                    "page": one.n,
+                    "age": one.age,
+                    "state": one.state,
+                }
+                for one in found.standings
+            ],
+            "conflicts": [
+                {"uuid": uuid.hex(), "conflict": name, "detail": detail}
+                for uuid, name, detail in self._station.plant.tables.conflicts()
+            ],
+            "alarms": [
+                {"code": one.code, "about": roster.name_of(one.about) if one.about else "", "why": one.why,
+                 "at": one.at, "seen": one.seen}
+                for one in found.alarms
+            ],
+        }  # fmt: skip
+
+    # -- threads -----------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self._wake.clear()
+            busy = self._sync()
+            self._wake.wait(_BUSY if busy else EVERY)
+
+    def _sync(self) -> bool:
+        """One sync; True where another command of this home is at it."""
+        station = self._station
+        try:
+            if self._post is None:
+                self._post = plant.reaching.post_of(station)
+            if self._post is None:
+                self._tell("unreachable", "nothing is known that carries: registry connect")
+                return False
+            self._say_daily()
+            done = plant.sync.sync(station, self._post)
+        except StoreLocked:
+            return True
+        except NotMember as error:
+            self._tell("removed", error.message)
+        except RosterExpired as error:
+            self._tell("expired", error.message)
+        except LinkFailure as error:
+            self._tell("unreachable", error.message)
+        except TedsProvisionError as error:
+            self._tell("alarm", error.message)
+        else:
+            self._after(done.pushed + done.fetched + done.parcels_in + done.parcels_out + len(done.rosters))
+        return False
+
+    def _after(self, moved: int) -> None:
+        record, roster = self._station.plant.joined, self._station.plant.roster
+        if record is None or roster is None:
+            return
+        found = plant.status.status(self._station, record, roster)
+        alarms = [one for one in found.alarms if not one.seen]
+        if alarms:
+            self._tell("alarm", f"{alarms[-1].code}: {alarms[-1].why}")
+        elif found.expired:
+            self._tell("expired", f"the roster's time was over on {roster.expires:%Y-%m-%d}")
+        elif found.expires_soon:
+            self._tell("expires", f"the roster's time is over on {roster.expires:%Y-%m-%d}")
+        else:
+            self._tell("synced", "")
+        if moved:
+            self._changed()
+
+    def _say_daily(self) -> None:
+        """An empty page each day: a station that says nothing for seven days counts as silent."""
+        station, roster = self._station, self._station.plant.roster
+        chain = station.plant.tables.chains().get(station.fingerprint)
+        if roster is None or chain is None or not chain.counted[0]:
+            return
+        page = station.plant.tables.page(chain.chain, *chain.counted)
+        if (
+            page is not None
+            and (datetime.now(UTC) - datetime.fromisoformat(page.created)).total_seconds() > _EMPTY_PAGE
+        ):
+            plant.sync.close_page(station, roster, empty=True)
+
+    def _listen(self) -> None:
+        """Wake the sync when the registry says that somebody did something."""
+        while not self._stop.is_set():
+            try:
+                if self._listener is None:
+                    self._listener = plant.reaching.listener(self._station)
+                    if self._listener is None:
+                        return
+                self._listener.listen()
+                while not self._stop.is_set():
+                    if self._listener.wait(EVERY):
+                        self._wake.set()
+                    else:
+                        self._listener.listen()  # also finds out whether the connection is there
+            except TedsProvisionError:
+                self._stop.wait(EVERY if self._told[0] == "unreachable" else _SOON)
+
+    def _tell(self, state: str, why: str) -> None:
+        """One line for each change of state."""
+        if (state, why) != self._told:
+            self._told = state, why
+            self._live.event("registry", state=state, why=why)

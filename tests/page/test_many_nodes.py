@@ -1,0 +1,81 @@
+"""Hundreds of nodes on the page: their order, filters, what is done with many of them, and how soon they are drawn."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from teds_provision.store import Store
+from tests.pace import until
+
+from .lab import Lab, opened
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from playwright.sync_api import Browser, Page
+
+pytestmark = pytest.mark.system
+MANY = 300
+
+
+@pytest.fixture(scope="module")
+def crowd(lab: Lab) -> Iterator[Lab]:
+    """The lab, and nodes that are on the whitelist and not there."""
+    listed = [{"uuid": f"{0xBEEF:04x}{number:016x}", "name": f"joint {number}"} for number in range(1, MANY + 1)]
+    file = lab.folder / "crowd.json"
+    file.write_text(json.dumps({"whitelist": listed}))
+    lab.ask("whitelist", "import", file)
+    yield lab
+    with Store.open(lab.station.home) as store, store.together():
+        for one in listed:
+            store.remove_whitelist(bytes.fromhex(one["uuid"]))
+
+
+def names(page: Page) -> list[str]:
+    """What is listed, from top to bottom."""
+    return page.locator(".card .name").all_inner_texts()
+
+
+def test_many_nodes_are_in_order_found_by_what_they_are_and_drawn_by_the_hundred(browser: Browser, crowd: Lab) -> None:
+    with opened(browser, crowd) as page:
+        page.get_by_role("button", name="Show 100 more").wait_for()
+        found = names(page)
+        assert found[:2] == ["hand", "slew"], "who is there comes first"
+        assert found[2:12] == [f"joint {number}" for number in range(1, 11)], "2 comes before 10"
+        assert len(found) == 100
+        page.get_by_label("Search nodes").fill("joint 29")
+        until(lambda: names(page) == ["joint 29", *[f"joint {number}" for number in range(290, 300)]])
+        page.get_by_role("button", name="Clear filters").click()
+        page.get_by_text("Filter", exact=True).click()
+        page.get_by_label("Filter by verdict").select_option("authentic")
+        until(lambda: names(page) == ["hand", "slew"])
+        page.get_by_label("Filter by type").select_option("gripper")
+        until(lambda: names(page) == ["hand"])
+        page.get_by_role("button", name="Clear filters").click()
+        page.get_by_label("Filter by link").select_option("away")
+        until(lambda: len(names(page)) == 100)
+
+
+def test_an_act_on_many_nodes_names_who_was_refused_and_does_the_rest(browser: Browser, crowd: Lab) -> None:
+    with opened(browser, crowd) as page, opened(browser, crowd) as other:
+        page.get_by_role("button", name="Select", exact=True).click()
+        for name in ("hand", "slew", "joint 1"):
+            page.get_by_role("checkbox", name=f"Select {name}", exact=True).check()
+        page.get_by_role("button", name="Verify").click()
+        result = page.locator(".bulk-result")
+        result.get_by_text("Verified 2 of 3.").wait_for()
+        result.get_by_role("listitem").filter(has_text="joint 1: ").wait_for()
+        page.get_by_role("checkbox", name="Select joint 1", exact=True).uncheck()
+        page.get_by_label("Group to add to").fill("pair")
+        page.get_by_role("button", name="Add to group").click()
+        result.get_by_text("Group pair has 2 nodes.").wait_for()
+        other.get_by_role("link", name="Measure").click()
+        other.get_by_role("heading", name="pair").wait_for()  # another tab sees it at once
+        page.get_by_role("group", name="Selected nodes").get_by_role("button", name="Measure").click()
+        result.get_by_text("Measuring 2 nodes.").wait_for()
+        assert sorted(crowd.measurements()[0]["uuids"]) == sorted(crowd.nodes[name].uuid for name in ("hand", "slew"))
+        page.get_by_label("Search nodes").fill("joint")
+        page.get_by_text("2 nodes selected, 2 of them not listed").wait_for()
