@@ -61,6 +61,18 @@ class NotAuthentic(TedsProvisionError):
     code = "not-authentic"
 
 
+class Fork(NotAuthentic):
+    """The registry has pages under this station's key that do not go on from those here."""
+
+    code = "fork"
+
+
+class TwoHistories(NotAuthentic):
+    """A station signed two pages of one number."""
+
+    code = "two-histories"
+
+
 class BadDatasheet(NotAuthentic):
     """A datasheet that was read is not authentic: no disturbed frame, which another try would cure."""
 
@@ -106,6 +118,12 @@ class AddressConflict(LinkFailure):
     code = "address-conflict"
 
 
+class RegistryFailure(LinkFailure):
+    """The registry cannot be reached, or refuses the login."""
+
+    code = "registry"
+
+
 class Unproven(LinkFailure):
     """A key of the node is held here and no session came about, so nothing that was read counts."""
 
@@ -147,6 +165,24 @@ class NoRoom(PolicyRefused):
     """The bus, or the budget of messages, has no room for a node's data."""
 
     code = "no-room"
+
+
+class NotMember(PolicyRefused):
+    """The station is no member of the registry, or none any more."""
+
+    code = "not-member"
+
+
+class RosterExpired(PolicyRefused):
+    """The roster is older than the owner's CA said that it may become."""
+
+    code = "roster-expired"
+
+
+class PlantConflict(PolicyRefused):
+    """Stations of the plant say different things, and a person has to decide."""
+
+    code = "conflict"
 
 
 class NodeRefused(PolicyRefused):

@@ -95,6 +95,17 @@ def write_whole(
         raise _cannot_write(path, error, failure) from error
 
 
+def open_lock(path: Path) -> int:
+    """Open the file that is locked while another one is changed, made where it is missing; returns its descriptor.
+
+    Raises StoreFailure where it cannot be made: the first thing that a read-only or full disk refuses.
+    """
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
+    except OSError as error:
+        raise _cannot_write(path, error, StoreFailure) from error
+
+
 def write_new(
     path: Path, octets: bytes, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
 ) -> None:
@@ -142,7 +153,7 @@ def read_limited(
     ``follow`` False refuses a symbolic link. Raises NotFound (no such file), ``failure`` (it cannot be read), and
     BadData (larger than any ``what``).
     """
-    with _told(path, failure):
+    with _failing_as(path, failure):
         octets = _read(_opened(path, 0 if follow else os.O_NOFOLLOW), max_octets + 1)
     if len(octets) > max_octets:
         raise BadData(f"{path} is larger than {max_octets} octets: that is no {what}.")
@@ -161,7 +172,7 @@ def read_text(path: Path, max_octets: int, what: str, *, failure: type[TedsProvi
 
 def open_to_read(path: Path) -> BinaryIO:
     """Open a file to read from; raises NotFound where it is not there or cannot be read."""
-    with _told(path, NotFound):
+    with _failing_as(path, NotFound):
         return open(_opened(path), "rb")
 
 
@@ -194,7 +205,7 @@ def _is_named(path: Path) -> bool:
 
 
 @contextmanager
-def _told(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]:
+def _failing_as(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]:
     """Say why a file cannot be read."""
     try:
         yield
@@ -267,17 +278,20 @@ def short_path(path: Path) -> Iterator[str]:
 
 
 def listen_alone(path: Path, waiting: int) -> socket.socket:
-    """A Unix socket that only this user can reach; what a killed process left is replaced. Raises OSError."""
-    with suppress(FileNotFoundError):
-        path.unlink()
+    """A Unix socket that only this user can reach; what a killed process left is replaced. Raises StoreFailure."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     before = os.umask(0o177)  # its mode is set when it is bound: there is no moment in which others may connect
     try:
+        with suppress(FileNotFoundError):
+            path.unlink()
         with short_path(path) as name:
             listener.bind(name)
+        listener.listen(waiting)
+    except OSError as error:
+        listener.close()
+        raise _cannot_write(path, error, StoreFailure) from error
     finally:
         os.umask(before)
-    listener.listen(waiting)
     return listener
 
 

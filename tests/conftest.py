@@ -21,8 +21,11 @@ from hypothesis import HealthCheck, settings
 
 from teds_provision.station.station import Station
 from tests.bench import Board, make_station
+from tests.firmware.c_node import OFFERS
 
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
+
+ALL_IN_C = os.environ.get("TEDS_NODE", "python") == "c"
 
 OF_TERMINALS = {
     "COLUMNS",
@@ -62,15 +65,41 @@ def pytest_configure() -> None:
             del os.environ[name]
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run what is marked ``both_nodes`` with the Python node and with the one in C."""
+    if metafunc.definition.get_closest_marker("both_nodes") and not ALL_IN_C:
+        metafunc.parametrize("node_kind", ["python", pytest.param("c", marks=pytest.mark.system)])
+
+
+@pytest.fixture
+def node_kind() -> str:
+    """Which node a desk has: ``python``, or ``c`` (``make test-c``)."""
+    return "c" if ALL_IN_C else "python"
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Let a rule about time be held by the best of three tries, as ``best_of`` does; every try is told (``-rR``).
 
-    Nothing but these is tried again: a rule that says nothing about time fails at once.
+    Nothing but these is tried again: a rule that says nothing about time fails at once. What needs of a node what the
+    one in C lacks is left out there.
     """
+    items[:] = [item for item in items if not _in_c(item) or _needed(item) <= OFFERS]
     for item in items:
         if item.get_closest_marker("realtime"):
             item.add_marker(pytest.mark.flaky(reruns=2))
+
+
+def _in_c(item: pytest.Item) -> bool:
+    return ALL_IN_C or (isinstance(item, pytest.Function) and _param(item, "node_kind") == "c")
+
+
+def _param(item: pytest.Function, name: str) -> object:
+    return item.callspec.params.get(name) if hasattr(item, "callspec") else None
+
+
+def _needed(item: pytest.Item) -> set[str]:
+    return {word for mark in item.iter_markers("needs") for word in mark.args}
 
 
 @pytest.hookimpl(wrapper=True)

@@ -36,22 +36,23 @@ ARROWS = {
     "talk": _BELOW_TALK,
     "steps": _BELOW_TALK | {"talk"},
     "handover": _BELOW_TALK | {"talk", "steps"},
+    "plant": _BELOW_TALK | {"talk", "steps", "handover"},
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
     "client": {"api"},
-    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "measure", "node", "client", "api"},
+    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "node", "client", "api"},
     "check": _BELOW_TALK | {"talk", "steps"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
-    "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure", "client"},
+    "demo": _BELOW_TALK | {"talk", "steps", "handover", "plant", "measure", "client"},
     "cli": _BELOW_TALK
     | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}
-    | {"trace"},
+    | {"trace", "plant"},
     "__main__": {"cli"},
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
 HEAVY |= {"smartcard", "mcap", "zstandard", "cyclonedds", "paho", "starlette", "uvicorn", "websockets"}
-HEAVY |= {"bleak", "bumble", "dbus_fast"}
+HEAVY |= {"bleak", "bumble", "dbus_fast", "psycopg", "pyarrow", "pandas"}
 PURE = ("protocol", "teds")
 IO = {"socket", "sqlite3", "subprocess", "threading", "time", "click", "serial"}
 

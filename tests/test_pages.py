@@ -6,11 +6,12 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-_FOLDERS = (ROOT / "docs" / "contract", ROOT / "docs", ROOT / "docs" / "adr", ROOT)
+_FOLDERS = (ROOT / "docs" / "contract", ROOT / "docs" / "internals", ROOT / "docs", ROOT / "docs" / "adr", ROOT)
 PAGES = {page.name: page for folder in _FOLDERS for page in folder.glob("*.md")}
 PAGES["model/README.md"] = ROOT / "model" / "README.md"
-NAMED = re.compile(r'\b((?:model/)?[A-Za-z0-9-]+\.md)((?:,?\s+(?:and\s+)?\\?"[^"\\]+\\?")*)')
-NUMBERED = re.compile(r"\b([a-z-]+\.md),?\s+sections?\s+([0-9]+(?:(?:,|\s+and|\s+to)\s+[0-9]+)*)")
+PAGES |= {f"contract/{page.name}": page for page in (ROOT / "docs" / "contract").glob("*.md")}
+NAMED = re.compile(r'\b((?:model/|contract/)?[A-Za-z0-9-]+\.md)((?:,?\s+(?:and\s+)?\\?"[^"\\]+\\?")*)')
+NUMBERED = re.compile(r"\b((?:contract/)?[a-z-]+\.md),?\s+sections?\s+([0-9]+(?:(?:,|\s+and|\s+to)\s+[0-9]+)*)")
 
 
 def headings(page: Path) -> set[str]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.store import NodeRecord, Revocation, Store, Tombstone, WhitelistEntry
+from teds_provision.store import Revocation, Store, Tombstone, WhitelistEntry
 from teds_provision.store.snapshot import Relation, extend_audit
 
 
@@ -28,7 +28,11 @@ class Merge:
         """Bring everything in the order in which one part looks at the other."""
         if self.newer:
             self.back["audit entries"] = extend_audit(self.live, self.copy)
-        self._revocations()
+        for revocation in self.copy.revocations():
+            if self.live.revocation(revocation.uuid) is None:
+                self.live.put_revocation(revocation)
+                self.back["revocations"] += 1
+        self.kept["revocations made since"] = _more(self.live.revocations(), self.copy.revocations())
         self._handovers()
         self._nodes()
         self._whitelist()
@@ -43,13 +47,6 @@ class Merge:
         """What stayed, in sentences."""
         return [f"{what}: {count}" for what, count in self.kept.items() if count]
 
-    def _revocations(self) -> None:
-        for revocation in self.copy.revocations():
-            if self.live.revocation(revocation.uuid) is None:
-                self.live.put_revocation(revocation)
-                self.back["revocations"] += 1
-        self.kept["revocations made since"] = _more(self.live.revocations(), self.copy.revocations())
-
     def _handovers(self) -> None:
         for handover in self.copy.handovers():
             known = self.live.handover(handover.id, handover.direction)
@@ -57,22 +54,16 @@ class Merge:
                 self.live.put_handover(handover)
                 self.back["handovers"] += 1
         if not self.older:  # what an older copy has and this store lacks was undone, or rotated away, since
-            self._tombstones()
-            self._holders()
+            for tombstone in self.copy.tombstones():
+                if self.live.tombstone(tombstone.uuid) is None:
+                    self.live.put_tombstone(tombstone)
+                    self.back["tombstones"] += 1
+            present = {(holder.uuid, holder.fingerprint) for holder in self.live.holders()}
+            for holder in self.copy.holders():
+                if (holder.uuid, holder.fingerprint) not in present:
+                    self.live.put_holder(holder)
+                    self.back["holders"] += 1
         self.kept["nodes moved away since"] = _more(self.live.tombstones(), self.copy.tombstones())
-
-    def _tombstones(self) -> None:
-        for tombstone in self.copy.tombstones():
-            if self.live.tombstone(tombstone.uuid) is None:
-                self.live.put_tombstone(tombstone)
-                self.back["tombstones"] += 1
-
-    def _holders(self) -> None:
-        present = {(holder.uuid, holder.fingerprint) for holder in self.live.holders()}
-        for holder in self.copy.holders():
-            if (holder.uuid, holder.fingerprint) not in present:
-                self.live.put_holder(holder)
-                self.back["holders"] += 1
 
     def _nodes(self) -> None:
         for record in self.copy.nodes():
@@ -94,13 +85,10 @@ class Merge:
             if wanted != known:
                 self.live.put_node(wanted)
                 self.back["nodes"] += 1
-            self._note_node(known, record, other=other)
-
-    def _note_node(self, known: NodeRecord, record: NodeRecord, *, other: bool) -> None:
-        self.kept["nodes pinned to another key now"] += other
-        self.kept["nodes whose epoch or sequence is higher now"] += (
-            known.epoch > record.epoch or known.sequence > record.sequence
-        )
+            self.kept["nodes pinned to another key now"] += other
+            self.kept["nodes whose epoch or sequence is higher now"] += (
+                known.epoch > record.epoch or known.sequence > record.sequence
+            )
 
     def _whitelist(self) -> None:
         for entry in self.copy.whitelist():
@@ -139,20 +127,14 @@ class Merge:
 
     def _images(self) -> None:
         for record in self.copy.nodes():
-            self._draft(record.uuid)
-            self._history(record.uuid)
-
-    def _draft(self, uuid: bytes) -> None:
-        draft, known = self.copy.draft(uuid), self.live.draft(uuid)
-        if draft is not None and draft != known and (self.newer or (known is None and not self.older)):
-            self.live.put_draft(draft)
-            self.back["drafts"] += 1
-
-    def _history(self, uuid: bytes) -> None:
-        history, present = self.copy.history(uuid), self.live.history(uuid)
-        if history and history != present and (not present or self.newer):
-            self.live.put_history(history[::-1])
-            self.back["datasheets"] += 1
+            draft, known = self.copy.draft(record.uuid), self.live.draft(record.uuid)
+            if draft is not None and draft != known and (self.newer or (known is None and not self.older)):
+                self.live.put_draft(draft)
+                self.back["drafts"] += 1
+            history, present = self.copy.history(record.uuid), self.live.history(record.uuid)
+            if history and history != present and (not present or self.newer):
+                self.live.put_history(history[::-1])
+                self.back["datasheets"] += 1
 
     def _trust(self) -> None:
         names = {record.name for record in self.live.trusted()}

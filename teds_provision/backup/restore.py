@@ -23,6 +23,7 @@ from teds_provision.errors import (
 )
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
+from teds_provision.station.plant import new_home
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
 from teds_provision.store.database import has_store
@@ -106,12 +107,18 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
             vault, why = bring_vault(home, content, known, wanted, costs)
             kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
             with copy.transaction():
-                _move_to(copy, kind, why)
+                # note in a restored store where the secrets lie on this machine
+                facts = copy.facts()
+                if facts is not None:
+                    copy.put_facts(replace(facts, keystore=kind, keystore_why=why))
                 due = _demand_rotations(copy, content, known)
+                _note_restored(copy, vault, known)
                 detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
                 copy.audit.append("restore", None, "rebuilt", detail)
             aside = set_aside(home) if has_store(home) else None
             place(copy, home)
+            if copy.plant() is not None:
+                new_home(home)
         return Restored("rebuilt", None, totals(copy), (), kind, aside, due)
 
     return asked_first(ask, make)
@@ -126,6 +133,14 @@ def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
     return len(nodes)
 
 
+def _note_restored(copy: Store, vault: Vault, ask: Ask) -> None:
+    """Have a home that belongs to a plant look for its own pages before it says anything there."""
+    if copy.plant() is not None:
+        station = Station(copy, ask)
+        station.adopt(vault)
+        station.plant.begin_restored()
+
+
 def keystore_for(content: Content, asked: str | None) -> str | None:
     """Which keystore a restored station gets: None means the keyring, or a passphrase file where it does not work.
 
@@ -133,7 +148,7 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
     PolicyRefused where the keys cannot be put there.
     """
     wanted = asked or _kept_keystore(content)
-    into_token = _is_token(wanted)
+    into_token = wanted is not None and wanted.startswith("pkcs11:")
     if wanted not in (None, "keyring", "file") and not into_token:
         raise UsageFailure("There is no such keystore.", hint="Give --keystore keyring, file or pkcs11:URI.")
     if content.in_token and asked is None:
@@ -151,10 +166,6 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
             "The keys of this backup cannot be put into a token.", hint="Restore with --keystore keyring or file."
         )
     return wanted
-
-
-def _is_token(keystore: str | None) -> bool:
-    return keystore is not None and keystore.startswith("pkcs11:")
 
 
 def _kept_keystore(content: Content) -> str | None:
@@ -244,10 +255,3 @@ def _check_inside(copy: Store, content: Content) -> None:
     facts = copy.facts()
     if copy.id != content.store or facts is None or facts.point != content.point:
         raise NotAuthentic("The store in the backup is not that of the station that signed it.")
-
-
-def _move_to(copy: Store, keystore: str, why: str) -> None:
-    """Note in a restored store where the secrets lie on this machine."""
-    facts = copy.facts()
-    if facts is not None:
-        copy.put_facts(replace(facts, keystore=keystore, keystore_why=why))

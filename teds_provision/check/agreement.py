@@ -150,15 +150,11 @@ def _slip_of_request(probe: Probe) -> slips.Slip | None:
     return None
 
 
-def _needs_agreement(probe: Probe) -> None:
+def stranger_asks(probe: Probe) -> bytes:
+    """The payload of a reply to a good Request of a stranger, which nobody confirms; raises NotApplicable."""
     tapped_or_bus(probe)
     if probe.no_agreement:
         raise NotApplicable(f"Needs a good reply to Request, and none came: {probe.no_agreement}")
-
-
-def stranger_asks(probe: Probe) -> bytes:
-    """The payload of a reply to a good Request of a stranger, which nobody confirms; raises NotApplicable."""
-    _needs_agreement(probe)
     return probe.good(request(Strangers.make().request()))
 
 

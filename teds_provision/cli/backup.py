@@ -120,7 +120,7 @@ def restore(
         _merge(app, present, content, keystore, yes=yes, dry_run=dry_run)
         return
     wanted = backup_room.restore.keystore_for(content, keystore)
-    app.note(_told(content, wanted))
+    app.note(_summary(content, wanted))
     if dry_run:
         plan = {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True}
         app.emit(plan | {"age_days": content.age_days()}, f"Plan: rebuild this station in {app.home}.")
@@ -138,7 +138,7 @@ def restore(
     _emit(app, content, done, f"The station is restored in {app.home}, with its keys in the keystore {done.keystore}.")
 
 
-def _told(content: Content, keystore: str | None) -> str:
+def _summary(content: Content, keystore: str | None) -> str:
     """Whose backup it is, how old, and where the keys shall lie: what a person has to compare."""
     days = content.age_days()
     age = f"{days} day{'' if days == 1 else 's'} ago" if days >= 0 else "in the future: check the clocks"
@@ -169,7 +169,7 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     plan = backup_room.restore.merge(store, content, dry_run=True)
     how = plan.relation.value if plan.relation is not None else ""
     facts = store.facts()
-    head = f"{_told(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
+    head = f"{_summary(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
     app.note("\n".join([head, *_lines(plan)]))
     if dry_run:
         _emit(app, content, plan, f"Plan: {'restore the items listed' if plan.back else 'nothing to do'}.", dry=True)

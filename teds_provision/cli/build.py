@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import steps
+from teds_provision import plant, steps
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
@@ -30,6 +30,8 @@ from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
+    from teds_provision.plant.asking import SignBy
+    from teds_provision.station.station import Station
     from teds_provision.steps.write import Written
 
 MAX_INPUT_OCTETS = 32 << 20
@@ -129,14 +131,29 @@ def read_file(path: Path) -> bytes:
     return read_limited(path, MAX_INPUT_OCTETS, "image")
 
 
-@command("teds-provision sign 8d4d", "teds-provision sign angle.json --output signed.json")
+@command(
+    "teds-provision sign 8d4d",
+    "teds-provision sign angle.json --output signed.json",
+    "teds-provision sign 8d4d --by office --job 0b5f --output request.jws",
+)
 @click.argument("what", metavar="UUID|IMAGE")
 @click.option(
     "--output",
     "-o",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="IMAGE",
-    help="Write the signed image to this file.",
+    help="Write the signed image to this file; with --by, the request.",
+)
+@click.option("--by", metavar="OFFICE", help="Have this station of the plant sign; the node must be at hand.")
+@click.option("--job", metavar="ID", help="With --by: the job that the board is of.")
+@click.option(
+    "--calibration", type=FileToRead(), metavar="FILE", help="With --by: the calibration that it was built from."
+)
+@click.option(
+    "--files",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="With --by: the folder that carries to the office, in place of the registry.",
 )
 @click.option("--read-node", is_flag=True, help="Use the node's own epoch, sequence and TEDS instead of the store's.")
 @click.option(
@@ -150,6 +167,10 @@ def sign(
     app: App,
     what: str,
     output: Path | None,
+    by: str | None,
+    job: str | None,
+    calibration: Path | None,
+    files: Path | None,
     read_node: bool,
     accept_calibration: str | None,
     yes: bool,
@@ -162,6 +183,9 @@ def sign(
     """
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
+    if by is not None:
+        _sign_by(app, station, plant.asking.SignBy(what, by, job, calibration, files, output), links)
+        return
     done = steps.commands.sign_at(
         station,
         links,
@@ -188,6 +212,22 @@ def sign(
     }
     again = " (existing signature reused)" if done.signed.reused else ""
     app.emit(result, f"{_changes(done.changes)}\nSigned {uuid.hex()}, sequence {done.signed.sequence}{again}.")
+
+
+def _sign_by(app: App, station: Station, order: SignBy, links: LinkSettings) -> None:
+    """Have an office sign; with an output the request is written, and signed when its answer comes as a file."""
+    try:
+        signed = plant.asking.sign_by_office(station, links, order, reporter_for(app))
+    except plant.asking.NotAnswered as waits:
+        if order.output is None:
+            raise
+        app.emit({"request": str(order.output)}, f"Wrote the request to {order.output}. {waits.hint}")
+        return
+    uuid = signed.image.uuid.hex()
+    app.emit(
+        {"uuid": uuid, "sequence": signed.sequence, "signed_by": order.by, "reused": signed.reused},
+        f"{order.by} signed {uuid}, sequence {signed.sequence}. Write it: teds-provision write {uuid}",
+    )
 
 
 def _changes(changes: tuple[str, ...]) -> str:
@@ -253,7 +293,7 @@ def write(
         plan = {"uuid": node, "plan": "write", "blocks": blocks, "octets": octets}
         app.emit(plan, f"Plan: write {blocks} TEDS, {octets} octets, to {node}.")
         return
-    app.emit(_told(node, written), f"Node {node}: {_said(written)}.")
+    app.emit(_to_json(node, written), f"Node {node}: {_said(written)}.")
 
 
 def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
@@ -264,12 +304,12 @@ def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_
         plan = {"uuid": node, "plan": "write", "from": sequence, "changes": changes}
         app.emit(plan, f"Plan: restore the datasheet of sequence {sequence} on {node}.{lines}")
         return
-    result = _told(node, done.written) | {"from": sequence, "sequence": done.sequence, "changes": changes}
+    result = _to_json(node, done.written) | {"from": sequence, "sequence": done.sequence, "changes": changes}
     told = f"datasheet {sequence} restored as sequence {done.sequence}"
     app.emit(result, f"Node {node}: {told}; {_said(done.written)}.{lines}")
 
 
-def _told(node: str, written: Written) -> dict[str, Any]:
+def _to_json(node: str, written: Written) -> dict[str, Any]:
     return {
         "uuid": node,
         "octets_written": written.octets,

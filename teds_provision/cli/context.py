@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TextIO
@@ -32,6 +33,7 @@ else:
     console = late("teds_provision.cli.console")  # rich
 
 _BEHIND = " [y/N]: "
+_TELLING = threading.Lock()
 SOCKET: Final = "ncap.sock"
 """``client.SOCKET``, which is loaded where it is there."""
 
@@ -275,7 +277,9 @@ class App:
 
 def say(text: str) -> None:
     """Say something on stderr; what others wrote steers no terminal, and no word is broken at its edge."""
-    print(folded(sanitize(text), sys.stderr), file=sys.stderr, flush=True)
+    with _TELLING:  # one line at a time, whatever threads there are
+        sys.stderr.write(f"{folded(sanitize(text), sys.stderr)}\n")
+        sys.stderr.flush()
 
 
 def _asked(question: str) -> str:

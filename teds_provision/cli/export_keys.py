@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from teds_provision import handover
+from teds_provision import handover, plant
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command, dry_run_option, yes_option
 from teds_provision.cli.rendering import count_of, first_lines, local_time
@@ -29,6 +31,7 @@ _MEANS = {
 @command(
     "teds-provision export-keys --to lab --all --output lab.jwe",
     "teds-provision export-keys --to lab 8d4d --mode move --output finger.jwe",
+    "teds-provision export-keys --to south 8d4d --mode move --send",
 )
 @click.argument("uuids", metavar="[UUID]…", nargs=-1)
 @click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
@@ -43,10 +46,10 @@ _MEANS = {
 @click.option(
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
-    required=True,
     metavar="FILE",
     help="Where to write the sealed bundle.",
 )
+@click.option("--send", is_flag=True, help="Leave it at the registry with the next sync, instead of a file.")
 @click.option(
     "--expires",
     type=WholeNumber(1, 365),
@@ -65,7 +68,8 @@ def export_keys(
     receivers: tuple[str, ...],
     everything: bool,
     mode: Literal["copy", "move"],
-    output: Path,
+    output: Path | None,
+    send: bool,
     expires: int,
     ca: str | None,
     yes: bool,
@@ -79,13 +83,19 @@ def export_keys(
     """
     if everything == bool(uuids):
         raise click.UsageError("Name the nodes, or use --all.")
+    if send == (output is not None):
+        raise click.UsageError("Give one of --output FILE and --send.")
+    if send and len(receivers) != 1:
+        raise click.UsageError("A parcel is for one station: give --to once.")
     station = app.station()
+    if send:
+        plant.folding.require_roster(station)
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
     order = handover.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
         station.unlock()
     shown = handover.outgoing.plan_exports(station, order)
-    outputs = handover.outgoing.outputs_of(output, len(shown))
+    outputs = handover.outgoing.outputs_of(output, len(shown)) if output is not None else []
     if dry_run:
         told = _exported(shown, outputs, station)
         id_ = None if shown[0].earlier is None else shown[0].id
@@ -98,6 +108,10 @@ def export_keys(
         plans = shown if station.version() == state else handover.outgoing.plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         told = _exported(plans, outputs, station)
+        if send:
+            names = [plant.parcels.send_export(station, plan, datetime.now(UTC)) for plan in plans]
+            app.emit({**told, "parcels": names}, f"{_count(plans)} will leave with the next registry sync.")
+            return
         done = handover.outgoing.export_all(station, plans, outputs)
     _tell_export(app, plans, outputs, told, done)
 
@@ -123,7 +137,7 @@ def _count(plans: Sequence[ExportPlan]) -> str:
 def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Station) -> dict[str, Any]:
     plan = plans[0]
     return {
-        "bundle": str(outputs[0]),
+        "bundle": str(outputs[0]) if outputs else None,
         "from": station.fingerprint,
         "to": [{"name": record.name, "fingerprint": record.fingerprint} for record in plan.receivers],
         "mode": plan.mode,
@@ -134,8 +148,8 @@ def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Sta
         "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
         "also_held_by": sorted({digits for one in plans for digits in one.also_held_by}),
         "bundles": [
-            {"bundle": str(output), "id": one.id, "count": len(one.nodes)}
-            for one, output in zip(plans, outputs, strict=True)
+            {"bundle": None if output is None else str(output), "id": one.id, "count": len(one.nodes)}
+            for one, output in zip_longest(plans, outputs)
         ],
     }
 

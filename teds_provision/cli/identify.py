@@ -41,14 +41,14 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
         if arrival.error is not None:
             app.fail_line(arrival.error, uuid=arrival.uuid.hex(), time=arrival.time)
         elif arrival.result is not None:
-            found.append(_told(arrival.result))
+            found.append(_to_json(arrival.result))
             if watch:
                 _emit(app, found.pop() | {"time": arrival.time})
     if not watch:
         _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
 
 
-def _told(found: Found) -> dict[str, Any]:
+def _to_json(found: Found) -> dict[str, Any]:
     who, identity = found.who, found.identity
     return {
         "uuid": who.uuid.hex(),

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import click
 
-from teds_provision import handover, protocol
+from teds_provision import handover, plant, protocol
 from teds_provision.cli import options
 from teds_provision.cli.context import App
 from teds_provision.cli.export_keys import require_same
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import count_of, first_lines, reporter_for
-from teds_provision.errors import BadData, LinkFailure
+from teds_provision.errors import BadData, LinkFailure, TedsProvisionError
 from teds_provision.files import holds, open_to_read, require_new, write_new
 from teds_provision.links import LinkSettings
 
@@ -38,8 +38,10 @@ _MOVED = "A move: each key is rotated at the first contact; until then, the send
 @command(
     "teds-provision import-keys lab.jwe --no-prove",
     "teds-provision import-keys lab.jwe --via can --can udp_multicast:239.74.163.2 --yes",
+    "teds-provision import-keys --received",
 )
-@click.argument("file", type=options.FileToRead())
+@click.argument("file", type=options.FileToRead(), required=False)
+@click.option("--received", is_flag=True, help="Take in what came through the registry and waits for a person.")
 @click.option(
     "--prove/--no-prove", default=None, help="Contact each node and open a session (default if a link is named)."
 )
@@ -55,7 +57,8 @@ _MOVED = "A move: each key is rotated at the first contact; until then, the send
 @click.pass_context
 def import_keys(
     ctx: click.Context,
-    file: Path,
+    file: Path | None,
+    received: bool,
     prove: bool | None,
     receipt: Path | None,
     yes: bool,
@@ -70,6 +73,11 @@ def import_keys(
     app = ctx.find_object(App)
     assert app is not None
     station = app.station()
+    if received == (file is not None):
+        raise click.UsageError("Give one of FILE and --received.")
+    if file is None:
+        _take_received(app, station, yes=yes, dry_run=dry_run)
+        return
     with _bundle_file(file) as bundle:
         receipt = receipt or file.with_name(file.name + ".receipt")
         station.unlock()
@@ -92,6 +100,35 @@ def import_keys(
     _tell_import(app, station, done, receipt, _import_plan(shown), outcomes)
     if prove:
         _require_proven(outcomes)
+
+
+def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
+    """Show each parcel that waits, and why; take in those that a person says yes to."""
+    plant.folding.require_roster(station)
+    station.unlock()
+    tables, told = station.plant.parcels, list[dict[str, Any]]()
+    for row in tables.parcels("in", "waiting", "later"):
+        if row.kind != "bundle":
+            continue
+        octets = tables.parcel_document(row.id, "in")
+        try:
+            shown = handover.incoming.plan_import(station, octets)
+        except TedsProvisionError as error:
+            app.warn(f"{row.id}: {error.message}")
+            continue
+        app.note(f"{_import_text(station, shown)}\nIt waits because: {row.detail or 'it came just now'}")
+        one = {**_import_plan(shown), "parcel": row.id, "why": row.detail}
+        told.append(one)
+        if dry_run:
+            continue
+        app.confirm("Import this parcel?", yes=yes)
+        with station.lock("import-keys", app.note):
+            plan = handover.incoming.plan_import(station, octets)
+            require_same(type(plan) is type(shown))
+            done = plant.parcels.import_parcel(station, row, plan)
+        one["fresh"] = done.fresh
+    text = f"{len(told)} parcels." if dry_run else f"{len(told)} parcels taken in; receipts leave with the next sync."
+    app.emit({"received": told, "plan": dry_run}, text if told else "Nothing waits.")
 
 
 def _require_proven(outcomes: list[dict[str, Any]]) -> None:
@@ -226,10 +263,10 @@ def _tell_import(
     pending = [uuid for uuid in imported if bytes.fromhex(uuid) not in known] if known else imported
     not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
     told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
-    app.emit(told, _import_told(done, receipt, not_met, pending, sum(bool(one["rotated"]) for one in outcomes)))
+    app.emit(told, _summary(done, receipt, not_met, pending, sum(bool(one["rotated"]) for one in outcomes)))
 
 
-def _import_told(done: Imported, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
+def _summary(done: Imported, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
     lines = [
         f"{count_of(len(done.notes.uuids) - len(done.notes.refused))} imported"
         + ("." if done.fresh else " earlier; nothing changed.")

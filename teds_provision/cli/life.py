@@ -126,7 +126,11 @@ def _result(uuid: bytes, receipt: ResetReceipt | None) -> dict[str, Any]:
 def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, force: bool) -> ResetReceipt | None:
     """Reset the node; None where it cannot be had and that is to be recorded as unconfirmed."""
     try:
-        with talk.meeting.meet(station, links, uuid, reporter_for(app)) as node, station.released(uuid, "reset"):
+        with (
+            talk.meeting.meet(station, links, uuid, reporter_for(app)) as node,
+            station.turn(uuid),
+            station.released(uuid, "reset"),
+        ):
             return steps.agree.reset_node(station, node, steps.identify.identify(station, node))
     except (LinkFailure, PolicyRefused) as error:
         if not force and not app.interactive:

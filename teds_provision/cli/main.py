@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import pathlib
     from pathlib import Path
 
-    from teds_provision.cli import completing
+    from teds_provision.cli import completing, start
 else:
-    completing = late("teds_provision.cli.completing")
+    completing, start = late("teds_provision.cli.completing"), late("teds_provision.cli.start")
     difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
@@ -127,6 +127,7 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
 
 @click.group(
     cls=LazyGroup,
+    invoke_without_command=True,
     context_settings={
         "help_option_names": ["-h", "--help"],
         "auto_envvar_prefix": ENVIRONMENT_PREFIX,
@@ -155,12 +156,15 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
 def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
     """Identify smart transducers, key them, and write their IEEE 1451.0 datasheets (TEDS).
 
-    Works over NFC, CAN and Bluetooth; then measures, publishes and drives actuators.
+    Works over NFC, CAN and Bluetooth; then measures, publishes and drives actuators. Without a command: the station,
+    who answers on its links now, what is wrong, and the next command.
     """
     ctx.obj = App(as_json=as_json, **options)
     broken = ctx.meta.get(_BROKEN)
     if broken is not None and ctx.invoked_subcommand != "doctor":  # which tells it, and looks at all the rest
         raise broken
+    if ctx.invoked_subcommand is None:
+        start.start(ctx.obj, ctx)
 
 
 def run(arguments: list[str]) -> int:

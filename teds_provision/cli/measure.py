@@ -18,7 +18,7 @@ from teds_provision import teds
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import Channel, FileToRead, Number, WholeNumber, command, link_options
-from teds_provision.cli.sample import ending, over_the_bus
+from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings, ble, can
@@ -41,6 +41,7 @@ KINDS = ("periodic", "event", "free")
 @command(
     "teds-provision measure 8d4d --can socketcan:can0 --to run.csv --to run.mcap",
     "teds-provision measure hand --can socketcan:can0 --duration 60 --ros2",
+    "teds-provision measure hand --can socketcan:can0 --duration 60 --to run.csv --wide",
     "teds-provision measure 8d4d --ble hci0 --duration 60 --to run.csv",
     "teds-provision measure recover run.mcap",
 )
@@ -58,6 +59,9 @@ KINDS = ("periodic", "event", "free")
 )
 @click.option(
     "--to", "files", multiple=True, metavar="FILE", help="Record to this file: .csv, .txt, .mcap, .jsonl; repeatable."
+)
+@click.option(
+    "--wide", is_flag=True, help="Write .csv and .txt as one grid: a row a time, a column a channel, no raw values."
 )
 @click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="With recover: the new file.")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
@@ -80,6 +84,7 @@ def measure(
     links: LinkSettings,
     duration: float | None,
     files: Sequence[str],
+    wide: bool,
     mqtt: str | None,
     require: Path | None,
     output: Path | None,
@@ -95,12 +100,15 @@ def measure(
         return
     if click.get_current_context().get_parameter_source("output") is ParameterSource.COMMANDLINE:
         raise UsageFailure("--output only works with `measure recover`.", hint="To record, use --to FILE.")
+    if wide:
+        files = _wide(files)
     links = over_the_bus(links, streams=True)
     if mqtt is not None and not mqtt.startswith(("mqtt://", "mqtts://")):
         raise UsageFailure(f"--mqtt {mqtt!r} is not a broker URL.", hint="Use mqtt://HOST or mqtts://USER@HOST.")
-    _require_streams(links, trigger=wished["trigger"])
     station = app.station()
     group, uuids = _who(station, what)
+    links = where_met(station, links, uuids)
+    _require_streams(links, trigger=wished["trigger"])
     ros = [name for name in ("ros1", "ros2") if wished[name]]
     kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished | {"require": _requirements(require)})
     if group and duration is None:
@@ -142,6 +150,14 @@ def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Map
         unsigned=wished["unsigned"],
         require=wished["require"],
     )
+
+
+def _wide(files: Sequence[str]) -> list[str]:
+    """The words for files of text whose rows are one grid."""
+    text = [Path(name).suffix.lower() in measure_room.sinks.TEXT for name in files]
+    if not any(text):
+        raise UsageFailure("--wide is for text files.", hint="Add --to FILE.csv")
+    return [f"wide:{name}" if is_text else name for name, is_text in zip(files, text, strict=True)]
 
 
 def _requirements(file: Path | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,9 +12,11 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, dry_run_option, examples
 from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.station.measurements import STATION
+from teds_provision.station.shown_units import channel_profiles
 
 if TYPE_CHECKING:
     from teds_provision.measure.blocks import ChannelFacts
+    from teds_provision.measure.sinks.names import Topics
     from teds_provision.station.station import Station
 
 
@@ -83,6 +86,37 @@ def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
     _tell(app, station)
 
 
+@command(
+    "teds-provision names frame 8d4d 1 left_gripper_tip",
+    "teds-provision names frame 8d4d 0 left_gripper_base",
+    name="frame",
+)
+@click.argument("node", metavar="UUID")
+@click.argument("channel", type=WholeNumber(0, 255))
+@click.argument("frame", metavar="FRAME")
+@dry_run_option
+@pass_app
+def set_frame(app: App, node: str, channel: int, frame: str, *, dry_run: bool) -> None:
+    """Choose the coordinate frame of a channel for ROS.
+
+    Values are published with FRAME as their frame_id; "" takes the profile's again.
+
+    Channel 0 stands for every channel of the node that has no frame of its own.
+    """
+    station = app.station()
+    uuid = station.nodes.resolve(node)
+    if frame and not measure.sinks.names.is_frame(frame):
+        raise UsageFailure(
+            f"{frame!r} is not a valid frame.", hint="Use letters, digits, _ and /, starting with a letter."
+        )
+    _require_channel(station, uuid, channel)
+    if not dry_run:
+        with station.lock("names", app.note), station.transaction():
+            station.measurements.set_frame(uuid, channel, frame or None)
+            station.audit("frame", uuid, "done", channel=channel, frame=frame)
+    _tell(app, station)
+
+
 def _who(station: Station, node: str) -> bytes:
     return STATION if node == "station" else station.nodes.resolve(node)
 
@@ -119,18 +153,30 @@ def _tell(app: App, station: Station) -> None:
     topics = measure.sinks.names.Topics(facts)
     channels = _channels(station)
     topics.learn(one for _, _, one in channels)
+    frames = station.measurements.frames
     told: list[dict[str, Any]] = [
         {
             "uuid": uuid.hex(),
             "channel": number,
             "topic": topics.channel(uuid.hex(), number),
             "chosen": (uuid, number) in chosen or (uuid, 0) in chosen,
+            "frame": _frame(station, frames, topics, uuid, number) or None,
         }
         for uuid, number, _ in channels
     ]
-    lines = [f"{one['uuid']} {one['channel']}: {one['topic']}{' (chosen)' if one['chosen'] else ''}" for one in told]
+    lines = [
+        f"{one['uuid']} {one['channel']}: {one['topic']}{' (chosen)' if one['chosen'] else ''}"
+        + (f", frame {one['frame']}" if one["frame"] else "")
+        for one in told
+    ]
     app.emit({"station": topics.station, "names": told}, "\n".join(lines) or "No datasheets are known yet.")
 
 
-for one in (set_name, reset_name):
+def _frame(station: Station, chosen: Mapping[tuple[bytes, int], str], topics: Topics, uuid: bytes, number: int) -> str:
+    of_type = channel_profiles(station, uuid).get(number)
+    frame = chosen.get((uuid, number)) or chosen.get((uuid, 0)) or (of_type.frame if of_type else "")
+    return frame.replace("{node}", topics.node(uuid.hex()))
+
+
+for one in (set_name, reset_name, set_frame):
     names.add_command(one)

@@ -16,10 +16,19 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from teds_provision import client
+from teds_provision import client, plant
 from teds_provision.cli.configuration import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples, tracing
+from teds_provision.cli.options import (
+    COMMAND_SETTINGS,
+    FileToRead,
+    Number,
+    WholeNumber,
+    command,
+    examples,
+    said_here,
+    tracing,
+)
 from teds_provision.cli.rendering import shown
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import how_to_install, late
@@ -52,6 +61,10 @@ _FILE = FileToRead(exists=True)
 )
 @click.option("--detection", type=click.Choice(["transparent", "whitelist"]), help="Which nodes to accept.")
 @click.option("--adopt", is_flag=True, help="In transparent mode, key factory nodes on a wired bus.")
+@click.option("--yes", "-y", is_flag=True, help="With --adopt: also sign the datasheet that such a node brought, where "
+              "nothing is wrong with it.")  # fmt: skip
+@click.option("--unverified", is_flag=True, help="With --adopt: measure such nodes by their own datasheets, "
+              "calibrated, under /STATION/unverified/.")  # fmt: skip
 @click.option("--measure", metavar="all|GROUP|EXPR", help="Measure every authentic node that comes: all, a group, or "
               "type:PROFILE, name:GLOB, group:NAME, 'angle >= 360 deg', joined by commas.")  # fmt: skip
 @click.option("--rate", type=Number(min=0.001), metavar="HZ", help="With --measure: at most so many samples a second.")
@@ -78,6 +91,7 @@ _FILE = FileToRead(exists=True)
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
               help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
+@click.option("--registry", is_flag=True, help="Follow the registry that this station joined: sync as news come.")
 @click.option("--metrics", is_flag=True, help="Serve /metrics for Prometheus.")
 @click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read-only.")
 @click.option("--nfc", multiple=True, metavar="PATH", help="Reader: auto, usb, udp:localhost:54321; repeatable.")
@@ -108,7 +122,12 @@ def run(
     Prints one line when it is ready, then one line per event.
     """
     _require_extra()
-    if wished["measure"] is None and (wished["rate"] is not None or wished["frozen"]):
+    if said_here("yes") and not wished["adopt"]:
+        raise UsageFailure("--yes belongs to --adopt.", hint="Add --adopt --detection transparent.")
+    if said_here("unverified") and not wished["adopt"]:
+        raise UsageFailure("--unverified belongs to --adopt.", hint="Add --adopt --detection transparent.")
+    wished["unverified"] = wished["unverified"] and wished["adopt"]
+    if wished["measure"] is None and not wished["unverified"] and (wished["rate"] is not None or wished["frozen"]):
         raise UsageFailure("--rate and --frozen belong to --measure.", hint="Add --measure all.")
     places = [f"{link}:{one}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for one in named]
     sinks = [name for name, asked in (("ros1", ros1), ("ros2", ros2), (mqtt or "", mqtt)) if asked]
@@ -122,6 +141,8 @@ def run(
     settings.require_safe(wanted)
     settings.require_places(wanted)
     station = app.station()
+    if wanted.registry:
+        plant.folding.require_roster(station)
     if wanted.measure is not None:
         matching.Match.parse(wanted.measure).require_groups(station)
     station.unlock()  # nobody is asked for a passphrase later
@@ -243,6 +264,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         for node in one["nodes"] if what else ():
             why = f": {node['why']}" if node["why"] else ""
             console.print(f"  {node['uuid']} {node['state']}{why}", markup=False)
+        if any(node["why"] == "no room on the bus" for node in one["nodes"]):
+            console.print("  → Who runs is not slowed. A lower --rate leaves room for all.", markup=False)
     for one in found.get("sinks", ()):
         why = one["error"] or one["detail"]
         told = f"{one['state']}, {one['dropped']} dropped{f': {why}' if why else ''}"
@@ -252,6 +275,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
 def _verdict(node: dict[str, Any]) -> str:
     if node["verdict"] is None:
         return "not verified yet"
+    if node.get("unverified"):
+        return "unverified (nobody signed its datasheet)"
     kept = " (all but the Security TEDS as last read)" if node["verdict"]["from"] == "kept" else ""
     return f"{node['verdict']['verdict']}{kept}"
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import steps, teds
+from teds_provision import plant, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import local_time, moment, print_json_list, print_table, shown
@@ -47,6 +47,7 @@ _GAP = "  "
     "--fits", metavar="EXPR", help='Check datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
 )
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), help="Default: table.")
+@click.option("--plant", "of_plant", is_flag=True, help="Show what the plant's stations say: who holds it, conflicts.")
 @pass_app
 def nodes(
     app: App,
@@ -58,6 +59,7 @@ def nodes(
     since: str | None,
     fits: str | None,
     form: str | None,
+    of_plant: bool,
 ) -> None:
     """List every node that this station has met, whitelisted or received, or show one in detail.
 
@@ -65,6 +67,9 @@ def nodes(
     are not contacted.
     """
     station = app.station()
+    if of_plant:
+        _show_plant(app, station, text, as_json=app.json or form == "json")
+        return
     day = (datetime.now(UTC) + timedelta(days=due)).strftime("%Y-%m-%d") if due is not None else None
     seen = moment(since) if since is not None else None
     found = search(station, text, state=state, profile=profile, group=group, due=day, since=seen)
@@ -82,6 +87,21 @@ def nodes(
         _one(next(described))
     else:
         _table(described)
+
+
+def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) -> None:
+    """What the stations of the plant say of nodes, those too that this one never met."""
+    described = plant.status.nodes(station, plant.folding.require_roster(station), text)
+    if as_json:
+        print_json_list("nodes", described)
+        return
+    for node in described:
+        says = node["says"]
+        holders = ", ".join(name for names in says["holders"].values() for name in names) or "nobody"
+        written = f", datasheet {says['sequence']} by {says['written_by']}" if says["written_by"] else ""
+        banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
+        line = f"{node['uuid']}  {shown(node['name'])}  held by {holders} (epoch {says['epoch']}){written}{banned}"
+        app.lines([line, *(f"  {one['name']}: {shown(one['why'])}" for one in node["conflicts"])])
 
 
 def _none(station: Station) -> None:

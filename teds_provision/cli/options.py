@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from teds_provision.cli.context import SOCKET, App
 from teds_provision.errors import NotFound, StoreFailure
@@ -149,15 +150,23 @@ def link_options(function: Function) -> Function:
         **rest: Any,
     ) -> Any:
         named = can[0] if len(can) == 1 else can or None
+        chosen = click.get_current_context().get_parameter_source("via") is not ParameterSource.DEFAULT
+        here = said_here("nfc", "can", "ble")
+        if not chosen and (here == {"can"} or (here == {"ble"} and not nfc)):  # the one that is named is meant
+            via, chosen = here.pop(), True
         with tracing(trace) as opened, readers_for(via):
             # a setting of config.toml is patience for a tap; whoever names it here means this very search
             listen = timeout if said_here("timeout") else LISTEN_SECONDS
-            links = LinkSettings(via, nfc or None, named, ble, timeout, opened, listen)
+            links = LinkSettings(via, nfc or None, named, ble, timeout, opened, listen, chosen)
             return function(*args, links=links, **rest)
 
     options = [
         click.option(
-            "--via", type=click.Choice(list(LINKS)), default="nfc", show_default=True, help="The link to use."
+            "--via",
+            type=click.Choice(list(LINKS)),
+            default="nfc",
+            show_default=True,
+            help="The link to use; without it, the one link that is named, or the bus on which the node was last met.",
         ),
         click.option(
             "--nfc",
@@ -203,15 +212,13 @@ def link_options(function: Function) -> Function:
 
 def links_given(ctx: click.Context) -> bool:
     """Whether an option (or setting) of this run says over which link a node is to be met."""
-    return any(
-        ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble")
-    )
+    return any(ctx.get_parameter_source(name) != ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble"))
 
 
 def said_here(*names: str) -> set[str]:
     """Which of these options stand in the command line itself, and not in config.toml or a variable."""
     ctx = click.get_current_context()
-    return {name for name in names if ctx.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE}
+    return {name for name in names if ctx.get_parameter_source(name) == ParameterSource.COMMANDLINE}
 
 
 def fingerprint_option(says: str) -> Callable[[Function], Function]:

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
+from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, command, dry_run_option, examples
 from teds_provision.cli.rendering import print_table
 from teds_provision.errors import BadData, StoreFailure, UsageFailure
 from teds_provision.files import SHARED, holds, write_new
+from teds_provision.teds.formats.mapped import profile_from_xml
 from teds_provision.teds.profile import check as check_profile
 from teds_provision.teds.profile import (
     default_folders,
@@ -24,6 +26,7 @@ from teds_provision.teds.profile import (
     load_profile,
     template,
 )
+from teds_provision.teds.profile.load import parse_profile
 from teds_provision.teds.show import seconds
 from teds_provision.teds.units import short_unit
 
@@ -171,10 +174,16 @@ profile.add_command(check)
 
 
 @command(
-    "teds-provision profile new wrist-torque", "teds-provision profile new my-finger --extends tactile-finger-sensor"
+    "teds-provision profile new wrist-torque",
+    "teds-provision profile new my-finger --extends tactile-finger-sensor",
+    "teds-provision profile new lab-angle --from examples/xml/angle.xml --map examples/xml/angle-map.toml",
 )
 @click.argument("name")
 @click.option("--extends", metavar="PROFILE", help="Start from another type and state only the differences.")
+@click.option("--from", "source", type=FileToRead(), metavar="XML", help="A datasheet XML of your own; needs --map.")
+@click.option(
+    "--map", "mapping", type=FileToRead(), metavar="FILE", help="Where each key stands in that XML, and its unit."
+)
 @click.option(
     "--output",
     "-o",
@@ -184,8 +193,20 @@ profile.add_command(check)
 )
 @dry_run_option
 @pass_app
-def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: bool) -> None:
-    """Write a commented template for a new type, with every key."""
+def new(
+    app: App,
+    name: str,
+    extends: str | None,
+    source: Path | None,
+    mapping: Path | None,
+    output: Path | None,
+    dry_run: bool,
+) -> None:
+    """Write a template for a new type, or a type from XML.
+
+    The template has every key, commented. A type is read from a datasheet XML of your own by a mapping file;
+    docs/formats.md says how that is written.
+    """
     import re
 
     if not re.fullmatch(r"[a-z0-9][a-z0-9._-]{0,63}", name):
@@ -193,8 +214,14 @@ def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: 
             f'"{name}" is not a valid profile name.',
             hint="Use lower-case letters, digits and dashes, like wrist-torque.",
         )
+    if (source is None) != (mapping is None) or (source is not None and extends is not None):
+        raise UsageFailure("--from needs --map, and no --extends.", hint="The mapping may say extends under [values].")
     text = template(name)
-    if extends is not None:
+    if source is not None and mapping is not None:
+        rules = read_file(mapping).decode(errors="replace")
+        text = profile_from_xml(read_file(source), rules, name=name, file=str(source), by=str(mapping))
+        parse_profile(text, name)  # what the XML says is checked like any profile
+    elif extends is not None:
         base = find_profile(extends, default_folders(app.home)).stem
         text = (
             f"# Transducer type {name}: like {base}, except for the settings below.\n"

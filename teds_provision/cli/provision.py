@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
-from teds_provision import station
+from teds_provision import plant, station
 from teds_provision import steps as steps_room
 from teds_provision.cli.build import order_options
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, yes_option
+from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, said_here, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
-from teds_provision.errors import NotWhitelisted, TedsProvisionError
+from teds_provision.errors import NotWhitelisted, TedsProvisionError, UsageFailure
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import sanitize
 from teds_provision.talk.progress import Reporter, StepResult
@@ -28,7 +30,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.links import Notice
-    from teds_provision.steps.batch import Boards, Plan, Questions
+    from teds_provision.steps.adopting import Brought
+    from teds_provision.steps.batch import Boards, Plan, Questions, Request
     from teds_provision.steps.batch_sheet import Board, Row
     from teds_provision.steps.build import NotNamed
     from teds_provision.steps.identify import Identified
@@ -44,9 +47,12 @@ _CHANGES_SHOWN = 20
     "teds-provision provision --watch --yes --profile load-cell --name 'cell {n}'",
     "teds-provision provision --batch boards.csv --report boards.html",
     "teds-provision provision --all --via can --can socketcan:can0 --profile load-cell",
+    "teds-provision provision --job fifty.jws --watch --yes",
+    "teds-provision provision --adopt --nfc usb",
 )
 @click.argument("uuid", required=False)
 @order_options
+@click.option("--adopt", is_flag=True, help="Sign the datasheet that the board brought, after it was shown.")
 @click.option("--watch", is_flag=True, help="Provision board after board until Ctrl-C.")
 @click.option(
     "--batch",
@@ -61,6 +67,40 @@ _CHANGES_SHOWN = 20
     help="Write a report of the batch, .csv or .html.",
 )
 @click.option("--all", "everything", is_flag=True, help="Provision every whitelisted node on the bus in parallel.")
+@click.option("--job", metavar="FILE|ID", help="Work on a keeper's job: it says what may be built, and how often.")
+@click.option(
+    "--calibrations",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="With --job: a folder with a file UUID.csv (.toml, .json) for each board.",
+)
+@click.option(
+    "--files",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="With --job: the folder that carries to the office, in place of the registry.",
+)
+@click.option("--only", type=click.Choice(["verify"]), help="With --job: test boards that others made; write nothing.")
+@click.option(
+    "--label-to",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="With --job or --evidence: write a label for each board that passed.",
+)
+@click.option(
+    "--label-format",
+    type=click.Choice(["svg", "png"]),
+    default="svg",
+    show_default=True,
+    help="What --label-to writes.",
+)
+@click.option("--scan", is_flag=True, help="Read scanned labels from stdin: the next board must be the one scanned.")
+@click.option("--evidence", is_flag=True, help="Keep signed proof of each board; see: evidence export.")
+@click.option(
+    "--operator",
+    metavar="NAME",
+    help="With --job, --evidence or --report: who worked, as evidence and report shall say.",
+)
 @yes_option
 @dry_run_option
 @link_options
@@ -69,10 +109,20 @@ def provision(
     app: App,
     uuid: str | None,
     order: Any,
+    adopt: bool,
     watch: bool,
     batch: Path | None,
     report: Path | None,
     everything: bool,
+    job: str | None,
+    calibrations: Path | None,
+    files: Path | None,
+    only: str | None,
+    label_to: Path | None,
+    label_format: str,
+    scan: bool,
+    evidence: bool,
+    operator: str | None,
     yes: bool,
     dry_run: bool,
     links: LinkSettings,
@@ -82,10 +132,34 @@ def provision(
     --yes accepts the node on the reader. A finished node keeps its datasheet: only what you name (--profile,
     --calibration, --name) changes, or what you confirm after seeing the changes.
     """
-    request = steps_room.batch.Request(uuid, order, watch, everything, batch, report)
+    order = replace(order, adopt=adopt and bool(said_here("adopt")))  # a setting of that name is meant for ncap run
+    if order.adopt and (batch is not None or job is not None):
+        raise UsageFailure("A sheet or a job says itself what a board gets.", hint="Drop --adopt.")
+    request = steps_room.batch.Request(uuid, order, watch, everything, batch, report, operator or "")
     several = everything or len(links.places) > 1
     reporter = Watched(reporter_for(app, several=several))
-    boards = steps_room.batch.Boards(app.station(), links, request, reporter)
+    base = app.station()
+    line = None
+    if job is not None or evidence:
+        _check_line(request, job, only)
+        found = plant.jobs.find_job(base, job) if job is not None else None
+        label = label_to / f"label.{label_format}" if label_to is not None else None
+        line = plant.line.LineRun(
+            base, found, order, calibrations, operator, only_verify=only is not None, label_to=label
+        )
+        if scan:
+            line.scans = plant.line.Scans(sys.stdin, app.note)
+            threading.Thread(target=line.scans.listen, name="scanner", daemon=True).start()
+        if found is not None and found.office not in (None, base.identity.fingerprint):
+            post = plant.asking.post_of(base, files)
+            app.closing(post.close)
+            line.office = plant.asking.PostOffice(base, post, links.timeout)
+    elif any((calibrations, operator and report is None, files, only, label_to, scan)):
+        raise UsageFailure(
+            "--calibrations, --operator, --files, --only, --label-to and --scan belong to a job.",
+            hint="Add --job FILE, or --evidence.",
+        )
+    boards = steps_room.batch.Boards(base, links, request, reporter, line=line)
     for warning in boards.warnings:
         app.warn(warning)
     if dry_run:
@@ -95,9 +169,22 @@ def provision(
         begun = None if several else reporter  # with several readers one board may be begun while another one ends
         with screen_for(app, boards, begun) as screen:
             questions = _questions(app, yes, strangers=not everything, several=True)
-            _many(app, boards, questions, screen, totals=everything or batch is not None)
+            _many(app, boards, questions, screen, totals=everything or batch is not None or job is not None)
     else:
         _one(app, boards, _questions(app, yes))
+
+
+def _check_line(request: Request, job: str | None, only: str | None) -> None:
+    """Raise UsageFailure where a job is named beside what a job says itself."""
+    order = request.order
+    if only is not None and job is None:
+        raise UsageFailure("--only verify tests the boards of a job.", hint="Add --job FILE.")
+    if request.sheet is not None:
+        raise UsageFailure("A sheet and a job or evidence do not go together.", hint="Drop --batch.")
+    if job is not None and not (order.names_nothing and order.accept_calibration is None and not order.retype):
+        raise UsageFailure(
+            "The job says what each board gets.", hint="Drop --profile, --calibration, --name and --retype."
+        )
 
 
 def _one(app: App, boards: Boards, questions: Questions) -> None:
@@ -106,15 +193,26 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
     except steps_room.build.NotNamed as error:
         _tell_not_named(app, error)
         return
-    _tell(app, done, error=_failure(done))
+    except steps_room.adopting.NotAdopted as error:
+        _show_brought(app, error.brought)
+        app.conclude({"findings": error.brought.findings}, None, error)
+        return
+    _tell(app, done, error=_failure(done), **_of_line(boards, done.who.uuid))
+
+
+def _of_line(boards: Boards, uuid: bytes) -> dict[str, Any]:
+    """Job, unit, attempt and evidence of a board, nothing outside a line."""
+    return boards.line.told(uuid) if boards.line is not None else {}
 
 
 def _many(app: App, boards: Boards, questions: Questions, screen: Screen, *, totals: bool) -> None:
     signal.signal(signal.SIGTERM, lambda *_: boards.stop.ask())
     try:
         for board in boards.many(questions):
-            if not screen.tells:
-                _tell_board(app, board)
+            if boards.expected and not app.json:
+                _tell_one_of(app, boards, board)
+            elif not screen.tells:
+                _tell_board(app, board, **_of_line(boards, board.uuid))
             screen.ended(board)
     finally:
         screen.close()
@@ -132,8 +230,6 @@ def _many(app: App, boards: Boards, questions: Questions, screen: Screen, *, tot
 
 def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = False) -> Questions:
     """Whom to ask; ``strangers`` False: a yes on the command line does not add nodes that nobody named."""
-    import threading
-
     accepted: set[tuple[bytes, str]] = set()
     turn = threading.Lock()  # one question at a time, however many readers there are
 
@@ -178,7 +274,35 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
 
     asked = app.interactive
     retype = app.asks_retype(yes=yes or several)
-    return steps_room.batch.Questions(accept, confirm if asked else None, low, take_over if asked else None, retype)
+
+    def adopt(brought: Brought) -> None:
+        with turn:
+            if not yes and not asked:
+                steps_room.adopting.nobody_adopts(brought)
+            _show_brought(app, brought)
+            if yes:
+                return
+            if not app.ask("Sign this datasheet, and put the node in service?"):
+                raise steps_room.batch_sheet.Declined("Cancelled. The board's datasheet was not signed.")
+
+    return steps_room.batch.Questions(
+        accept, confirm if asked else None, low, take_over if asked else None, retype, adopt
+    )
+
+
+def _show_brought(app: App, brought: Brought) -> None:
+    """What a board says of itself, a line for each channel, and what was found."""
+    app.note(f"Node {brought.image.uuid.hex()} brought a datasheet of its own: {brought.name or '(no name)'}")
+    for one in brought.channels[:_CHANGES_SHOWN]:
+        kind = one.kind.word if one.kind is not None else "of unknown kind"
+        limits = f"{one.show(one.low)} to {one.show(one.high)}"
+        exact = f", ± {one.show(one.stated_uncertainty, difference=True)}" if one.stated_uncertainty > 0 else ""
+        made = f", calibrated {one.calibrated_at:%Y-%m-%d}" if one.calibrated_at else ""
+        app.note(f"  channel {one.number}: {one.name or '(no name)'}, {kind}, {limits}{exact}{made}")
+    if len(brought.channels) > _CHANGES_SHOWN:
+        app.note(f"  and {len(brought.channels) - _CHANGES_SHOWN} channels more")
+    for finding in brought.findings[:_CHANGES_SHOWN]:
+        app.note(f"  {finding['severity']}: {finding['message']}")
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------
@@ -220,27 +344,37 @@ def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = Non
         "name": summary.name,
         "channels": [vars(channel) for channel in summary.channels],
         "steps": [{"name": s.name, "result": s.result, "seconds": s.seconds} for s in done.steps],
-        "sample": [{key: one[key] for key in ("channel", "value", "unit", "valid")} for one in done.samples],
+        "sample": [{key: one[key] for key in ("channel", "value", "unit", "valid", "shown")} for one in done.samples],
         "verdict": done.verified.verdict,
         "warnings": list(done.warnings),
         **{name: value for name, value in more.items() if value is not None},
     }
-    app.conclude(result, lambda console: _summary(console, done), error)
+    app.conclude(result, lambda console: _summary(console, done, more), error)
 
 
-def _tell_board(app: App, board: Board) -> None:
-    """One line of JSON, or what a person reads: UUID, time and row of the sheet on each."""
+def _tell_board(app: App, board: Board, **line: Any) -> None:
+    """One line of JSON, or what a person reads: UUID, time and row of the sheet on each; ``line``: its unit."""
     if board.done is not None:
-        _tell(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3))
+        _tell(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3), **line)
         if board.failure is not None and not app.json:
             app.fail_line(board.failure, uuid=board.uuid.hex(), time=board.time, row=board.row)
     elif board.error is not None:
         of: dict[str, object] = {"uuid": board.uuid.hex(), "time": board.time, "row": board.row}
         if app.json:
-            of["seconds"] = round(board.seconds, 3)
+            of |= {"seconds": round(board.seconds, 3), **line}
             if isinstance(board.error, steps_room.build.NotNamed):
                 of["changes"] = [change.text for change in board.error.changes]
         app.fail_line(board.error, **of)
+
+
+def _tell_one_of(app: App, boards: Boards, board: Board) -> None:
+    """One line for one of many on a bus: ``37 of 200  8d4d…  arm 3  authentic  1.2 s``; why, where it did not pass."""
+    name = station.summary.summarise(board.done.image).name if board.done is not None else None
+    words = board.done.verified.verdict if board.result == "passed" and board.done is not None else board.result
+    place = f"{boards.ended:>{len(str(boards.expected))}} of {boards.expected}"
+    app.lines([sanitize(f"{place}  {board.uuid.hex()}  {name or '(no name)'}  {words}  {board.seconds:.1f} s")])
+    if board.failure is not None:
+        app.note(f"{board.uuid.hex()}: {board.failure.message}\n  → {board.failure.hint}".removesuffix("\n  → "))
 
 
 def _tell_totals(app: App, boards: Boards) -> None:
@@ -263,7 +397,7 @@ def _tell_totals(app: App, boards: Boards) -> None:
     app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in total.{steps}")
 
 
-def _summary(console: Console, done: Provisioned) -> None:
+def _summary(console: Console, done: Provisioned, more: Mapping[str, object]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -272,9 +406,15 @@ def _summary(console: Console, done: Provisioned) -> None:
     table.add_row("node", f"[bold]{escape(summary.name or '(no name)')}[/]")
     table.add_row("UUID", done.who.uuid.hex())
     table.add_row("key", done.who.fingerprint[:16])
+    now = {one["channel"]: one["shown"] for one in done.samples if one["valid"]}
+    if "unit" in more:
+        table.add_row("unit", f"{more['unit']} of {more['of']}")
     for channel in summary.channels:
         calibrated = ", calibrated" if channel.calibrated else ""
-        table.add_row(f"channel {channel.number}", f"{escape(channel.name)}  {channel.range}{calibrated}".strip())
+        read = now.get(channel.number)
+        reads = f", reads {read['value']:.6g} {read['unit']}".rstrip() if read is not None else ""
+        what = f"{escape(channel.name)}  {channel.range}{calibrated}{reads}".strip()
+        table.add_row(f"channel {channel.number}", what)
     verdict = done.verified.verdict
     table.add_row("verdict", f"[bold {'green' if verdict == 'authentic' else 'red'}]{verdict}[/]")
     print_table(console, table)
@@ -335,6 +475,10 @@ class Told(Protocol):
     @property
     def next_row(self) -> Row | None:
         """The row that the next board may be of."""
+
+    @property
+    def of_a_job(self) -> bool:
+        """Whether a job counts them, and no sheet: any board may be the next one."""
 
     def row(self, number: int) -> Row:
         """The row of that number."""
@@ -462,6 +606,8 @@ class OperatorScreen:
 
     def _next(self) -> str:
         row = self._boards.next_row
+        if row is None and self._boards.of_a_job and self._boards.passed < len(self._boards):
+            return "TAP THE NEXT BOARD"
         if row is None:
             return "ALL BOARDS ARE DONE."
         name = row.prepared.order.name or ""

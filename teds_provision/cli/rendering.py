@@ -134,7 +134,8 @@ def line_of(step: StepResult) -> str:
     """``✓ agree       0.05 s  key epoch 1``."""
     mark = "·" if step.result == NOTHING else "✓"
     detail = step.detail if step.result != NOTHING else f"{NOTHING}{': ' if step.detail else ''}{step.detail}"
-    return f"{mark} {step.name:<11} {step.seconds:6.2f} s  {detail}".rstrip()
+    whose = f"{step.of}: " if step.of else ""
+    return f"{whose}{mark} {step.name:<11} {step.seconds:6.2f} s  {detail}".rstrip()
 
 
 class LiveReporter:

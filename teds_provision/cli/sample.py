@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from teds_provision.protocol.operation.commands import Operation, Power
     from teds_provision.station.station import Station
     from teds_provision.talk.conversation import Conversation
+    from teds_provision.teds.sheet import Channel as SheetChannel
 
 
 def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:
@@ -51,6 +52,16 @@ def _bus_meant(links: LinkSettings, said: set[str]) -> str | None:
     named = [name for name, given in (("can", links.can), ("ble", links.ble)) if given]
     here = [name for name in named if name in said]
     return next(iter(here or named), None)
+
+
+def where_met(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> LinkSettings:
+    """The links with the bus where these nodes were met last, where nobody names one; all of them on the same kind."""
+    places = talk.meeting.likely_places(station, links, uuids)
+    kinds = {place.partition(":")[0] for place in places}
+    if len(kinds) != 1:
+        return links
+    wheres = tuple(place.partition(":")[2] for place in places)
+    return replace(links.at(places[0]), can=wheres) if kinds == {"can"} else links.at(places[0])
 
 
 @contextmanager
@@ -93,9 +104,12 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
 
     table = Table("channel", "name", "value", "±", "unit", "raw", box=None, pad_edge=False)
     for one in samples:
-        value = f"{tidy(one.value, one.uncertainty):.6g}" if one.value is not None else f"not valid: {one.why}"
-        uncertainty = f"{one.uncertainty:.3g}" if one.uncertainty is not None else ""
-        table.add_row(str(one.channel), escape(shown(one.name)), escape(value), uncertainty, one.unit, str(one.raw))
+        told = one.as_json().get("shown") or {"value": one.value, "uncertainty": one.uncertainty, "unit": one.unit}
+        sure = told["uncertainty"]
+        value = f"{tidy(told['value'], sure):.6g}" if told["value"] is not None else f"not valid: {one.why}"
+        uncertainty = f"{sure:.3g}" if sure is not None else ""
+        name = escape(shown(one.name))
+        table.add_row(str(one.channel), name, escape(value), uncertainty, escape(told["unit"]), str(one.raw))
     print_table(console, table)
 
 
@@ -198,13 +212,14 @@ def set_value(
     uuid = station.nodes.resolve(node)
     measure.trusting.require_whitelisted(station, uuid)
     stop = threading.Event()
-    links = over_the_bus(links)
+    links = where_met(station, over_the_bus(links), [uuid])
     with (
         measure.sources.beside(station, links, f"set {uuid.hex()}") as own,
         trusted_node(app, station, own, uuid, by="set") as trusted,
         ending(stop),
     ):
         actuator = measure.held_actuator.HeldActuator(trusted, channel, unit=unit, dead_man=dead_man)
+        _require_unit(app, actuator.channel, value, unit)
         actuator.octets_of(value)  # the limits, before anything is claimed
         station.audit("set", uuid, "begun", channel=channel, value=value, unit=actuator.unit.text)
         with actuator:
@@ -225,6 +240,16 @@ def set_value(
             hint="Its dead-man timer brings it there. To check: teds-provision mode UUID",
         )
     app.emit({"event": "end", "safe": actuator.safe}, "safe" if actuator.safe else "NOT in its safe state")
+
+
+def _require_unit(app: App, channel: SheetChannel, value: float, unit: str | None) -> None:
+    """Refuse a bare number of a person where the unit that this channel is shown in is not SI: 45 would be radians."""
+    if unit is None and app.interactive and channel.shown.text != channel.si_unit:
+        raise UsageFailure(
+            f"{value:g} is in {channel.si_unit} without --unit, and channel {channel.number} is shown in "
+            f"{channel.shown.text}.",
+            hint=f"Say which: --unit {channel.shown.text} or --unit {channel.si_unit}.",
+        )
 
 
 @contextmanager

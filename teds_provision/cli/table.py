@@ -52,7 +52,9 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "show": Entry("show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },
     "Measure and actuate": {
+        "record": Entry("record", "record", "Look into recordings, and convert them."),
         "sample": Entry("sample", "sample", "Take one verified, calibrated reading."),
+        "calibrate": Entry("calibrate", "calibrate", "Zero a sensor where it is mounted; take calibration points."),
         "set": Entry("sample", "set_value", "Drive an actuator within its limits; it returns to its safe state."),
         "mode": Entry("sample", "mode", "Show or change a node's operating mode."),
         "ncap": Entry("ncap", "ncap", "Run and control the base station service."),
@@ -72,6 +74,14 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "unlock": Entry("vault", "unlock", "Keep the vault unlocked in memory for a while."),
         "lock": Entry("vault", "lock", "Lock the vault again."),
     },
+    "The plant": {
+        "registry": Entry("registry", "registry", "Join this owner's stations: what one did, all know."),
+    },
+    "The line": {
+        "job": Entry("job", "job", "Say what a line may build, and see how it does."),
+        "signer": Entry("signer", "signer", "Sign what a line builds, as the office of a job."),
+        "evidence": Entry("evidence", "evidence", "List, export and check the proof of every board."),
+    },
     "Try it out": {
         "demo": Entry("demo", "demo", "Run two stations and a virtual node on this machine, start to finish."),
         "node": Entry("node", "node", "Create and run virtual nodes; check a real board's firmware."),
@@ -82,5 +92,6 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items() if " " not in name}
 GROUPS: Final = frozenset(
     {"draft", "vault", "group", "trace", "trust", "config", "profile", "whitelist", "handover", "node", "ncap", "names"}
+    | {"calibrate", "evidence", "job", "record", "registry", "signer"}
 )
 """The commands that have commands of their own."""

@@ -209,7 +209,12 @@ def list_(app: App) -> None:
     ca, certificate = station.ca, station.identity.certificate
     certified = {record.fingerprint: certificate(ca, record.point) is not None for record in records}
     told = [
-        {**_record(record), "added": record.added, "certified": certified[record.fingerprint]}
+        {
+            **_record(record),
+            "added": record.added,
+            "certified": certified[record.fingerprint],
+            "source": "roster" if station.policy.in_roster(record.fingerprint) else "added",
+        }
         if record.role == "station"
         else {**_record(record), "added": record.added}
         for record in records
@@ -218,6 +223,8 @@ def list_(app: App) -> None:
     lines = [f"this station   {station.name}  {station.fingerprint[:16]}, CA {own['ca'][:16]}"]
     for record in records:
         mark = "  certified by this station's CA" if record.role == "station" and certified[record.fingerprint] else ""
+        if record.role == "station" and station.policy.in_roster(record.fingerprint):
+            mark = "  member of the plant"
         lines.append(f"{record.role:<14} {record.name}  {record.fingerprint[:16]}{mark}")
     app.emit({"trusted": told, "own": own}, "\n".join(lines))
 

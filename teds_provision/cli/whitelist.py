@@ -14,6 +14,7 @@ from teds_provision.cli.build import write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.cli.rendering import local_time, print_json_list, shown
+from teds_provision.errors import NotFound
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.label import read_label
 
@@ -54,7 +55,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
     """
     station = app.station()
     scanned = read_label(uuid)
-    octets = station.nodes.resolve(uuid) if scanned is None else scanned[0]
+    octets = _meant(station, uuid) if scanned is None else scanned[0]
     if scanned is not None:
         if fingerprint is not None and not same_key(fingerprint, scanned[1]):
             raise click.BadParameter("the label carries a different key.", param_hint="--fingerprint")
@@ -70,6 +71,17 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
         plan = steps.whitelist.plan_addition(station, [wanted])
         steps.whitelist.add(station, plan)
     _emit_plan(app, station, plan, dry_run=False)
+
+
+def _meant(station: Station, uuid: str) -> bytes:
+    """The UUID, or the one that stands for an EUI-64 of which no node is known by its first digits."""
+    try:
+        return station.nodes.resolve(uuid)
+    except NotFound:
+        by_rule = steps.whitelist.uuid_of_eui64(uuid)
+        if by_rule == uuid:
+            raise
+        return station.nodes.resolve(by_rule)
 
 
 @whitelist.command(

@@ -104,7 +104,15 @@ def _daemon(home: Path, secret: str, *options: str) -> Iterator[None]:
         finally:
             os.close(read)
         try:
-            _wait_until_ready(process, home / "events")
+            until = time.monotonic() + _READY
+            while (
+                b"\n" not in (first := (home / "events").read_bytes())
+                and process.poll() is None
+                and time.monotonic() < until
+            ):
+                time.sleep(0.05)
+            if b'"ready"' not in first:
+                raise _failure(first)
             yield
         finally:
             process.terminate()
@@ -113,14 +121,6 @@ def _daemon(home: Path, secret: str, *options: str) -> Iterator[None]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-
-
-def _wait_until_ready(process: subprocess.Popen[bytes], events: Path) -> None:
-    until = time.monotonic() + _READY
-    while b"\n" not in (first := events.read_bytes()) and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.05)
-    if b'"ready"' not in first:
-        raise _failure(first)
 
 
 def _run(*words: str) -> None:

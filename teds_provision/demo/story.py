@@ -260,7 +260,7 @@ def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoDone:
 
 def _run(demo: Demo) -> DemoDone:
     demo.say("Two base stations, each with its own keys, and a sensor on a reader (a process of its own).")
-    first, second = _station(demo, "bench"), _station(demo, "crane")
+    first, second = new_station(demo, "bench"), new_station(demo, "crane")
     with demo.steps.step("start node") as step:
         demo.uuid = demo.stack.enter_context(_node(demo, "node", PROFILE, "--nfc", demo.nfc))
         step.detail = f"{demo.uuid.hex()} on {demo.nfc} and {demo.can}"
@@ -288,7 +288,8 @@ def _measure(demo: Demo, station: Station) -> None:
     move_gripper(demo, station, gripper)
 
 
-def _station(demo: Demo, name: str) -> Station:
+def new_station(demo: Demo, name: str) -> Station:
+    """A station with a throwaway vault, closed with the demo."""
     secret = secrets.token_hex(16)
     with demo.steps.step("init") as step:
         station, _ = initialise(
@@ -313,18 +314,28 @@ def _over_can(demo: Demo, station: Station) -> None:
 @contextmanager
 def _node(demo: Demo, name: str, profile: str, *links: str) -> Iterator[bytes]:
     """A virtual transducer in a process of its own, while the context lasts; gives its UUID."""
+    folder = make_node(demo, name, profile)
+    with run_node(folder, *links, "--can", demo.can, "--source", "sine:4") as uuid:
+        yield uuid
+
+
+_NODE_COMMAND = (sys.executable, "-m", "teds_provision", "--json", "node")
+
+
+def make_node(demo: Demo, name: str, profile: str) -> Path:
+    """Make a virtual transducer that describes itself as this profile; its folder. Raises LinkFailure."""
     folder = demo.folder / f"{name}-flash"
-    command = [sys.executable, "-m", "teds_provision", "--json", "node"]
-    made = subprocess.run(
-        [*command, "create", str(folder), "--profile", profile], capture_output=True, text=True, check=False
-    )
+    words = [*_NODE_COMMAND, "create", str(folder), "--profile", profile]
+    made = subprocess.run(words, capture_output=True, text=True, check=False)
     if made.returncode:
         raise _failure("The virtual node could not be made", made.stdout)
-    process = subprocess.Popen(
-        [*command, "run", str(folder), *links, "--can", demo.can, "--source", "sine:4"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    return folder
+
+
+@contextmanager
+def run_node(folder: Path, *links: str) -> Iterator[bytes]:
+    """Run a virtual transducer as a process while the context lasts; gives its UUID. Raises LinkFailure."""
+    process = subprocess.Popen([*_NODE_COMMAND, "run", str(folder), *links], stdout=subprocess.PIPE, text=True)
     try:
         yield _ready(process)
     finally:

@@ -55,7 +55,7 @@ class System:
 
 Look = Callable[[System], Iterator[Finding]]
 CHECKS: Final[dict[str, tuple[Room, Look]]] = {}
-_MODULES: Final = ("machine", "links", "station", "fleet")
+_MODULES: Final = ("machine", "links", "station", "fleet", "plant")
 
 
 def check(name: str, room: Room) -> Callable[[Look], Look]:

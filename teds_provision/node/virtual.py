@@ -276,7 +276,8 @@ class VirtualNode:
         with self._core.interrupt():
             wait = self._sample(board)
             if wait is not None:
-                self._look_for_events(board)
+                for channel, tick, reading in board.events():
+                    self.tim.event(channel, tick, reading.octets, valid=reading.valid)
         if wait is None:
             return None
         frame = self._send_frames()
@@ -315,10 +316,6 @@ class VirtualNode:
             more = missed - self._told_missed
             board.tell(f"{more} data messages of node {self.tim.flash.uuid.hex()} could not leave in time ({missed}).")
             self._told_missed, self._tell_at = missed, now + _TELL_EVERY
-
-    def _look_for_events(self, board: Board) -> None:
-        for channel, tick, reading in board.events():
-            self.tim.event(channel, tick, reading.octets, valid=reading.valid)
 
     def _send_frames(self) -> float | None:
         """Send what may begin now, a frame for each bus, and what follows close behind; seconds until the next one.

@@ -217,7 +217,7 @@ def test_a_full_disk_leaves_the_old_backup_and_no_rest(home: Path, sealed: Path,
         text=True,
         check=False,
         timeout=60,
-        env=clean_environment(),
+        env=clean_environment(PYTHONDONTWRITEBYTECODE="1"),  # see tests/e2e/desk.py
     )
     assert done.returncode == 7
     assert "cannot be written" in done.stderr

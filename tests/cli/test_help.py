@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import click
 import pytest
@@ -123,14 +124,21 @@ def test_the_help_of_no_command_loads_anything_heavy() -> None:
     assert done.out.count("Usage: ") == len(ALL)
 
 
-@pytest.mark.parametrize(("words", "path"), [([], PROGRAM), (["trust"], f"{PROGRAM} trust")], ids=["none", "group"])
-def test_a_command_that_is_missing_shows_the_help(words: list[str], path: str) -> None:
-    shown = spawn(*words)
+def test_a_command_that_is_missing_in_a_group_shows_its_help() -> None:
+    path = f"{PROGRAM} trust"
+    shown = spawn("trust")
     assert (shown.code, shown.out) == (2, "")
     assert shown.err.startswith(f"Usage: {path} [OPTIONS] COMMAND")
-    told = spawn("--json", *words)
+    told = spawn("--json", "trust")
     assert told.code == 2
     assert told.json["error"]["message"] == f"Missing command. (see: {path} --help)"
+
+
+def test_the_program_alone_says_what_comes_first(tmp_path: Path) -> None:
+    shown = spawn("--home", tmp_path / "new")
+    assert (shown.code, shown.err) == (0, "")
+    assert "Next: teds-provision init" in shown.out
+    assert not (tmp_path / "new").exists(), "it only looks"
 
 
 @pytest.mark.parametrize(

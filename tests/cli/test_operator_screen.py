@@ -25,6 +25,7 @@ class Batch:
     passed: int = 0
     next_row: Row | None = None
     had: str | None = None
+    of_a_job: bool = False
 
     def board_of(self, row: Row) -> str | None:
         return self.had

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -182,3 +183,25 @@ def test_a_value_has_no_digits_that_its_uncertainty_makes_noise_of(
 ) -> None:
     """The lower end of a gripper's range was shown as -2.13163e-17 m."""
     assert f"{tidy(value, uncertainty):.6g}" == seen
+
+
+@pytest.mark.parametrize(
+    ("lock", "words"),
+    [
+        ("ncap.lock", ("ncap", "run", "--can", "udp_multicast:239.74.163.2?port=1")),
+        ("ncap.sock/", ("ncap", "run", "--can", "udp_multicast:239.74.163.2?port=1")),
+        ("ncap-tokens.json.lock", ("ncap", "token", "add", "lab")),
+        (f"measuring-{hashlib.sha256(b'hand').hexdigest()}.lock", ("group", "delete", "hand")),
+    ],
+)
+def test_a_home_that_takes_no_lock_is_told_as_a_store_that_fails(home: Path, lock: str, words: tuple[str, ...]) -> None:
+    """A disk that is read only from then on refused the lock first of all: that was "a bug" (make faults, EROFS)."""
+    assert call(home, "group", "create", "hand").code == 0
+    if lock.endswith("/"):
+        (home / lock).mkdir()
+        (home / lock / "kept").touch()
+    else:
+        (home / lock).symlink_to(home / lock)
+    told = call(home, *words)
+    assert told.code in (2, 7), told
+    assert lock.rstrip("/") in told.err

@@ -100,6 +100,7 @@ def test_the_registry_holds_every_check(system: System) -> None:
         "keys folder",
         "store file",
         "nodes",
+        "registry",
         "seals",
         "config",
         "profiles",

@@ -20,8 +20,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, prepared: Path) -> Iterator[Desk]:
-    desk = Desk(tmp_path, prepared)
+def desk(tmp_path: Path, prepared: Path, node_kind: str) -> Iterator[Desk]:
+    desk = Desk(tmp_path, prepared, nodes=node_kind)
     yield desk
     desk.clear()
 

@@ -16,15 +16,20 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import pytest
 
 from teds_provision.node.described import create
 from teds_provision.store import Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import PROGRAM, ROOT, Outcome, begin
+from tests.firmware.c_node import CNode
 from tests.pace import PATIENCE, until
 from tests.places import free_bus, free_reader, new_uuid
 
+KIND_OF_NODE = os.environ.get("TEDS_NODE", "python")
+"""``c``: every node of a desk is the one in C (``make test-c``)."""
 ANGLE = "magnetic-angular-position-sensor"
 FINGER = "tactile-finger-sensor"
 _UTF8 = codecs.getincrementaldecoder("utf-8")
@@ -44,9 +49,12 @@ class Links:
 
 
 def limited(octets: int) -> tuple[str, ...]:
-    """The program on a disk on which no file may grow beyond so many octets."""
+    """The program on a disk on which no file may grow beyond so many octets.
+
+    It compiles nothing: Python 3.11 keeps a module's octets as far as they went, and nothing imports that module again.
+    """
     code = (
-        "import resource, runpy, sys;"
+        "import resource, runpy, sys; sys.dont_write_bytecode = True;"
         f"resource.setrlimit(resource.RLIMIT_FSIZE, ({octets}, {octets}));"
         "sys.argv[0] = 'teds-provision'; runpy.run_module('teds_provision', run_name='__main__')"
     )
@@ -142,9 +150,10 @@ class Running:
 class Desk:
     """Where the processes of one test run; every one of them is gone afterwards."""
 
-    def __init__(self, folder: Path, prepared: Path) -> None:
+    def __init__(self, folder: Path, prepared: Path, *, nodes: str = "") -> None:
         self.folder = folder
         self.prepared = prepared
+        self.nodes = nodes or KIND_OF_NODE
         self.links = Links()
         self.running: list[Running] = []
         self.addresses: set[int] = set()  # of its nodes
@@ -174,6 +183,10 @@ class Desk:
     def node(self, name: str = "node", *, uuid: str | None = None, called: str = "", type_: str | None = None) -> Node:
         """A new node in factory state, made in this process: what the command does is in tests/node."""
         own = bytes.fromhex(uuid) if uuid else self.new_uuid()
+        if self.nodes == "c":
+            if called or type_:
+                pytest.skip("the node in C has no datasheet of its own")
+            return cast(Node, CNode(self, self.folder / name, own.hex()))
         made = create(self.folder / name, uuid=own, name=called, profile=type_)
         made.release()
         return Node(self, self.folder / name, made.load().uuid.hex())

@@ -15,7 +15,7 @@ from tests.terminal import on_terminal
 
 from .desk import ANGLE, FINGER, Desk, Node, Station, results
 
-pytestmark = pytest.mark.link
+pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
 
 CALIBRATION = "raw,value [degree]\n0,0\n32768,{middle}\n65535,359.9\n"
 
@@ -261,9 +261,10 @@ def test_no_at_the_question_skips_the_board(station: Station, node: Node, tmp_pa
 # -- a whole bus -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.needs("a slow chip")
 def test_every_whitelisted_node_of_a_bus_is_brought_up_at_once(desk: Desk, station: Station) -> None:
     nodes = [desk.node(f"node{number}").start("--crypto-delay", "20", nfc=False, can=True) for number in range(4)]
-    words = ["--json", "provision", "--all", "--yes", "-p", ANGLE, "--name", "axis {n}", *desk.links.over("can")]
+    words = ["--json", "provision", "--all", "--yes", "-p", FINGER, "--name", "axis {n}", *desk.links.over("can")]
     outcome = station.run(*words)
     assert outcome.code == 6, "a yes adds no strangers, and none of them is ours"
     assert "none is on the whitelist" in outcome.out
@@ -278,6 +279,29 @@ def test_every_whitelisted_node_of_a_bus_is_brought_up_at_once(desk: Desk, stati
     assert nodes[3].flash["key"] is None
     assert station.log_is_whole()
     assert list(station.run(*words).json) == ["totals"], "the finished ones are left alone"
+
+
+@pytest.mark.needs("a datasheet of its own")
+def test_of_many_on_a_bus_each_line_names_its_node_and_one_without_the_calibration_of_its_type_does_not_pass(
+    desk: Desk, station: Station
+) -> None:
+    nodes = [desk.node(f"node{number}", called=f"arm {number}").start(nfc=False, can=True) for number in range(3)]
+    for node in nodes:
+        station.ask("whitelist", "add", node.uuid)
+    over = desk.links.over("can")
+    for number in (0, 1):
+        calibration = desk.folder / "calibration.csv"
+        calibration.write_text("# date: 2026-11-01\nraw,value [degree]\n0,0\n65535,359.9\n")
+        station.ask("provision", nodes[number].uuid, "-p", ANGLE, "--calibration", calibration, "--yes", *over)
+    done = station.run("provision", "--all", "-p", ANGLE, *over)
+    assert done.code == 6, done
+    assert f"1 of 1  {nodes[2].uuid}" in done.out, "the finished ones are left alone"
+    assert f"Board {nodes[2].uuid} has no calibration of channel 1, which its type requires." in done.err
+    steps = [line for line in done.err.splitlines() if "✓" in line]
+    assert len(steps) >= 5
+    assert all(line.startswith((f"{nodes[2].uuid}: ", "arm 2: ")) for line in steps), done.err
+    again = station.run("provision", "--all", "-p", ANGLE, *over)
+    assert (again.code, "1 failed" in again.out) == (6, True), "it is not finished the second time either"
 
 
 # -- global options and a look at a plan -------------------------------------------------------------------------------

@@ -146,6 +146,7 @@ def test_a_node_that_moves_away_in_the_transfer_is_5(station: Station, node: Nod
     assert [(entry["uuid"], entry["outcome"]) for entry in failed] == [(node.uuid, "node-silent")]
 
 
+@pytest.mark.needs("flash.json")
 @pytest.mark.parametrize("room", [100, 2500])
 def test_a_node_whose_flash_fails_is_refused_by_it_and_stays_as_it_was(station: Station, node: Node, room: int) -> None:
     """No room for the key, or for the datasheet: old state whole, and the same command finishes on a mended board."""
@@ -182,6 +183,7 @@ def test_an_image_that_was_tampered_with_is_not_authentic(station: Station, fini
                 assert said["verdict"] == "not authentic", (block["access_code"], at)
 
 
+@pytest.mark.needs("flash.json")
 def test_a_node_whose_flash_was_tampered_with_is_found_out_and_mended(station: Station, finished: Node) -> None:
     """Somebody changed the range in the flash chip, checksum and all; provisioning it again writes it anew."""
     links = station.desk.links
@@ -205,6 +207,7 @@ def test_a_node_whose_flash_was_tampered_with_is_found_out_and_mended(station: S
     assert station.ask("verify", finished.uuid, *links.over("can"))["verdict"] == "authentic"
 
 
+@pytest.mark.needs("flash.json")
 def test_a_tampered_flash_is_mended_by_hand_too(station: Station, finished: Node) -> None:
     links = station.desk.links.over("nfc")
     finished.stop()

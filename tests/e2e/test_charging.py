@@ -6,7 +6,7 @@ import pytest
 
 from .desk import ANGLE, Desk
 
-pytestmark = pytest.mark.link
+pytestmark = [pytest.mark.link, pytest.mark.needs("a battery")]
 
 
 def test_the_charge_is_remembered_and_shown_with_its_time(desk: Desk) -> None:

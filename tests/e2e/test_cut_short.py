@@ -14,7 +14,7 @@ from tests.pace import PATIENCE
 
 from .desk import ANGLE, Desk, Node, Running, Station
 
-pytestmark = pytest.mark.link
+pytestmark = [pytest.mark.link, pytest.mark.needs("a slow chip")]
 
 SLOW = ("--crypto-delay", "120", "--flash-delay", "250")
 """A node slow enough that every step can be met in the middle; milliseconds."""

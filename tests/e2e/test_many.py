@@ -6,7 +6,7 @@ import pytest
 
 from .desk import ANGLE, Desk, Node, Station, results
 
-pytestmark = pytest.mark.link
+pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
 
 UUIDS = ("8d4d9da65281f7000000", "8d4d9da65281f7000001", "00112233445566778899")
 
@@ -69,6 +69,7 @@ def test_the_same_command_twice_at_once_provisions_once(station: Station, bus: l
     assert station.keys(UUIDS[0]) == [("active", 1)]
 
 
+@pytest.mark.needs("a slow chip")
 @pytest.mark.parametrize("delay", ["0", "200"])
 def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, delay: str) -> None:
     node = desk.node(uuid=UUIDS[0]).start("--crypto-delay", delay, nfc=False, can=True)

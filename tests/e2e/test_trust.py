@@ -8,7 +8,7 @@ import pytest
 
 from .desk import ANGLE, Desk, Node, Station, results
 
-pytestmark = pytest.mark.link
+pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
 
 UUID = "8d4d9da65281f7000000"
 

@@ -9,10 +9,10 @@ import pytest
 
 from .desk import ANGLE, FINGER, Desk, Node, Station, results
 
-pytestmark = pytest.mark.link
+pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
 
 SECURITY = 128
-CHANGING = ("audit", "nodes", "datasheets", "drafts", "readings")
+CHANGING = ("audit", "nodes", "datasheets", "drafts", "readings", "last_places")
 STEPS = ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
 NODE_KEYS = {"uuid", "fingerprint", "tag_uid", "state", "whitelisted", "channels", "name"}
 CALIBRATION = """raw,value [degree]
@@ -31,7 +31,7 @@ def settled(node: Node) -> dict[str, Any]:
     return {name: flash[name] for name in ("provisioned", "epoch", "sequence", "read_only")} | {"blocks": blocks}
 
 
-@pytest.mark.parametrize("tag", ["4", "2"])
+@pytest.mark.parametrize("tag", ["4", pytest.param("2", marks=pytest.mark.needs("type 2 tag"))])
 def test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do(
     station: Station, node: Node, tag: str
 ) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links.nfc.pieces import Piece, Requester, Responder
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
 
 CORPUS = Path(__file__).parent / "corpus"
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
@@ -512,6 +512,120 @@ def unit_seeds() -> Iterable[bytes]:
     yield b"angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz"
 
 
+def check_evidence(data: bytes) -> None:
+    """Evidence; first octet odd: a statement, which gets its envelope first, so that what is inside is reached."""
+    import base64
+
+    from teds_provision.protocol.plant import evidence
+
+    if not data:
+        return
+    octets = data[1:]
+    if data[0] & 1:
+        signature = {"keyid": "0" * 64, "sig": "MAA="}
+        whole = {"payload": base64.b64encode(octets).decode(), "payloadType": evidence.PAYLOAD_TYPE}
+        octets = json.dumps({**whole, "signatures": [signature]}).encode()
+    with suppress(TedsProvisionError):
+        read = evidence.read(octets)
+        assert evidence.faults(read, SoftwareKey(3).point), "nobody signed this"
+
+
+def evidence_seeds() -> Iterable[bytes]:
+    from base64 import b64decode
+
+    kept = (VECTORS / "profile" / "plant_kat.json").read_bytes()
+    file = json.loads(kept)["evidence"]["file"]
+    statement = json.loads(b64decode(json.loads(file)["payload"]))
+    statement["predicate"]["node"]["teds"] = "00" * 20
+    yield b"\0" + file.encode()
+    yield b"\1" + json.dumps(statement, separators=(",", ":")).encode()
+
+
+def check_plant(data: bytes) -> None:
+    """Rosters, pages and requests: the first octet says which; a payload, which a key signs first. Then the fold."""
+    from teds_provision.protocol.handover import jose
+    from teds_provision.protocol.plant import claim, document, event, fold, page, roster
+
+    if not data:
+        return
+    key = SoftwareKey(3)
+    kinds = (document.ROSTER, document.PAGE, document.MEMBER_REQUEST)
+    kind = kinds[data[0] % 3]
+    octets = jose.sign_compact(data[1:], key, typ=kind.typ) if data[0] & 0x80 else data[1:]
+    with suppress(TedsProvisionError):
+        if kind is document.ROSTER:
+            read = roster.open_roster(octets, key.point)
+            assert roster.taking(read, None, read.registry)[0] == "taken"
+            assert fold.view(read, {}, fold.Own("f" * 64)).key_it
+        elif kind is document.PAGE:
+            opened = page.open_page(octets, "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29", lambda kid: key.point)
+            gathered = claim.Claim()
+            for one in map(event.read, opened.events):
+                if isinstance(one, event.Event):
+                    gathered.take(one)
+            assert claim.Claim.from_json(gathered.to_json()) == gathered
+        else:
+            document.open_request(octets)
+
+
+def plant_seeds() -> Iterable[bytes]:
+    from base64 import urlsafe_b64decode
+
+    kept = json.loads((VECTORS / "profile" / "plant_kat.json").read_bytes())["documents"]
+    for name, first in (("roster 2", 0), ("west 1", 1), ("north 1", 1), ("west 2", 1), ("member-request", 2)):
+        text = kept[name]["jws"].split(".")[1]
+        payload = urlsafe_b64decode(text + "=" * (-len(text) % 4))
+        yield bytes([first]) + kept[name]["jws"].encode()
+        told = json.loads(payload)
+        if "station" in told:
+            told["station"] = fingerprint(SoftwareKey(3).point)
+        if "point" in told:
+            told["point"] = SoftwareKey(3).point.hex()
+        if "members" in told:
+            told["members"], told["share"] = [], []
+            told["removed"][0]["point"] = SoftwareKey(4).point.hex()
+        yield bytes([_signed(first)]) + json.dumps(told, separators=(",", ":")).encode()
+
+
+def _signed(kind: int) -> int:
+    """The first octet that asks for this kind, signed."""
+    return next(first for first in range(0x80, 0x84) if first % 3 == kind)
+
+
+def check_line(data: bytes) -> None:
+    """Jobs, sign requests and answers: the first octet says which; a payload, which a key signs first."""
+    from teds_provision.protocol.handover import jose
+    from teds_provision.protocol.plant import document, job, signing
+
+    if not data:
+        return
+    kinds = (document.JOB, job.open_job), (document.SIGN_REQUEST, signing.open_request)
+    kind, reader = (*kinds, (document.SIGNED, signing.open_answer))[data[0] % 3]
+    key = SoftwareKey(3)
+    octets = jose.sign_compact(data[1:], key, typ=kind.typ) if data[0] & 0x80 else data[1:]
+    with suppress(TedsProvisionError):
+        read = reader(octets, lambda kid: key.point)
+        if isinstance(read, job.Job):
+            assert job.open_job(job.seal_job(read, key), lambda kid: key.point).unsigned() == read.unsigned()
+        elif isinstance(read, signing.SignRequest):
+            again = signing.open_request(signing.seal_request(read, key), lambda kid: key.point)
+            assert again.unsigned() == read.unsigned()
+        else:
+            assert isinstance(read, signing.Answer)
+            assert signing.open_answer(signing.seal_answer(read, key), lambda kid: key.point) == read
+
+
+def line_seeds() -> Iterable[bytes]:
+    from base64 import urlsafe_b64decode
+
+    documents = json.loads((VECTORS / "profile" / "plant_kat.json").read_bytes())["documents"]
+    for number, name in enumerate(("job", "sign-request", "signed")):
+        text = documents[name]["jws"].encode()
+        first = number + 3 * ((0x80 - number + 2) // 3)
+        yield bytes([number]) + text
+        yield bytes([first]) + urlsafe_b64decode(text.split(b".")[1] + b"==")
+
+
 _JSON = ("{", "}", "[", "]", '"', ":", ",", "null", "true", "1e9")
 _TOML = ("[[", "]]", "[channel.1]", " = ", '"""', "'", "extends", "unit", "points", "calibration", "inf", "nan")
 _XML = ("<", "/>", "</", "<!DOCTYPE", "<![CDATA[", "&#0;", "uuid=", "<teds", "<field", "xmlns=")
@@ -533,6 +647,11 @@ TARGETS = {
         Target("calibration", check_calibration, calibration_seeds, (*_JSON, *_TOML, "# unit:", "method", "all")),
         Target("profile", check_profile, profile_seeds, _TOML, longest=2048),
         Target("image", check_image, image_seeds, (*_JSON, *_XML, ":00000001FF", "# channel 1 access code 3")),
+        Target("evidence", check_evidence, evidence_seeds, (*_JSON, "facts", "steps", "blocks", "subject", "teds:")),
+        Target(
+            "plant", check_plant, plant_seeds, (*_JSON, "members", "roles", "events", "act", "heads", "share", "last")
+        ),
+        Target("line", check_line, line_seeds, (*_JSON, "nodes", "list", "rule", "image", "refused", "stations")),
         Target("units", check_units, unit_seeds, ("**", "^", "·", "/", "deg", "count", ">=", "<=", "rate", "²")),
     )
 }

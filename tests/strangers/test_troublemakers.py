@@ -31,6 +31,7 @@ COUNTED = {
     "begins again": "late", "stands still": "late", "counts down": "late", "leaps": "bad",
     "ticks jump ahead": "bad", "ticks jump back": "late", "ticks of 32 bits": "late",
     "every second tick is the one before": "bad", "ticks at the end": "bad",
+    "data before the reply": "bad",
 }  # fmt: skip
 NOTHING = {
     "longer", "shorter", "twice the instants", "no instants", "of another stream", "to another station",

@@ -93,7 +93,10 @@ class Converter:
     def value(self, octets: bytes) -> float | None:
         """The value that a set point stands for, None where nothing says so."""
         if self._interpreter.problem:
-            return self._ideal_value(octets)
+            ends, raw = self.form.raw_range, self.raw_of(octets)
+            if ends is None or not math.isfinite(raw) or not self._ranged:
+                return None
+            return self.low + raw / ends[1] * (self.high - self.low)
         values = self._interpreter.decode(octets).value
         return float(values[0]) if math.isfinite(values[0]) else None
 
@@ -101,12 +104,6 @@ class Converter:
         """The raw number that octets hold; NaN where they hold none."""
         numbers, possible = self._writer.numbers(self._writer.raw(octets))
         return float(numbers[0]) if possible[0] else math.nan
-
-    def _ideal_value(self, octets: bytes) -> float | None:
-        ends, raw = self.form.raw_range, self.raw_of(octets)
-        if ends is None or not math.isfinite(raw) or not self._ranged:
-            return None
-        return self.low + raw / ends[1] * (self.high - self.low)
 
     @property
     def _ranged(self) -> bool:

@@ -88,14 +88,11 @@ class NdefApplication:
         if instruction == _SELECT:
             return self._select_file(_data(apdu))
         if instruction == _READ_BINARY and self._file:
-            return self._read_binary(apdu)
+            octets = self._memory.read(self._file, _offset(apdu), (apdu[4] or 256) if len(apdu) == 5 else 256)
+            return _WRONG_OFFSET if octets is None else octets + _OK
         if instruction == _UPDATE_BINARY and self._file == _NDEF_FILE:
             return _OK if self._memory.write(_offset(apdu), _data(apdu)) else _NO_SPACE
         return _NO_COMMAND
-
-    def _read_binary(self, apdu: bytes) -> bytes:
-        octets = self._memory.read(self._file, _offset(apdu), (apdu[4] or 256) if len(apdu) == 5 else 256)
-        return _WRONG_OFFSET if octets is None else octets + _OK
 
     def _select_file(self, name: bytes) -> bytes:
         self._file = name if name in (_CC_FILE, _NDEF_FILE) else b""
@@ -161,6 +158,7 @@ class IsoDepTag:
 
     def _information_block(self, pcb: int, octets: bytes) -> bytes:
         self._number ^= 1
+        self._parts = []  # a reader that begins anew wants no more of the answer before
         self._received = (self._received + octets)[:_LONGEST_APDU]
         if pcb & 0x10:
             return self._kept(bytes((0xA2 | self._number,)))

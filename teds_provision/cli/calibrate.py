@@ -1,0 +1,278 @@
+"""``calibrate``: a sensor's zero where it is mounted, points from the running sensor, and how well a fit meets them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import measure, steps, teds
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import (
+    Channel,
+    FileToRead,
+    WholeNumber,
+    command,
+    dry_run_option,
+    examples,
+    link_options,
+    yes_option,
+)
+from teds_provision.cli.rendering import print_table, reporter_for, shown
+from teds_provision.cli.sample import over_the_bus
+from teds_provision.errors import UsageFailure
+from teds_provision.files import read_text
+from teds_provision.limits import LIMITS
+from teds_provision.links import LinkSettings
+from teds_provision.teds.calibration.model import METHODS
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.measure.zeroing import Zeroed
+    from teds_provision.teds.calibration import Calibration
+
+_NEGATIVE: dict[str, Any] = {"ignore_unknown_options": True}  # -0.5 is a value, and no option
+
+
+@click.group(
+    epilog=examples(
+        "teds-provision calibrate zero 8d4d 1 --can socketcan:can0",
+        "teds-provision calibrate capture 8d4d 1 --reference 90 --unit degree --to joint3.csv --can socketcan:can0",
+        "teds-provision calibrate fit joint3.csv --method polynomial",
+    )
+)
+def calibrate() -> None:
+    """Set a sensor's zero where it is mounted, and take calibration points from it."""
+
+
+@command(
+    "teds-provision calibrate zero 8d4d 1 --can socketcan:can0",
+    "teds-provision calibrate zero 8d4d 1 --value 90 --unit degree --nfc usb",
+    context_settings=_NEGATIVE,
+)
+@click.argument("node", metavar="UUID")
+@click.argument("channel", type=Channel())
+@click.option("--value", type=float, metavar="V", help="What the channel is to read now (default: 0).")
+@click.option("--unit", metavar="U", help="Unit of V (default: the SI unit of the datasheet).")
+@click.option(
+    "--accept-calibration", metavar='"WHY"', help="Accept a result that the guard refuses; the reason is logged."
+)
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def zero(
+    app: App,
+    node: str,
+    channel: int,
+    value: float | None,
+    unit: str | None,
+    accept_calibration: str | None,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
+) -> None:
+    """Have a channel read 0 now, or --value V, in one step.
+
+    It is read, and its datasheet signed, written and verified with another zero offset. The curve and the date of its
+    calibration stay, and the date of the zero stands beside it. Nothing is written where the sensor is restless, or the
+    guard refuses the result (exit 6). An ncap that measures the node lets it go meanwhile.
+    """
+    if value is not None and not math.isfinite(value):
+        raise UsageFailure("--value is not a finite number.")
+    order = measure.zeroing.ZeroOrder(channel, value, unit, app.interactive, accept_calibration)
+    done = measure.zeroing.zero_at(
+        app.station(),
+        over_the_bus(links),
+        node,
+        order,
+        reporter_for(app),
+        dry_run=dry_run,
+        low=partial(app.confirm, yes=yes),
+    )
+    for warning in done.warnings:
+        app.warn(warning)
+    app.emit(_zero_json(done, dry_run=dry_run), _zero_lines(done, dry_run=dry_run))
+
+
+def _zero_json(done: Zeroed, *, dry_run: bool) -> dict[str, Any]:
+    channel = done.channel
+    unit = channel.shown
+    differences = {"offset": done.offset, "moved": done.moved, "spread": done.spread}
+    readings = {"before": done.before, "after": done.after}
+    return {
+        "uuid": done.uuid.hex(),
+        "channel": channel.number,
+        "name": channel.name,
+        **differences,
+        **readings,
+        "unit": channel.si_unit,
+        "shown": {name: value / unit.scale for name, value in differences.items()}
+        | {name: unit.from_si(value) for name, value in readings.items()}
+        | {"unit": unit.text},
+        "count": done.count,
+        "sequence": done.sequence,
+        "written": done.written,
+        "dry_run": dry_run,
+        "changes": list(done.changes),
+        "warnings": list(done.warnings),
+        "steps": [{"name": one.name, "result": one.result, "seconds": one.seconds} for one in done.steps],
+    }
+
+
+def _zero_lines(done: Zeroed, *, dry_run: bool) -> str:
+    channel = done.channel
+    named = f"Channel {channel.number}" + (f" ({shown(channel.name)})" if channel.name else "")
+    read = f"{named} read {channel.show(done.before)}"
+    seen = f"{done.count} samples, spread {channel.show(done.spread, difference=True)}"
+    if not done.moved:
+        return f"{named} reads {channel.show(done.before)} ({seen}): nothing to do."
+    offset = f"zero offset {channel.show(done.offset, difference=True)}"
+    offset += f" (moved by {channel.show(done.moved, difference=True)})"
+    changes = "".join(f"\n  {text}" for text in done.changes)
+    if dry_run:
+        return f"Plan: {read} ({seen}); it would read {channel.show(done.after)}, {offset}.{changes}"
+    said = f"{read} ({seen}) and reads {channel.show(done.after)} now: {offset}."
+    return f"{said}{changes}\nWritten and verified, sequence {done.sequence}."
+
+
+@command(
+    "teds-provision calibrate capture 8d4d 1 --reference 90 --unit degree --to joint3.csv --can socketcan:can0",
+    context_settings=_NEGATIVE,
+)
+@click.argument("node", metavar="UUID")
+@click.argument("channel", type=Channel())
+@click.option("--reference", type=float, required=True, metavar="V", help="What the sensor really stands at.")
+@click.option("--unit", metavar="U", help="Unit of V (default: the SI unit of the datasheet).")
+@click.option(
+    "--to",
+    "file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    metavar="FILE.csv",
+    help="Calibration file that gets the point; it is made where it is not there.",
+)
+@link_options
+@pass_app
+def capture(
+    app: App, node: str, channel: int, reference: float, unit: str | None, file: Path, links: LinkSettings
+) -> None:
+    """Take one calibration point from the running sensor.
+
+    The mean of 32 raw values over half a second is written beside the reference, with their spread and count. The file
+    is one for --calibration; calibrate fit shows what a fit of it is worth. Others may measure the sensor meanwhile.
+    """
+    if not math.isfinite(reference):
+        raise UsageFailure("--reference is not a finite number.")
+    done = measure.capturing.capture_at(
+        app.station(),
+        over_the_bus(links),
+        node,
+        channel,
+        reference,
+        file,
+        reporter_for(app),
+        unit=unit,
+        shown_unit_asked=app.interactive,
+    )
+    point, own = done.point, done.channel
+    added = {"raw": point.raw, "mean": point.raw, "reference": point.reference, "unit": own.si_unit}
+    result = {
+        "uuid": done.uuid.hex(),
+        "channel": own.number,
+        "name": own.name,
+        "file": str(file),
+        "added": {**added, "spread": point.spread, "count": point.count},
+        "points": [dict(one) for one in done.points],
+    }
+    count = len(done.points)
+    app.emit(
+        result,
+        f"Channel {own.number}: raw {point.raw:.8g} at {own.show(point.reference)} ({point.count} samples, spread "
+        f"{point.spread:.3g}). {file} holds {count} point{'' if count == 1 else 's'}.",
+    )
+
+
+@command(
+    "teds-provision calibrate fit joint3.csv --method polynomial",
+    "teds-provision calibrate fit joint3.csv --profile magnetic-angular-position-sensor",
+)
+@click.argument("file", type=FileToRead(), metavar="FILE.csv")
+@click.option("--method", type=click.Choice(METHODS), help="How to fit (default: as the file says, else table).")
+@click.option("--degree", type=WholeNumber(1, 12), metavar="N", help="Degree of a polynomial (default: 3).")
+@click.option("--profile", "-p", metavar="P", help="Also hold it against this transducer type and the guard.")
+@pass_app
+def fit(app: App, file: Path, method: str | None, degree: int | None, profile: str | None) -> None:
+    """Show how well a calibration meets its points.
+
+    Nothing is written to a node. A table goes through every point; what each inner point is missed by without it stands
+    beside the residuals.
+    """
+    text = read_text(file, LIMITS.text_file, "calibration")
+    warnings: tuple[str, ...] = ()
+    if profile is not None:
+        if method is not None or degree is not None:
+            raise UsageFailure(
+                "--profile says the method itself.",
+                hint="Leave --method and --degree out, or write them into the file.",
+            )
+        prepared = steps.build.prepare(app.station(), steps.build.BuildOrder(profile, calibration=file))
+        fitted, warnings = dict(prepared.calibrations or {}), prepared.warnings
+    else:
+        fitted = teds.calibration.fit_points(text, str(file), method=method, degree=degree)
+    told = [_fit_json(one) for _, one in sorted(fitted.items())]
+    for warning in warnings:
+        app.warn(warning)
+    result = {"file": str(file), **told[0], "channels": told, "warnings": list(warnings)}
+    app.emit(result, lambda console: _fits(console, [one for _, one in sorted(fitted.items())], told))
+
+
+def _fit_json(one: Calibration) -> dict[str, Any]:
+    found, without = teds.calibration.residuals(one), teds.calibration.left_out(one)
+    if found is None:
+        raise UsageFailure("There are no points to fit.", hint="calibrate fit takes a CSV of points: raw, value.")
+    rows = zip(found.inputs, found.references, found.curve, found.differences, strict=True)
+    return {
+        "channel": one.channel,
+        "method": one.method,
+        "kind": teds.calibration.kind_of(one),
+        "unit": one.unit.text,
+        "residuals": [
+            {"raw": raw, "value": value, "fit": curve, "residual": residual} for raw, value, curve, residual in rows
+        ],
+        "rms": found.rms,
+        "maximum": found.maximum,
+        "left_out": {"rms": _rms(without), "maximum": max(map(abs, without))} if without else None,
+    }
+
+
+def _rms(values: Sequence[float]) -> float:
+    return math.sqrt(sum(value * value for value in values) / len(values))
+
+
+def _fits(console: Console, fitted: Sequence[Calibration], told: Sequence[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    for one, said in zip(fitted, told, strict=True):
+        unit = one.unit.text
+        table = Table("raw", f"value [{unit}]", "fit", "residual", box=None, pad_edge=False)
+        for row in said["residuals"]:
+            table.add_row(*(f"{row[name]:.6g}" for name in ("raw", "value", "fit")), f"{row['residual']:+.3g}")
+        print_table(console, table)
+        console.print(teds.calibration.sentence(one), markup=False)
+        if said["left_out"] is not None:
+            worst, rms = said["left_out"]["maximum"], said["left_out"]["rms"]
+            console.print(
+                f"Each inner point left out in turn is missed by up to {worst:.3g} {unit}, rms {rms:.3g} {unit}.",
+                markup=False,
+            )
+
+
+calibrate.add_command(zero, "zero")
+calibrate.add_command(capture, "capture")
+calibrate.add_command(fit, "fit")

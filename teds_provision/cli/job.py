@@ -1,0 +1,340 @@
+"""``job``: what a line may build, and how it does."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import plant, protocol, steps
+from teds_provision.cli.build import read_file, write_file
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, WholeNumber, command, dry_run_option, examples
+from teds_provision.cli.rendering import local_time, moment, print_table
+from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.teds.profile.load import default_folders, find_profile
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.plant.yields import StationYield
+    from teds_provision.protocol.plant.job import CalibrationRule, Job
+    from teds_provision.protocol.plant.roster import Roster
+    from teds_provision.station.station import Station
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision job new --title angles -p load-cell --count 50 --station west --ends 2027-01-31",
+        "teds-provision job status 0b5f",
+    ),
+)
+def job() -> None:
+    """Jobs for a line: a keeper says what may be built, how often, by which station and until when."""
+
+
+@command(
+    "teds-provision job new --title cells -p load-cell --count 50 --station west=50 --ends 2027-01-31",
+    "teds-provision job new --title spares -p load-cell --list boards.csv --station west --ends 2027-01-31",
+    name="new",
+)
+@click.option("--title", required=True, metavar="TEXT", help="What people call it.")
+@click.option("--profile", "-p", required=True, metavar="P", help="Transducer type; its file is named by SHA-256.")
+@click.option("--count", type=WholeNumber(1), metavar="N", help="So many boards, whichever come.")
+@click.option("--list", "listed", type=FileToRead(), metavar="FILE", help="These boards: uuid, fingerprint.")
+@click.option("--station", "stations", multiple=True, required=True, metavar="NAME[=N]", help="Who builds, how many.")
+@click.option("--ends", required=True, metavar="TIME", help="When it ends.")
+@click.option("--not-before", metavar="TIME", help="When it begins (default: now).")
+@click.option("--calibration", type=FileToRead(), metavar="FILE", help="The same calibration for all.")
+@click.option(
+    "--calibrations",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="A calibration for each board: files UUID.csv, .toml or .json.",
+)
+@click.option("--calibration-age", type=WholeNumber(1), metavar="DAYS", help="Any calibration, at most so old.")
+@click.option(
+    "--assurance", type=click.Choice(["uuid", "bus", "tap"]), default="tap", show_default=True, help="How it is met."
+)
+@click.option("--sign", default="station", show_default=True, metavar="station|NAME", help="Who signs the datasheets.")
+@click.option("--no-evidence", is_flag=True, help="Keep no proof of each board.")
+@click.option("--read-only", multiple=True, metavar="CHANNEL:CODE", help="TEDS that boards bring and nobody writes.")
+@click.option("--name", metavar="PATTERN", help="Name of each board: {unit}, {unit:03}, {uuid}, {uuid8}.")
+@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Also write it.")
+@dry_run_option
+@pass_app
+def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
+    """Make a job and sign it; this station must be a keeper."""
+    station = app.station()
+    roster = plant.jobs.roster_of(station)
+    if not roster.has(station.identity.fingerprint, "keeper"):
+        raise PolicyRefused("This station is not a keeper: nobody would take its job.", hint="Ask a keeper.")
+    drafted = _drafted(station, roster, told)
+    if not dry_run:
+        station.unlock()
+        octets = protocol.plant.job.seal_job(drafted, station.credentials().key)
+        drafted = plant.jobs.take_job(station, octets)
+        if output is not None:
+            write_file(output, octets.decode())
+    app.emit(_told(station, drafted), f"{'Would make' if dry_run else 'Made'} job {drafted.id}: {_sentence(drafted)}")
+
+
+def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
+    if (told["count"] is None) == (told["listed"] is None):
+        raise UsageFailure("A job is for a number of boards or for a list.", hint="Use one of --count and --list.")
+    path = find_profile(told["profile"], default_folders(station.home))
+    boards = _boards(told["listed"]) if told["listed"] is not None else {}
+    total = told["count"] or len(boards)
+    sign = told["sign"]
+    begins = told["not_before"]
+    return protocol.plant.job.Job(
+        str(uuid.uuid4()),
+        roster.registry,
+        told["title"],
+        path.stem,
+        plant.jobs.digest_of_file(path),
+        _rule(told, boards),
+        told["count"],
+        boards,
+        _time(begins) if begins is not None else datetime.now(UTC).replace(microsecond=0),
+        _time(told["ends"]),
+        dict(_allotment(roster, text, total) for text in told["stations"]),
+        told["assurance"],
+        sign if sign == "station" else _office(roster, sign),
+        not told["no_evidence"],
+        tuple(_block(text) for text in told["read_only"]),
+        told["name"],
+    )
+
+
+def _time(text: str) -> datetime:
+    return datetime.fromisoformat(moment(text))
+
+
+def _boards(path: Path) -> dict[bytes, str]:
+    """The boards of a whitelist file, each with its whole fingerprint."""
+    listed = steps.whitelist.read_whitelist(path)
+    for one in listed:
+        if one.fingerprint is None or len(one.fingerprint) != 64:
+            raise BadData(f"{path}:{one.line}: a job names the whole fingerprint (64 digits) of each board.")
+    return {one.uuid: one.fingerprint or "" for one in listed}
+
+
+def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
+    given = [name for name in ("calibration", "calibrations", "calibration_age") if told[name] is not None]
+    if len(given) > 1:
+        raise UsageFailure("A job has one rule for calibrations.", hint=f"Use one of --{' and --'.join(given)}.")
+    rule = protocol.plant.job.CalibrationRule
+    if told["calibration"] is not None:
+        return rule("one", plant.jobs.digest_of_file(told["calibration"]))
+    if told["calibration_age"] is not None:
+        return rule("any", max_age_days=told["calibration_age"])
+    if told["calibrations"] is None:
+        return rule()
+    by_uuid: dict[bytes, str] = {}
+    for path in sorted(told["calibrations"].glob("*")):
+        if len(path.stem) == 20 and set(path.stem) <= set("0123456789abcdef") and path.is_file():
+            by_uuid[bytes.fromhex(path.stem)] = plant.jobs.digest_of_file(path)
+    if not by_uuid or boards.keys() - by_uuid.keys():
+        lacking = next(iter(boards.keys() - by_uuid.keys()), b"").hex() or "UUID"
+        raise NotFound(f"There is no calibration {lacking}.* in {told['calibrations']}.")
+    return rule("list", by_uuid=by_uuid)
+
+
+def _allotment(roster: Roster, text: str, total: int) -> tuple[str, int]:
+    name, _, number = text.rpartition("=") if "=" in text else (text, "", str(total))
+    found = roster.named(name)
+    if found is None or roster.member(found.fingerprint) is None:
+        raise NotFound(f"The roster has no member {name!r}.", hint="See: teds-provision registry status")
+    if not number.isdecimal() or not 1 <= int(number) <= total:
+        raise UsageFailure(f"{text!r}: an allotment is a number of 1 to {total}.")
+    return found.fingerprint, int(number)
+
+
+def _office(roster: Roster, name: str) -> str:
+    found = roster.named(name)
+    if found is None or not roster.has(found.fingerprint, "sign"):
+        raise NotFound(f"The roster has no member {name!r} with the role sign.", hint="See: registry status")
+    return found.fingerprint
+
+
+def _block(text: str) -> tuple[int, int]:
+    channel, _, code = text.partition(":")
+    if not (channel.isdecimal() and code.isdecimal() and int(channel) <= 255 and int(code) <= 255):
+        raise UsageFailure(f"{text!r} is not CHANNEL:CODE, like 1:5.")
+    return int(channel), int(code)
+
+
+def _told(station: Station, found: Job) -> dict[str, Any]:
+    """A job with what became of it here; its own members as they were signed."""
+    row = station.plant.line.job(found.id)
+    given, passed, _ = station.plant.line.count_units(found.id)
+    said = found.unsigned()
+    return {
+        **said,
+        "H": found.hash,
+        "state": row.state if row is not None else "draft",
+        "units": given,
+        "passed": passed,
+    }
+
+
+def _sentence(found: Job) -> str:
+    until = local_time(found.ends.isoformat())
+    return f"“{found.title}”, {found.total} × {found.profile}, until {until}."
+
+
+@command("teds-provision job list", name="list")
+@pass_app
+def list_jobs(app: App) -> None:
+    """List the jobs that this station knows."""
+    station = app.station()
+    plant.jobs.take_received(station)
+    rows = station.plant.line.jobs()
+    found = [replace(_read(station, row.octets), hash=row.hash) for row in rows]
+    told = [_told(station, one) for one in found]
+
+    def table(console: Console) -> None:
+        from rich.table import Table
+
+        shown = Table("id", "title", "profile", "boards", "passed here", "until", "state", box=None, pad_edge=False)
+        for one, said in zip(found, told, strict=True):
+            until = local_time(one.ends.isoformat())
+            counted = f"{said['passed']} of {one.total}"
+            shown.add_row(one.id[:8], one.title, one.profile, str(one.total), counted, until, said["state"])
+        print_table(console, shown)
+
+    app.emit({"jobs": told}, table if told else "There are no jobs yet. A keeper makes one: teds-provision job new")
+
+
+def _read(station: Station, octets: bytes) -> Job:
+    """A job that was taken, whoever is a keeper today."""
+    roster = station.plant.roster
+    return protocol.plant.job.open_job(octets, roster.point_of if roster is not None else lambda kid: None)
+
+
+@command("teds-provision job show fifty.jws", name="show")
+@click.argument("which", metavar="FILE|ID")
+@pass_app
+def show(app: App, which: str) -> None:
+    """Show a job, and keep it if it comes from a file."""
+    station = app.station()
+    found = plant.jobs.find_job(station, which)
+    roster = plant.jobs.roster_of(station)
+    said = _told(station, found)
+    who = ", ".join(f"{roster.name_of(key)} {number}" for key, number in found.stations.items())
+    lines = [
+        f"job          {found.id}",
+        f"title        {found.title}",
+        f"signed by    {roster.name_of(found.signer)}",
+        f"profile      {found.profile}  {found.profile_sha256[:16]}",
+        f"calibration  {found.calibration.rule}",
+        f"boards       {found.total}{', by list' if found.boards else ''}; {said['units']} given here",
+        f"stations     {who}",
+        f"from, until  {local_time(found.not_before.isoformat())}, {local_time(found.ends.isoformat())}",
+        f"met by       {found.assurance}",
+        f"signs        {'each station' if found.office is None else roster.name_of(found.office)}",
+        f"evidence     {'yes' if found.evidence else 'no'}",
+        f"state        {said['state']}",
+    ]
+    app.emit(said, "\n".join(lines))
+
+
+@command("teds-provision job send 0b5f", "teds-provision job send 0b5f --files /media/stick", name="send")
+@click.argument("which", metavar="FILE|ID")
+@click.option(
+    "--files",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="A folder that carries, in place of the registry.",
+)
+@dry_run_option
+@pass_app
+def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
+    """Send a job to its stations and its office.
+
+    They know it after their next sync; `provision --job ID` takes it from there.
+    """
+    station = app.station()
+    found = plant.jobs.find_job(station, which)
+    roster = plant.jobs.roster_of(station)
+    to = plant.asking.receivers(station, found)
+    if not dry_run:
+        station.unlock()
+        post = plant.asking.post_of(station, files)
+        app.closing(post.close)
+        plant.asking.send_job(station, post, found)
+    names = [roster.name_of(one) for one in to]
+    app.emit({"id": found.id, "to": to}, f"{'Would send' if dry_run else 'Sent'} {found.id[:8]} to {', '.join(names)}.")
+
+
+@command("teds-provision job close 0b5f", name="close")
+@click.argument("which", metavar="ID")
+@dry_run_option
+@pass_app
+def close(app: App, which: str, dry_run: bool) -> None:
+    """Close a job at this station: it takes no further board here."""
+    station = app.station()
+    found = plant.jobs.find_job(station, which)
+    if not dry_run:
+        plant.jobs.close_job(station, found)
+    app.emit(_told(station, found), f"{'Would close' if dry_run else 'Closed'} {_sentence(found)}")
+
+
+@command(
+    "teds-provision job status 0b5f",
+    "teds-provision job status 0b5f west/ --csv attempts.csv",
+    name="status",
+)
+@click.argument("which", metavar="FILE|ID")
+@click.argument("evidence", metavar="[FILE|DIR…]", nargs=-1)
+@click.option("--csv", "csv_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Attempts.")
+@pass_app
+def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None) -> None:
+    """Show how a job goes, station by station.
+
+    Boards, first-pass yield, seconds per step, failures by code. Other stations' evidence may be added (what
+    `evidence export` wrote there); of a station without any, its pages count.
+    """
+    station = app.station()
+    found = plant.jobs.find_job(station, which)
+    names = steps.verify_files.image_files([Path(file) for file in evidence]) if evidence else []
+    attempts = plant.yields.attempts_of(station, found.id, (read_file(Path(name)) for name in names))
+    parts = plant.yields.yields(station, found, attempts)
+    if csv_file is not None:
+        write_file(csv_file, plant.yields.to_csv(station, attempts))
+    told = {**_told(station, found), "stations": [part.to_json() for part in parts]}
+    app.emit(told, lambda console: _table(console, found, parts))
+
+
+def _table(console: Console, found: Job, parts: list[StationYield]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    passed = sum(part.passed for part in parts)
+    console.print(f"[bold]{escape(found.title)}[/]: {passed} of {found.total} passed")
+    table = Table("station", "units", "of", "passed", "first pass", "failures", box=None, pad_edge=False)
+    for part in parts:
+        first = "" if part.first_pass is None else f"{part.first_pass:.1%}"
+        failures = ", ".join(f"{count} {code}" for code, count in part.failures.most_common())
+        over = " [bold red]over[/]" if part.over else ""
+        units = f"{part.units}{over}"
+        table.add_row(escape(part.name), units, str(part.allotment), str(part.passed), first, failures)
+    print_table(console, table)
+    for part in parts:
+        if not part.steps:
+            continue
+        times = Table(f"{escape(part.name)}: step", "median s", "worst s", box=None, pad_edge=False)
+        for step, (middle, worst) in part.steps.items():
+            times.add_row(step, f"{middle:.2f}", f"{worst:.2f}")
+        print_table(console, times)
+
+
+for one in (new, list_jobs, show, send, close, status):
+    job.add_command(one)

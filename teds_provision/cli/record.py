@@ -1,0 +1,198 @@
+"""``record``: what is in a recording, its values, the same in another format."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import measure as measure_room
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, Channel, FileToRead, WholeNumber, examples
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    from teds_provision.cli import measure_view, rendering
+    from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
+    from teds_provision.measure.recordings.source import Recording
+    from teds_provision.measure.recordings.summary import Summary
+else:
+    rendering = late("teds_provision.cli.rendering")
+    measure_view = late("teds_provision.cli.measure_view")  # numpy and the sinks
+
+SHOWN = 20
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision record info run.mcap", "teds-provision record convert run.mcap run.csv"),
+)
+def record() -> None:
+    """Look into recordings of `measure --to`, and convert them: CSV, text, MCAP, JSON lines, Parquet.
+
+    The format of a file is told by its content. Of a recording that was cut off, or is still being written, everything
+    up to its last complete line or chunk is read. docs/recording.md describes the formats.
+    """
+
+
+@record.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Show what a recording holds: channels, times, losses.",
+    epilog=examples("teds-provision record info run.mcap", "teds-provision --json record info run.csv"),
+)
+@click.argument("file", type=FileToRead())
+@pass_app
+def info(app: App, file: Path) -> None:
+    """Show the channels of a recording, from when to when it goes, and what is invalid, lost or cut off in it."""
+    recordings = measure_room.recordings
+    recording, summary = recordings.opening.open_recording(file), recordings.summary.Summary()
+    for entry in recording.entries():
+        summary.take(entry)
+    result = summary.to_json(recording)
+    app.emit(result, "\n".join(_lines(result, summary, recording)))
+
+
+def _lines(result: Mapping[str, Any], summary: Summary, recording: Recording) -> Iterator[str]:
+    group = f", group {result['group']}" if result["group"] else ""
+    yield f"{result['file']}: {result['format']}, station {result['station'] or 'unknown'}{group}"
+    if result["test_pattern"]:
+        yield "TEST PATTERN: these are not measurements."
+    if result["from"]:
+        yield f"From {_local(result['from'])} until {_local(result['until'])}"
+    else:
+        yield "It has no values."
+    lost = "not recorded" if result["lost"] is None else f"{result['lost']} messages"
+    yield (
+        f"{result['messages']} instants, {result['samples']} values, {result['invalid']} invalid; "
+        f"lost: {lost}, missing: {result['missing']} samples"
+    )
+    if result["being_written"]:
+        yield "It is still being written."
+    elif not result["complete"]:
+        yield f"It was cut off: no end was written{_torn(result['torn'])}."
+    for one in result["channels"]:
+        facts = summary.facts.get((one["uuid"], one["channel"])) or recording.facts.get((one["uuid"], one["channel"]))
+        span = _span(one, facts)
+        name = f"{one.get('node') or one['uuid']}/{one.get('name') or one['channel']}"
+        yield f"  {name}: {one['samples']} values, {one['invalid']} invalid{span}"
+    for one in result["notes"]:
+        yield f"  {_local(one['time'])} {one['why']}"
+
+
+def _torn(octets: int) -> str:
+    return f", and the last {octets} octets are incomplete" if octets else ""
+
+
+def _span(one: Mapping[str, Any], facts: ChannelFacts | None) -> str:
+    if one["lowest"] is None or facts is None:
+        return ""
+    low, unit = measure_view.in_peoples_units(one["lowest"], facts)
+    high, _ = measure_view.in_peoples_units(one["highest"], facts)
+    return f", {low:.6g} to {high:.6g} {unit}".rstrip()
+
+
+def _local(text: str) -> str:
+    with suppress(ValueError):
+        return datetime.fromisoformat(text).astimezone().isoformat(sep=" ", timespec="milliseconds")
+    return text
+
+
+@record.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Show the values of a recording.",
+    epilog=examples(
+        "teds-provision record show run.mcap --limit 100",
+        "teds-provision record show run.csv --channel 2",
+        "teds-provision --json record show run.parquet",
+    ),
+)
+@click.argument("file", type=FileToRead())
+@click.option(
+    "--channel", "channels", type=Channel(), multiple=True, metavar="N", help="Show only this channel; repeatable."
+)
+@click.option(
+    "--limit", type=WholeNumber(1), metavar="N", help="Show the first N values (default: 20, or all with --json)."
+)
+@pass_app
+def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> None:
+    """Show values with time, node and channel, in the units for people.
+
+    With --json the lines are the events of `measure --json` (SI units), and the last one, `end`, is what `record info`
+    gives. It counts the whole file, whatever --channel and --limit show of it.
+    """
+    recordings = measure_room.recordings
+    recording, summary = recordings.opening.open_recording(file), recordings.summary.Summary()
+    left: float = limit or (math.inf if app.json else SHOWN)
+    for entry in recording.entries():
+        summary.take(entry)
+        if left > 0 and (cut := recordings.selecting.first(entry, channels, left)) is not None:
+            left -= len(cut.time)
+            app.lines(list(_events(cut, summary) if app.json else _values(cut, summary)))
+    if app.json:
+        app.emit({"event": "end", **summary.to_json(recording)})
+    elif summary.messages > (limit or SHOWN):
+        app.note(f"{summary.messages} instants in all; --limit shows more of them.")
+
+
+def _events(shown: Block | GroupRows, summary: Summary) -> Iterator[str]:
+    lines = measure_room.sinks.lines
+    events = (
+        lines.data_lines(shown, summary.facts)
+        if isinstance(shown, measure_room.blocks.Block)
+        else lines.row_lines(shown, summary.facts)
+    )
+    return (lines.as_line(event).decode().rstrip() for event in events)
+
+
+def _values(shown: Block | GroupRows, summary: Summary) -> Iterator[str]:
+    """A line for each instant, in the units for people."""
+    keys = shown.keys
+    known = [summary.facts.get(key) or measure_room.blocks.ChannelFacts(key[0], "", key[1], "") for key in keys]
+    names = [rendering.shown(f"{one.node or one.uuid}/{one.label}") for one in known]
+    for instant, row in zip(shown.time.tolist(), shown.value.tolist(), strict=True):
+        moment = datetime.fromtimestamp(instant).astimezone().isoformat(sep=" ", timespec="milliseconds")
+        cells = [f"{name} {_value(value, one)}" for name, value, one in zip(names, row, known, strict=True)]
+        yield f"{moment}  {', '.join(cells)}"
+
+
+def _value(value: float, known: ChannelFacts) -> str:
+    if not math.isfinite(value):
+        return "not valid"
+    number, unit = measure_view.in_peoples_units(rendering.tidy(value, known.uncertainty), known)
+    return f"{number:.6g} {unit}".rstrip()
+
+
+@record.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Convert a recording to another format.",
+    epilog=examples(
+        "teds-provision record convert run.mcap run.csv",
+        "teds-provision record convert run.mcap run.csv --wide",
+        "teds-provision record convert run.csv run.parquet",
+    ),
+)
+@click.argument("source", type=FileToRead(), metavar="FROM")
+@click.argument("target", type=click.Path(path_type=Path), metavar="TO")
+@click.option("--wide", is_flag=True, help="Write one grid: a row a time, a column a channel, no raw values.")
+@pass_app
+def convert(app: App, source: Path, target: Path, wide: bool) -> None:
+    """Write the recording FROM in the format of TO: .csv, .txt, .mcap, .jsonl, or .parquet (needs pyarrow).
+
+    TO appears when it is complete, and nothing is overwritten. A recording whose datasheets changed midway becomes
+    several files of CSV or Parquet (TO, then TO.2 and so on).
+    """
+    done = measure_room.recordings.converting.convert(source, target, wide=wide)
+    result = done.summary.to_json(done.recording)
+    if result["being_written"]:
+        app.warn(f"{source} is still being written: the result ends at {result['until']}.")
+    elif not result["complete"]:
+        app.warn(f"{source} was cut off: the result ends at {result['until']}.")
+    files = [str(path) for path in done.files]
+    app.emit(
+        {"files": files, **result}, f"{', '.join(files)}: {result['samples']} values in {result['messages']} instants"
+    )

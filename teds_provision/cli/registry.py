@@ -1,0 +1,745 @@
+"""``registry``: the plant, that is many stations of one owner that tell each other what they did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from teds_provision import plant
+from teds_provision.cli.build import read_file
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import (
+    COMMAND_SETTINGS,
+    FileToRead,
+    WholeNumber,
+    command,
+    dry_run_option,
+    examples,
+    yes_option,
+)
+from teds_provision.cli.rendering import local_time, moment, print_json_list
+from teds_provision.errors import NotFound, PolicyRefused
+from teds_provision.files import SHARED, write_new
+from teds_provision.lazy import late
+from teds_provision.sanitize import sanitize
+
+if TYPE_CHECKING:
+    from teds_provision.plant.post import Post
+    from teds_provision.plant.status import Standing, Status
+    from teds_provision.plant.sync import Synced
+    from teds_provision.protocol import keys
+    from teds_provision.protocol.plant import document, roster
+    from teds_provision.protocol.plant.roster import Roster
+    from teds_provision.station.station import Station
+else:
+    keys, document = late("teds_provision.protocol.keys"), late("teds_provision.protocol.plant.document")
+    roster = late("teds_provision.protocol.plant.roster")
+
+_FILE: Final = click.Path(path_type=Path, dir_okay=False)
+_FOLDER: Final = click.Path(path_type=Path, file_okay=False)
+_ROLES: Final = click.Choice(["keeper", "line", "sign", "base", "audit"])
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision registry create --name 'plant Augsburg'",
+        "teds-provision registry sync --files /media/stick",
+        "teds-provision registry status",
+    ),
+)
+def registry() -> None:
+    """Join this owner's stations into a plant: who holds which key, who signed what, which board was revoked.
+
+    What a station says is signed and travels in a folder (a stick, a share). A station that joined no registry works
+    as before, and one that did needs none to work.
+    """
+
+
+# -- the roster: by who has the CA key ---------------------------------------------------------------------------------
+
+
+def _change_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --draft, --output, --yes and --dry-run of the commands that make a new version of the roster."""
+    for option in (
+        dry_run_option,
+        yes_option,
+        click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to this new file."),
+        click.option("--draft", type=_FILE, metavar="FILE", help="Only write a draft; sign it where the CA key is."),
+    ):
+        function = option(function)
+    return function
+
+
+def _emit_change(
+    app: App,
+    station: Station,
+    draft: Roster,
+    *,
+    file: Path | None,
+    output: Path | None,
+    yes: bool,
+    dry_run: bool,
+) -> None:
+    """Show what a new version changes, ask, sign it, and have it count here; ``file``: only write it as a draft."""
+    before = station.plant.roster
+    said = "\n".join(plant.owner.changes(before, draft))
+    if dry_run or file is not None:
+        if file is not None and not dry_run:
+            write_new(file, plant.owner.write_draft(draft), mode=SHARED)
+        told = f"Draft: {file}" if file is not None and not dry_run else "Plan only; nothing was changed."
+        app.emit({**_told(draft), "plan": dry_run, "draft": str(file) if file else None}, f"{said}\n{told}")
+        return
+    app.note(said)
+    app.confirm("Sign this roster?", yes=yes)
+    station.unlock()
+    with station.lock("registry", app.note):
+        if station.plant.roster != before:
+            raise PolicyRefused("Another command changed the roster meanwhile.", hint="Run this again.")
+        signed = plant.owner.signed(station, draft)
+        if output is not None:
+            write_new(output, signed.octets + b"\n", mode=SHARED)
+        plant.folding.put_roster(station, signed)
+    app.emit(_told(signed), f"Roster {signed.version} counts here. To tell the others: teds-provision registry sync")
+
+
+def _told(one: Roster) -> dict[str, Any]:
+    return {
+        "registry": one.registry,
+        "name": one.name,
+        "version": one.version,
+        "members": [
+            {"name": member.name, "fingerprint": member.fingerprint, "roles": _in_order(member.roles)}
+            for member in one.members
+        ],
+        "removed": [
+            {"name": left.name, "fingerprint": left.fingerprint, "why": left.why, "last": left.last[0]}
+            for left in one.removed
+        ],
+        "share": [
+            {"what": {share.what[0]: share.what[1] or True}, "to": list(share.to), "forget": share.forget}
+            for share in one.share
+        ],
+        "expires": _time(one.expires),
+    }
+
+
+def _in_order(roles: frozenset[str]) -> list[str]:
+    return [role for role in roster.ROLES if role in roles]
+
+
+def _time(when: Any) -> str:
+    return f"{when:%Y-%m-%dT%H:%M:%SZ}"
+
+
+@command("teds-provision registry create --name 'plant Augsburg'", name="create")
+@click.option("--name", required=True, help="Name of the plant.")
+@click.option(
+    "--days", type=WholeNumber(1, 400), default=90, show_default=True, metavar="DAYS", help="How long the roster holds."
+)
+@click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to this new file.")
+@yes_option
+@dry_run_option
+@pass_app
+def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_run: bool) -> None:
+    """Create a registry; this station is its first member.
+
+    It gets the roles keeper, sign, line and base. Needs the CA key.
+    """
+    station = app.station()
+    draft = plant.owner.draft_first(station, name, timedelta(days=days))
+    past = list(plant.past.past(station))
+    said = "\n".join([*plant.owner.changes(None, draft), _past(past)])
+    if dry_run:
+        app.emit({**_told(draft), "roster": None, "events": len(past), "plan": True}, f"Plan:\n{said}")
+        return
+    app.note(said)
+    app.confirm("Create this registry?", yes=yes)
+    station.unlock()
+    with station.lock("registry create", app.note):
+        signed = plant.owner.signed(station, draft)
+        if output is not None:
+            write_new(output, signed.octets + b"\n", mode=SHARED)
+        events = plant.owner.join(station, signed, url=None, told=list(plant.past.past(station)))
+    text = f"Registry {signed.registry} of {name} was created. Next: registry connect --files DIR"
+    app.emit({**_told(signed), "roster": signed.octets.decode(), "events": events}, text)
+
+
+def _past(past: Sequence[Any]) -> str:
+    counts = plant.past.count(list(past))
+    listed = ", ".join(f"{count} {act}" for act, count in sorted(counts.items())) or "nothing"
+    return f"  it will tell the plant what this store knows: {listed}"
+
+
+@command("teds-provision registry request --output south.request", name="request")
+@click.option("--output", type=_FILE, required=True, metavar="FILE", help="Where to write the request.")
+@pass_app
+def request(app: App, output: Path) -> None:
+    """Write this station's request to be a member.
+
+    It is for the owner of the CA key. Run again, it writes the same.
+    """
+    station = app.station()
+    station.unlock()
+    with station.lock("registry request", app.note):
+        octets = plant.membership.request(station)
+    write_new(output, octets + b"\n", mode=SHARED)
+    login = plant.schema.role_of(station.fingerprint)
+    app.emit(
+        {"request": str(output), "fingerprint": station.fingerprint, "role": login},
+        f"Request of {station.name}: {output}\n{station.fingerprint}\nThere: teds-provision registry add {output.name}"
+        " --role base",
+    )
+
+
+@command("teds-provision registry add south.request --role base", name="add")
+@click.argument("file", type=FileToRead())
+@click.option("--role", "roles", type=_ROLES, multiple=True, required=True, help="What its word counts for; several.")
+@click.option("--name", help="Another name than the station's own.")
+@_change_options
+@pass_app
+def add(app: App, /, file: Path, roles: Sequence[roster.Role], name: str | None, **how: Any) -> None:
+    """Add the station that made this request to the roster.
+
+    Compare its fingerprint by voice.
+    """
+    station = app.station()
+    asked = document.open_request(read_file(file))
+    draft = plant.owner.add(station, replace(asked, name=name) if name else asked, frozenset(roles))
+    _emit_change(app, station, draft, **_named(how))
+
+
+@command("teds-provision registry role west line", "teds-provision registry role west line --signed 88", name="role")
+@click.argument("name")
+@click.argument("roles", type=_ROLES, nargs=-1, required=True, metavar="ROLE…")
+@click.option("--signed", type=WholeNumber(0, 1 << 31), metavar="N", help="The last page whose datasheets it signed.")
+@_change_options
+@pass_app
+def role(app: App, /, name: str, roles: Sequence[roster.Role], signed: int | None, **how: Any) -> None:
+    """Give a member these roles, all of them. What one that loses "sign" has signed before stays authentic."""
+    station = app.station()
+    member = plant.owner.require_member(plant.folding.require_roster(station), name)
+    place = None if signed is None else plant.owner.page_place(station, member.fingerprint, signed)
+    _emit_change(app, station, plant.owner.with_roles(station, name, frozenset(roles), place), **_named(how))
+
+
+@command("teds-provision registry share --group left-hand --to south", name="share")
+@click.option("--all", "every", is_flag=True, help="All nodes.")
+@click.option("--group", metavar="NAME", help="The nodes of a group.")
+@click.option("--profile", metavar="NAME", help="The nodes of a type.")
+@click.option(
+    "--to", "names", multiple=True, required=True, metavar="NAME", help="A member with the role base; several."
+)
+@click.option("--forget", is_flag=True, help="A sender that is not named deletes its key once all have it.")
+@_change_options
+@pass_app
+def share(
+    app: App, /, every: bool, group: str | None, profile: str | None, names: Sequence[str], forget: bool, **how: Any
+) -> None:
+    """Have the keys of nodes copied to these members by themselves."""
+    station = app.station()
+    held = plant.folding.require_roster(station)
+    to = tuple(plant.owner.require_member(held, name).fingerprint for name in names)
+    draft = plant.owner.shared(station, roster.Share(_what(every, group, profile), to, forget))
+    _emit_change(app, station, draft, **_named(how))
+
+
+@command("teds-provision registry unshare --group left-hand", name="unshare")
+@click.option("--all", "every", is_flag=True, help="All nodes.")
+@click.option("--group", metavar="NAME", help="The nodes of a group.")
+@click.option("--profile", metavar="NAME", help="The nodes of a type.")
+@_change_options
+@pass_app
+def unshare(app: App, /, every: bool, group: str | None, profile: str | None, **how: Any) -> None:
+    """Have the keys of these nodes copied no more.
+
+    What was copied stays.
+    """
+    station = app.station()
+    _emit_change(app, station, plant.owner.unshared(station, _what(every, group, profile)), **_named(how))
+
+
+def _what(every: bool, group: str | None, profile: str | None) -> Any:
+    named = [one for one in (("all", "") if every else None, group and ("group", group),
+                             profile and ("profile", profile)) if one]  # fmt: skip
+    if len(named) != 1:
+        raise click.UsageError("Give one of --all, --group and --profile.")
+    return named[0]
+
+
+@command("teds-provision registry remove west --lost --last 88", name="remove")
+@click.argument("name")
+@click.option("--retired", "why", flag_value="retired", help="It went out of service in order.")
+@click.option("--lost", "why", flag_value="lost", help="Nobody knows where it is.")
+@click.option("--stolen", "why", flag_value="stolen", help="Somebody else has it.")
+@click.option("--last", type=WholeNumber(0, 1 << 31), metavar="N", help="The last page of it that counts.")
+@_change_options
+@pass_app
+def remove(app: App, /, name: str, why: roster.Why | None, last: int | None, **how: Any) -> None:
+    """Remove a station. Its key never comes back; what it said on pages up to the last one stays."""
+    if why is None:
+        raise click.UsageError("Give one of --retired, --lost and --stolen.")
+    station = app.station()
+    held = plant.folding.require_roster(station)
+    member = plant.owner.require_member(held, name)
+    pages = plant.status.page_list(station, member.fingerprint)
+    if last is None and why != "retired":
+        listed = "\n".join(f"  {n:>6}  {local_time(created)}  {hash[:16]}" for n, hash, created in pages)
+        app.note(f"The newest pages of {member.name}:\n{listed or '  none'}")
+    _emit_change(app, station, plant.owner.without(station, name, why, last), **_named(how))
+
+
+@command("teds-provision registry renew --days 90", name="renew")
+@click.option(
+    "--days",
+    type=WholeNumber(1, 400),
+    default=90,
+    show_default=True,
+    metavar="DAYS",
+    help="How long it holds from now on.",
+)
+@_change_options
+@pass_app
+def renew(app: App, /, days: int, **how: Any) -> None:
+    """Sign the same roster with a new end."""
+    station = app.station()
+    _emit_change(app, station, plant.owner.renewed(station, timedelta(days=days)), **_named(how))
+
+
+def _named(how: dict[str, Any]) -> dict[str, Any]:
+    return {"file": how["draft"], "output": how["output"], "yes": how["yes"], "dry_run": how["dry_run"]}
+
+
+@command("teds-provision registry sign roster.draft --output roster.jws", name="sign")
+@click.argument("file", type=FileToRead())
+@click.option("--output", type=_FILE, required=True, metavar="FILE", help="Where to write the signed roster.")
+@yes_option
+@dry_run_option
+@pass_app
+def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
+    """Sign a draft of a roster with the CA key.
+
+    The key need not be a member's. Shows all that is in the draft.
+    """
+    station = app.station()
+    draft = plant.owner.read_draft(read_file(file), station.ca)
+    before = station.plant.roster
+    same = before is not None and before.registry == draft.registry
+    said = "\n".join(plant.owner.changes(before if same else None, draft))
+    if dry_run:
+        app.emit({**_told(draft), "plan": True}, f"Plan:\n{said}")
+        return
+    app.note(said)
+    app.confirm("Sign this roster?", yes=yes)
+    station.unlock()
+    signed = plant.owner.signed(station, draft)
+    write_new(output, signed.octets + b"\n", mode=SHARED)
+    if same:
+        with station.lock("registry sign", app.note):
+            plant.folding.take_rosters(station, [signed.octets])
+    app.emit(_told(signed), f"Signed: {output}. Bring it: registry sync --files DIR, or connect --roster {output.name}")
+
+
+# -- belonging ---------------------------------------------------------------------------------------------------------
+
+
+@command(
+    "teds-provision registry connect --files /media/stick",
+    "teds-provision registry connect 'postgresql://office/plant?sslrootcert=office.crt'",
+    name="connect",
+)
+@click.argument("url", required=False)
+@click.option("--files", type=_FOLDER, metavar="DIR", help="The folder that carries.")
+@click.option("--roster", "roster_file", type=FileToRead(exists=True), metavar="FILE", help="The roster, by hand.")
+@yes_option
+@dry_run_option
+@pass_app
+def connect(app: App, url: str | None, files: Path | None, roster_file: Path | None, yes: bool, dry_run: bool) -> None:
+    """Join a registry whose roster names this station.
+
+    Shows registry and CA to compare, and what it will tell.
+
+    URL is where PostgreSQL is: postgresql://HOST/DATABASE, with ?sslrootcert=FILE where the server's certificate is
+    the owner's own. The station logs in with the key that its request brought; no password is ever typed.
+    """
+    if (files is None) == (url is None):
+        raise click.UsageError("Give a URL, or --files DIR.")
+    station = app.station()
+    post: Post
+    if url is not None:
+        station.unlock()
+        post = plant.reaching.database(station, plant.reaching.absolute(url))
+    else:
+        assert files is not None
+        post = plant.files.FilesPost(files)
+    octets = None if roster_file is None else read_file(roster_file).strip()
+    found = plant.membership.found_roster(station, post, octets)
+    if url is not None:
+        plant.reaching.require_registry(post, found.registry)
+    joined = station.plant.joined
+    same = joined is not None and joined.registry == found.registry
+    if joined is not None and not same:
+        raise PolicyRefused(
+            f"This station belongs to the registry {joined.registry} already.", hint="First: registry disconnect"
+        )
+    past = [] if same else list(plant.past.past(station))
+    said = "\n".join([
+        f"{found.name}, registry {found.registry}, roster {found.version} until {_time(found.expires)}",
+        f"  CA {keys.fingerprint(station.ca)}",
+        f"  as {' '.join(_in_order(found.roles_of(station.fingerprint)))}",
+        _past(past),
+    ])  # fmt: skip
+    told = {"registry": found.registry, "version": found.version, "events": len(past)}
+    if dry_run:
+        app.emit({**told, "plan": True}, f"Plan: join {said}")
+        return
+    app.note(said)
+    if not same:
+        app.confirm("Join this registry?", yes=yes)
+    station.unlock()
+    with station.lock("registry connect", app.note):
+        place = plant.membership.FILES + str(files.resolve()) if files else plant.reaching.absolute(url or "")
+        events = plant.owner.join(station, found, url=place, told=past)
+    post.close()
+    app.emit({**told, "events": events}, f"Joined {found.name}. Next: teds-provision registry sync")
+
+
+@command("teds-provision registry disconnect --yes", name="disconnect")
+@yes_option
+@dry_run_option
+@pass_app
+def disconnect(app: App, yes: bool, dry_run: bool) -> None:
+    """Take no part in the registry any more. Keys, pins and pages stay; the roster decides nothing here any more."""
+    station = app.station()
+    held = plant.folding.require_roster(station)
+    said = (
+        f"Leave {held.name}: this station tells nothing any more, and every station that the CA certified counts here"
+        " again, also one that was removed. To be removed from the roster is another thing: registry remove."
+    )
+    if dry_run:
+        app.emit({"registry": held.registry, "plan": True}, f"Plan: {said}")
+        return
+    app.note(said)
+    app.confirm("Leave?", yes=yes)
+    with station.lock("registry disconnect", app.note):
+        plant.membership.disconnect(station)
+    app.emit({"registry": held.registry}, f"Left {held.name}.")
+
+
+def _post(station: Station, files: Path | None) -> tuple[Post, bool]:
+    """What carries, and whether it is what this station joined by."""
+    joined = plant.reaching.post_of(station)
+    if files is not None:
+        named = plant.files.FilesPost(files)
+        return named, joined is not None and joined.where == str(files.resolve())
+    if joined is None:
+        plant.folding.require_roster(station)
+        raise NotFound("Nothing is known that carries to this registry.", hint="Name it: registry sync --files DIR")
+    return joined, True
+
+
+_files = click.option("--files", type=_FOLDER, metavar="DIR", help="A folder that carries: a stick, a share.")
+
+
+@command("teds-provision registry sync", "teds-provision registry sync --files /media/stick", name="sync")
+@_files
+@pass_app
+def sync(app: App, files: Path | None) -> None:
+    """Exchange news with the others; if it is cut, run it again."""
+    station = app.station()
+    post, connected = _post(station, files)
+    try:
+        done = plant.sync.sync(station, post, connected=connected)
+    finally:
+        post.close()
+    alarms = [one for one in station.plant.tables.alarms() if not one.seen]
+    told = {
+        "pushed": done.pushed,
+        "fetched": done.fetched,
+        "parcels": {"in": done.parcels_in, "out": done.parcels_out, "waiting": done.waiting},
+        "alarms": [_alarm(station, one) for one in alarms],
+        "told": done.told,
+        "rosters": done.rosters,
+    }
+    app.emit(told, _synced(station, done, alarms))
+    if alarms:
+        raise click.exceptions.Exit(4)
+
+
+def _synced(station: Station, done: Synced, alarms: Sequence[Any]) -> str:
+    lines = [f"{done.pushed} pages out, {done.fetched} in"]
+    if done.parcels_in or done.parcels_out:
+        lines.append(f"{done.parcels_out} parcels out, {done.parcels_in} in")
+    if done.waiting:
+        lines.append(f"{done.waiting} parcels wait for a person: teds-provision import-keys --received")
+    lines += [f"roster {version} counts from now on" for version in done.rosters]
+    lines += done.told
+    lines += [f"ALARM {_alarm_line(station, one)}" for one in alarms]
+    return "\n".join(lines)
+
+
+def _alarm(station: Station, one: Any) -> dict[str, Any]:
+    return {"code": one.code, "about": one.about, "n": one.n, "why": one.why, "at": one.at, "seen": one.seen}
+
+
+def _alarm_line(station: Station, one: Any) -> str:
+    held = station.plant.roster
+    name = held.name_of(one.about) if held is not None and one.about else ""
+    return f"{one.code}{f' of {name}' if name else ''}, {one.n}: {one.why}"
+
+
+# -- looking -----------------------------------------------------------------------------------------------------------
+
+
+@command("teds-provision registry status", name="status")
+@pass_app
+def status(app: App) -> None:
+    """Show where every station stands and what is to be decided.
+
+    Opens no connection.
+
+    Exits with 4 while there are alarms that nobody has seen, with 6 when the roster has expired or this station was
+    removed.
+    """
+    station = app.station()
+    held = plant.folding.require_roster(station)
+    record = station.plant.joined
+    assert record is not None
+    found = plant.status.status(station, record, held)
+    told = {
+        "registry": held.registry,
+        "name": held.name,
+        "roster": held.version,
+        "expires": _time(held.expires),
+        "members": [_standing(one) for one in found.standings],
+        "unsent": found.unsent,
+        "synced": record.synced,
+        "conflicts": found.conflicts,
+        "alarms": [_alarm(station, one) for one in found.alarms],
+        "to_rotate": plant.leaving.due(station),
+        "heads": list(found.heads),
+    }
+    app.emit(told, _shown(station, found))
+    if found.exit_code:
+        raise click.exceptions.Exit(found.exit_code)
+
+
+def _standing(one: Standing) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "fingerprint": one.fingerprint,
+        "roles": list(one.roles),
+        "n": one.n,
+        "age": one.age,
+        "state": one.state,
+    }
+
+
+def _shown(station: Station, found: Status) -> str:
+    held, digits = found.roster, found.heads[0]
+    heads = " ".join(digits[at : at + 4] for at in range(0, 16, 4))
+    lines = [
+        f"{held.name} {held.registry[:8]}   roster {held.version}, until {held.expires:%Y-%m-%d}"
+        f"   heads {heads} of {found.heads[1]}"
+    ]
+    wide = max(len(one.name) for one in found.standings)
+    roles = max(len(" ".join(one.roles)) for one in found.standings)
+    for one in found.standings:
+        age = _age(one.age) if one.age is not None else "-"
+        lines.append(f"{one.name:<{wide}}  {' '.join(one.roles):<{roles}}  page {one.n:>5}  {age:>8}  {one.state}")
+    last = f"last sync {local_time(found.record.synced)}" if found.record.synced else "never synced"
+    lines.append(f"{found.conflicts} conflicts, {found.unsent} events unsent, {last}")
+    review, due = plant.leaving.last(station), plant.leaving.due(station)
+    if review is not None and (due or review.alone):
+        tap = f"; {review.alone} need a tap" if review.alone else ""
+        lines.append(f"to rotate: {due} of {review.of}{tap}")
+    lines += [f"{'alarm' if one.seen else 'ALARM'} {_alarm_line(station, one)}" for one in found.alarms]
+    if found.expired:
+        lines.append("The roster has EXPIRED: where the CA key is, registry renew")
+    elif found.expires_soon:
+        lines.append("The roster expires soon: where the CA key is, registry renew")
+    return "\n".join(lines)
+
+
+def _age(seconds: int) -> str:
+    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length or (unit == "min" and seconds >= length):
+            return f"{seconds // length} {unit}"
+    return f"{seconds} s"
+
+
+@command("teds-provision registry log --since today", "teds-provision registry log 8d4d --station west", name="log")
+@click.argument("node", required=False, metavar="[UUID]")
+@click.option("--station", "name", metavar="NAME", help="Only what this station said.")
+@click.option("--since", metavar="TIME", help="Only pages made since then: ISO 8601, today, 2h.")
+@pass_app
+def log(app: App, node: str | None, name: str | None, since: str | None) -> None:
+    """Show what the stations said, with station and page.
+
+    The signature of every page was checked.
+    """
+    station = app.station()
+    held = plant.folding.require_roster(station)
+    of = None
+    if name is not None:
+        found = held.named(name)
+        if found is None:
+            raise NotFound(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
+        of = found.fingerprint
+    uuid = None if node is None else station.nodes.resolve(node)
+    said = plant.status.log(station, uuid=uuid, of=of, since=moment(since) if since else None)
+    if app.json:
+        more = ((one, {"fingerprint_of_station": one.station, "page": one.n, "counts": one.counts}) for one in said)
+        print_json_list("events", ({**one.event, "station": held.name_of(one.station), **told} for one, told in more))
+        return
+    for one in said:
+        counts = "" if one.counts else "  (does not count)"
+        who = f"{held.name_of(one.station)} {one.n}"
+        app.lines([sanitize(f"{one.event['at']}  {who}  {one.event['act']}  {_members(one.event)}{counts}")])
+
+
+def _members(event: dict[str, Any]) -> str:
+    shown = {name: value for name, value in event.items() if name not in ("act", "id", "at", "statement", "proof")}
+    return " ".join(f"{name}={str(value)[:20]}" for name, value in shown.items())
+
+
+# -- a person's word ---------------------------------------------------------------------------------------------------
+
+
+@command("teds-provision registry vouch --all", name="vouch")
+@click.argument("nodes", nargs=-1, metavar="[UUID …]")
+@click.option(
+    "--all", "every", is_flag=True, help="All that this store knows as authentic and nobody may sign any more."
+)
+@yes_option
+@dry_run_option
+@pass_app
+def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool) -> None:
+    """Say as a keeper that older datasheets are good everywhere.
+
+    For those of stations that left before the plant was made.
+    """
+    if every == bool(nodes):
+        raise click.UsageError("Give UUIDs, or --all.")
+    station = app.station()
+    uuids = None if every else [station.nodes.resolve(text) for text in nodes]
+    found = plant.membership.vouchable(station, uuids)
+    said = "\n".join(f"  {uuid.hex()}  signed by {signer}" for uuid, _, signer in found) or "  none"
+    told = {"nodes": [{"uuid": uuid.hex(), "teds_sha256": digest} for uuid, digest, _ in found]}
+    if dry_run:
+        app.emit({**told, "done": 0, "plan": True}, f"Plan: vouch for these datasheets:\n{said}")
+        return
+    app.note(f"Datasheets that are authentic here and not in the plant:\n{said}")
+    if found:
+        app.confirm("Vouch for them?", yes=yes)
+    station.unlock()
+    with station.lock("registry vouch", app.note):
+        done = plant.membership.vouch(station, found)
+    app.emit({**told, "done": done}, f"Vouched for {done} datasheets. To tell the others: registry sync")
+
+
+@command("teds-provision registry accept west --page 4f1c09aa77e012bd", name="accept")
+@click.argument("name")
+@click.option("--page", metavar="HASH", help="The first page of the branch: at least 8 digits of its H.")
+@_files
+@yes_option
+@pass_app
+def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool) -> None:
+    """Take one of a station's two histories, here alone. A roster that removes it goes before this."""
+    station = app.station()
+    held = plant.folding.require_roster(station)
+    member = plant.owner.require_member(held, name)
+    post = plant.files.FilesPost(files) if files is not None else plant.reaching.post_of(station)
+    app.confirm(f"Take this history of {member.name}?", yes=yes, named="--page")
+    station.unlock()
+    with plant.sync.alone(station):
+        n, hash = plant.membership.accept(station, member.fingerprint, page, post)
+        plant.folding.judge(station)
+    app.emit({"done": 1, "n": n, "hash": hash}, f"Page {n} ({hash[:16]}) and what follows it counts here.")
+
+
+@command("teds-provision registry resume", name="resume")
+@_files
+@yes_option
+@pass_app
+def resume(app: App, files: Path | None, yes: bool) -> None:
+    """Go on after a fork.
+
+    Pages under this station's key that lie there are taken for its own.
+
+    First look who else works with a copy of this home. If nobody knows, remove this station instead.
+    """
+    station = app.station()
+    post, _ = _post(station, files)
+    app.note("If a copy of this home is at work elsewhere, end it first; in doubt have this station removed.")
+    app.confirm("Is this the only home with this station's key?", yes=yes)
+    done = plant.sync.resume(station, post)
+    app.emit({"done": done}, f"{done} pages were adopted. Next: teds-provision registry sync")
+
+
+@command("teds-provision registry seen", name="seen")
+@pass_app
+def seen(app: App) -> None:
+    """Note that somebody has seen the alarms up to now.
+
+    They are still shown, and end no command with 4 any more.
+    """
+    station = app.station()
+    plant.folding.require_roster(station)
+    with station.lock("registry seen", app.note):
+        done = station.plant.tables.see_alarms()
+        station.audit("registry", None, "seen", alarms=done)
+    app.emit({"done": done}, f"{done} alarms seen.")
+
+
+@command(
+    "teds-provision registry sql",
+    "teds-provision registry sql --member south.request",
+    "teds-provision registry sql --close west",
+    name="sql",
+)
+@click.option("--member", type=FileToRead(), metavar="FILE", help="The login of the station that asked.")
+@click.option("--close", "closed", metavar="NAME", help="Nothing more from this station.")
+@click.option("--mend", nargs=2, metavar="NAME N", help="Take off rows from number N on that NAME did not sign.")
+@pass_app
+def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str] | None) -> None:
+    """Print the SQL for the database's superuser.
+
+    This program runs none of it: pipe it into psql. Without an option
+    it prints the schema, which may be run again at any time and must be after every pg_restore.
+    """
+    if sum(one is not None for one in (member, closed, mend)) > 1:
+        raise click.UsageError("Give one of --member, --close and --mend.")
+    station = app.station()
+    held = plant.folding.require_roster(station)
+    if member is not None:
+        asked = document.open_request(read_file(member))
+        text = plant.schema.member_sql(asked.fingerprint, asked.login)
+    elif closed is not None:
+        text = plant.schema.close_sql(_of_roster(held, closed))
+    elif mend is not None:
+        if not mend[1].isdecimal() or len(mend[1]) > 10:
+            raise click.UsageError(f"--mend: {mend[1]!r} is no number of a page.")
+        text = plant.schema.mend_sql(_of_roster(held, mend[0]), int(mend[1]))
+    else:
+        text = plant.schema.registry_sql(held.registry, [one.fingerprint for one in held.removed])
+    app.emit({"sql": text}, text.rstrip("\n"))
+
+
+def _of_roster(held: Roster, name: str) -> str:
+    found = held.named(name)
+    if found is None:
+        raise NotFound(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
+    return found.fingerprint
+
+
+for one in (
+    create, request, add, role, share, unshare, remove, renew, sign, connect, disconnect, sync, status, log, vouch,
+    accept, resume, seen, sql,
+):  # fmt: skip
+    registry.add_command(one)

@@ -1,0 +1,218 @@
+"""``teds-provision`` alone: this station, what is on its links now, what is wrong, and the next command."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import client, doctor, measure, steps
+from teds_provision.cli.context import SOCKET, App
+from teds_provision.cli.rendering import count_of, print_table, shown
+from teds_provision.errors import LinkFailure, NotFound, TedsProvisionError
+from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.measure.present import Present
+    from teds_provision.station.station import Station
+
+_SHOWN = 20
+
+
+def start(app: App, ctx: click.Context) -> None:
+    """Show one screen: the station, its links and who answers there, what is wrong, and what to run next."""
+    try:
+        station = app.station()
+    except NotFound:
+        found: dict[str, Any] = {
+            "station": None,
+            "links": [_link(each) for each in measure.present.readers()],
+            "nodes": [],
+            "problems": [],
+            "next": "teds-provision init",
+        }
+    else:
+        found = _of_service(app, station) or _of_links(station, _named(ctx))
+        waiting = doctor.fleet.nodes(doctor.registry.System(app.home))
+        found["problems"] += [{"what": one.why, "fix": one.fix} for one in waiting if one.result == "warning"]
+        found["next"] = _next(found)
+    app.emit(found, lambda console: _print(console, found))
+
+
+def _named(ctx: click.Context) -> LinkSettings:
+    """The links that config.toml or the environment names for every command."""
+
+    def of(name: str) -> tuple[str, ...]:
+        said = os.environ.get(f"TEDS_PROVISION_{name.upper()}") or (ctx.default_map or {}).get(name) or ()
+        return tuple(said.split()) if isinstance(said, str) else tuple(map(str, said))
+
+    ble = of("ble")
+    return LinkSettings(nfc=of("nfc") or None, can=of("can") or None, ble=ble[0] if ble else None)
+
+
+def _station(station: Station) -> dict[str, Any]:
+    return {
+        "name": station.name,
+        "fingerprint": station.fingerprint,
+        "keystore": station.identity.keystore,
+        "home": str(station.home),
+    }
+
+
+def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
+    """Ask on the links themselves: those that are named, else where nodes were met last, and readers that are there."""
+    known = [node["uuid"] for node in steps.inventory.inventory(station, steps.inventory.search(station))]
+    remembered = sorted(set(station.nodes.last_places([bytes.fromhex(uuid) for uuid in known]).values()))
+    places = [place for place in named.places if named.nfc] + list(named.buses or remembered)
+    present = [*measure.present.look(station, places), *([] if named.nfc else measure.present.readers())]
+    nodes = [_node(station, link.place, address, who) for link in present for address, who in link.nodes]
+    problems = [{"what": link.why, "fix": link.cure} for link in present if link.state == "down"]
+    problems += [{"what": text, "fix": f"teds-provision identify --via can --can {link.place.partition(':')[2]}"}
+                 for link in present for text in link.troubles]  # fmt: skip
+    return {
+        "station": _station(station),
+        "links": [_link(each) for each in present],
+        "nodes": nodes,
+        "known": len(known),
+        "problems": problems,
+    }
+
+
+def _link(link: Present) -> dict[str, Any]:
+    return {"place": link.place, "state": link.state, "nodes": len(link.nodes), "why": link.why or None}
+
+
+def _node(station: Station, place: str, address: int, who: Any) -> dict[str, Any]:
+    (known,) = steps.inventory.inventory(station, [who.uuid])
+    return {
+        "uuid": who.uuid.hex(),
+        "name": known["name"],
+        "link": place,
+        "address": address,
+        "state": who.state.name.lower(),
+        "whitelisted": known["whitelisted"],
+        "verdict": known["verdict"],
+    }
+
+
+def _of_service(app: App, station: Station) -> dict[str, Any] | None:
+    """What a running `ncap` of this home sees, which looks at its links all the time; None where none runs."""
+    if not (app.home / SOCKET).exists():
+        return None
+    try:
+        with client.connect(home=app.home, timeout=5) as running:
+            status, nodes = running.status(), running.nodes()
+    except (LinkFailure, OSError, TedsProvisionError):
+        return None
+    here = [node for node in nodes if node["present"]]
+    return {
+        "station": _station(station),
+        "ncap": {"url": status["url"], "measurements": len(status["measurements"])},
+        "links": [
+            {
+                "place": link["place"],
+                "state": "down" if link["problem"] else "up",
+                "nodes": link["nodes"],
+                "why": link["problem"]["message"] if link["problem"] else None,
+            }
+            for link in status["links"]
+        ],
+        "nodes": [
+            {
+                "uuid": node["uuid"],
+                "name": node["name"],
+                "link": node["link"],
+                "address": node.get("address"),
+                "state": node["state"],
+                "whitelisted": node["whitelisted"],
+                "verdict": node["verdict"]["verdict"] if node["verdict"] else None,
+            }
+            for node in here
+        ],
+        "known": len(nodes),
+        "problems": [
+            {"what": f"{link['place']}: {link['problem']['message']}", "fix": link["problem"]["hint"]}
+            for link in status["links"]
+            if link["problem"]
+        ],
+    }
+
+
+def _next(found: dict[str, Any]) -> str:
+    """The one command that most likely comes next: a fault before new boards, new boards before work."""
+    mute = (
+        [link for link in found["links"] if link["state"] == "up" and not link["nodes"]] if not found["nodes"] else []
+    )
+    down = [link for link in found["links"] if link["state"] == "down"] or mute
+    if down:
+        kind, _, where = str(down[0]["place"]).partition(":")
+        return f"teds-provision doctor --{kind} '{where}'"
+    for node in found["nodes"]:
+        over = f" --can '{str(node['link']).partition(':')[2]}'" if str(node["link"]).startswith("can:") else ""
+        if not node["whitelisted"]:
+            return f"teds-provision identify --add{over}"
+        if node["state"] == "factory":
+            return f"teds-provision provision --profile PROFILE{over}"
+        if node["verdict"] != "authentic":
+            return f"teds-provision verify {node['name'] or node['uuid']}{over}"
+    if "ncap" in found:
+        return "teds-provision ncap open"
+    if found["nodes"]:
+        first = found["nodes"][0]
+        return f"teds-provision measure {first['name'] or first['uuid']}"
+    if found["links"] and all(link["place"].startswith("nfc:") for link in found["links"]):
+        return "teds-provision provision --profile PROFILE"
+    if not found["links"]:
+        return "teds-provision config set can socketcan:can0"
+    return "teds-provision doctor"
+
+
+def _print(console: Console, found: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    station = found["station"]
+    if station is None:
+        console.print("No station yet.", markup=False)
+    else:
+        told = f"Station {shown(station['name'])}, key {station['fingerprint'][:16]}, {count_of(found['known'])} known"
+        console.print(told, markup=False)
+    if "ncap" in found:
+        console.print(f"ncap is running: {found['ncap']['url'] or 'without a page'}", markup=False)
+    for link in found["links"]:
+        console.print(f"  {_link_line(link)}", markup=False)
+    if not found["links"]:
+        console.print("  No reader is plugged in, and no bus is named.", markup=False)
+    if found["nodes"]:
+        table = Table("uuid", "name", "link", "state", "verdict", box=None, pad_edge=False)
+        for node in found["nodes"][:_SHOWN]:
+            listed = node["verdict"] or ("not verified" if node["whitelisted"] else "not whitelisted")
+            cells = (node["uuid"], shown(node["name"]), node["link"], node["state"], listed)
+            table.add_row(*(escape(str(cell or "")) for cell in cells))
+        print_table(console, table)
+        if len(found["nodes"]) > _SHOWN:
+            console.print(f"  … and {len(found['nodes']) - _SHOWN} more", markup=False)
+    _print_problems(console, found["problems"])
+    console.print(f"Next: {found['next']}", markup=False)
+    console.print("All commands: teds-provision --help", markup=False)
+
+
+def _print_problems(console: Console, problems: Sequence[dict[str, str]]) -> None:
+    for one in problems:
+        console.print(f"! {one['what']}", markup=False)
+        if one["fix"]:
+            console.print(f"  → {one['fix']}", markup=False)
+
+
+def _link_line(link: dict[str, Any]) -> str:
+    if link["state"] == "down":
+        return f"{link['place']}: {link['why']}"
+    if link["state"] == "listed":
+        return f"{link['place']}: waits for a {'tap' if link['place'].startswith('nfc:') else 'connection'}"
+    if not link["nodes"]:
+        return f"{link['place']}: no node answers"
+    return f"{link['place']}: {count_of(link['nodes'])} {'answers' if link['nodes'] == 1 else 'answer'}"

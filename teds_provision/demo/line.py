@@ -1,0 +1,186 @@
+"""A line on one machine: an order for three boards, an office that signs, a bench that builds, and proof of each.
+
+What goes wrong on purpose: a board of another type, one board too many, and one that somebody changes afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+import tempfile
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from teds_provision import plant
+from teds_provision.demo.story import PROFILE, Demo, make_node, new_station, run_node
+from teds_provision.errors import LinkFailure, PolicyRefused
+from teds_provision.handover import trust
+from teds_provision.plant.evidence import export
+from teds_provision.plant.jobs import digest_of_file, take_job
+from teds_provision.plant.line import LineRun
+from teds_provision.plant.office import answer
+from teds_provision.plant.verify_evidence import Grounds, Totals, judge_file
+from teds_provision.protocol.plant.document import MemberRequest
+from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
+from teds_provision.protocol.plant.roster import Role
+from teds_provision.protocol.plant.signing import SignRequest
+from teds_provision.station.station import Station
+from teds_provision.steps.board_type import WrongBoard
+from teds_provision.steps.provision import Provisioned, inspect, provision
+from teds_provision.steps.verify import require_authentic
+from teds_provision.talk.meeting import meet
+from teds_provision.talk.progress import Reporter, Silent, StepResult
+from teds_provision.teds.profile.load import find_profile
+
+OTHER = "tactile-finger-sensor"
+BOARDS = 3
+_LOGIN = "SCRAM-SHA-256$4096:" + "A" * 22 + "==$" + "B" * 43 + "=:" + "C" * 43 + "="
+"""The verifier of no password: nobody logs in anywhere in the demo."""
+
+
+@dataclass(frozen=True)
+class LineDone:
+    """What the line came to: its steps, units that passed, evidence by verdict, and the boards that were refused."""
+
+    steps: tuple[StepResult, ...]
+    passed: int
+    evidence: dict[str, int]
+    refused: tuple[str, ...]
+
+
+class _AtHand:
+    """The office, in this process: a request goes to it directly."""
+
+    def __init__(self, station: Station) -> None:
+        self._station = station
+
+    def ask(self, request: SignRequest) -> bytes | None:
+        return answer(self._station, request.octets)
+
+
+def run_line(reporter: Reporter, say: Callable[[str], None]) -> LineDone:
+    """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
+    folder = Path(tempfile.mkdtemp(prefix="teds-provision-demo-"))
+    try:
+        demo = Demo(folder, reporter, say)
+        with demo.stack:
+            return _run(demo)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _run(demo: Demo) -> LineDone:
+    demo.say("An owner: the office keeps the CA key and signs; the bench keys boards and signs nothing.")
+    office, bench = _plant(demo)
+    demo.say(f"The order: {BOARDS} boards of one type, signed by the office as a keeper.")
+    line = _job(demo, office, bench)
+    folders, refused = {}, []
+    demo.say("The bench works on it, board after board; a board of another type lies among them.")
+    for name, profile in (("one", PROFILE), ("other", OTHER), ("two", PROFILE), ("three", PROFILE), ("four", PROFILE)):
+        folders[name] = make_node(demo, name, profile)
+        with demo.steps.step(f"board {name}") as step, run_node(folders[name], "--nfc", demo.nfc) as uuid:
+            try:
+                step.detail = f"unit {_build(demo, line, uuid)} of {BOARDS}"
+            except PolicyRefused as error:
+                step.detail = error.message
+                refused.append("wrong-board" if isinstance(error, WrongBoard) else "one too many")
+    demo.say("Afterwards somebody changes a TEDS in the flash of board two. The office tests boards one and two.")
+    _tamper(folders["two"])
+    tests = LineRun(office, line.job, only_verify=True)
+    for name in ("one", "two"):
+        with (
+            demo.steps.step(f"test {name}") as step,
+            run_node(folders[name], "--nfc", demo.nfc) as uuid,
+            meet(office, demo.over("nfc"), uuid, Silent()) as node,
+        ):
+            step.detail = inspect(office, node, tests, Silent()).verified.verdict
+    totals = _proof(demo, office, bench)
+    return LineDone(tuple(demo.steps.done), line.passed, totals.words, tuple(refused))
+
+
+def _plant(demo: Demo) -> tuple[Station, Station]:
+    office = new_station(demo, "office")
+    with demo.steps.step("registry") as step:
+        plant.owner.create(office, "demo")
+        home = demo.folder / "bench"
+        secret = secrets.token_hex(16)
+        asked = trust.ask_for_certificate(home, name="bench", keystore="file", ask=lambda prompt, confirm: secret)
+        certificate = trust.sign_request(office, trust.read_request(asked))
+        bench = trust.adopt_certificate(home, certificate, ask=lambda prompt, confirm: secret)
+        demo.stack.callback(bench.close)
+        now = datetime.now(UTC).replace(microsecond=0)
+        request = MemberRequest(bench.name, bench.point, bench.identity.signature, _LOGIN, now)
+        roles: frozenset[Role] = frozenset({"line"})
+        plant.folding.put_roster(office, plant.owner.signed(office, plant.owner.add(office, request, roles)))
+        roster = plant.jobs.roster_of(office)
+        plant.owner.join(bench, roster, url=None, told=[])
+        step.detail = f"roster {roster.version}: office keeper, sign; bench line"
+    office.unlock()
+    bench.unlock()
+    return office, bench
+
+
+def _job(demo: Demo, office: Station, bench: Station) -> LineRun:
+    with demo.steps.step("job") as step:
+        now = datetime.now(UTC).replace(microsecond=0)
+        drafted = Job(
+            str(uuid.uuid4()),
+            plant.jobs.roster_of(office).registry,
+            "three angles",
+            PROFILE,
+            digest_of_file(find_profile(PROFILE)),
+            CalibrationRule(),
+            BOARDS,
+            {},
+            now - timedelta(minutes=1),
+            now + timedelta(days=1),
+            {bench.fingerprint: BOARDS, office.fingerprint: 0},
+            "tap",
+            sign=office.fingerprint,
+            name="angle {unit:03}",
+        )
+        document = seal_job(drafted, office.credentials().key)
+        take_job(office, document)
+        job = take_job(bench, document)
+        step.detail = f"“{job.title}”, {job.total} boards, signed by office"
+    return LineRun(bench, job, office=_AtHand(office))
+
+
+def _build(demo: Demo, line: LineRun, uuid: bytes) -> int:
+    """Provision one board of the job; its unit."""
+    with meet(line.station, demo.over("nfc"), uuid, Silent()) as node:
+        done: Provisioned = provision(
+            line.station, node, line.order, accept=lambda who: None, reporter=Silent(), line=line
+        )
+    require_authentic(done.verified)
+    return int(line.told(uuid)["unit"])
+
+
+def _tamper(folder: Path) -> None:
+    """Change a digit of a TEDS where it lies in the flash of a virtual node, past its station and its key."""
+    file = folder / "flash.json"
+    told = json.loads(file.read_text(encoding="utf-8"))
+    blocks = told["flash"]["blocks"]
+    place = next(at for at, (channel, code, _) in enumerate(blocks) if (channel, code) == (0, 12))
+    channel, code, teds = blocks[place]
+    blocks[place] = [channel, code, teds[:-6] + ("0" if teds[-6] != "0" else "1") + teds[-5:]]
+    file.write_text(json.dumps(told), encoding="utf-8")
+
+
+def _proof(demo: Demo, office: Station, bench: Station) -> Totals:
+    """Export the evidence of both stations, and check it with nothing but files."""
+    totals = Totals()
+    demo.say("The evidence of both, checked with nothing but files and the CA key.")
+    with demo.steps.step("evidence") as step:
+        for station in (bench, office):
+            rows = station.plant.line.evidence()
+            for path in export(station.plant.line, rows, demo.folder / "evidence" / station.name):
+                totals.add(judge_file(Grounds(office.ca, roster=plant.jobs.roster_of(office)), path))
+        if totals.exit_code:
+            raise LinkFailure(f"The demo's evidence does not hold: {totals.words}")
+        step.detail = f"{totals.files} files hold: " + ", ".join(f"{n} {word}" for word, n in totals.words.items())
+    return totals

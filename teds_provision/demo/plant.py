@@ -1,0 +1,210 @@
+"""Three stations of one owner and their registry: from the roster to a stolen station whose datasheet is refused.
+
+The registry is a PostgreSQL of the demo's own where Debian's server is installed, else a folder. Stations, database and
+a virtual board (a process of its own, on a CAN bus over multicast) are gone at the end.
+"""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision import plant, vault
+from teds_provision.demo import cluster
+from teds_provision.demo.story import PROFILE, Demo, _node, provision_over
+from teds_provision.errors import NotAuthentic
+from teds_provision.handover import trust
+from teds_provision.links.ports import free_port
+from teds_provision.plant.post import Post
+from teds_provision.protocol.plant.document import open_request
+from teds_provision.protocol.plant.roster import Role, Roster, Share
+from teds_provision.station.station import Station, initialise
+from teds_provision.steps.agree import session_if_keyed
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.identify import identify
+from teds_provision.steps.read import read_image
+from teds_provision.steps.verify_node import verify_node
+from teds_provision.talk.meeting import meet
+from teds_provision.talk.progress import Reporter, StepResult
+
+_DATABASE: Final = "plant"
+_ROLES: Final[dict[str, frozenset[Role]]] = {
+    "west": frozenset({"line", "sign"}),
+    "south": frozenset({"base"}),
+}
+
+
+@dataclass(frozen=True)
+class PlantDone:
+    """The steps, by what the stations met (``postgresql`` or ``files``), and the verdict before and after the theft."""
+
+    steps: tuple[StepResult, ...]
+    by: str
+    before: str
+    after: str
+    seconds: float
+
+
+def run_plant_demo(reporter: Reporter, say: Callable[[str], None], *, files: bool = False) -> PlantDone:
+    """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
+    folder = Path(tempfile.mkdtemp(prefix="teds-provision-plant-"))
+    folder.chmod(0o755)  # the server runs as another user
+    try:
+        demo = Demo(folder, reporter, say)
+        with demo.stack:
+            return _Story(demo, files).run()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class _Story:
+    """The demo's stations and what carries between them."""
+
+    def __init__(self, demo: Demo, files: bool) -> None:
+        self.demo = demo
+        self.bin = None if files else cluster.programs()
+        self.stations: dict[str, Station] = {}
+        self.server: cluster.Cluster | None = None
+        self.places = demo.folder / "homes"
+        self.places.mkdir(mode=0o700)
+        self.secret = secrets.token_hex(16)
+
+    def run(self) -> PlantDone:
+        demo, began = self.demo, time.monotonic()
+        if self.bin is None:
+            demo.say("No PostgreSQL 15 is installed here, so the stations meet in a folder, as by a stick.")
+        else:
+            demo.say("A PostgreSQL of the demo's own: TLS, its own port; nothing of the system's is touched.")
+            with demo.steps.step("start database") as step:
+                made = cluster.running(demo.folder / "postgresql", free_port(), self.bin)
+                self.server = demo.stack.enter_context(made)
+                step.detail = f"port {self.server.port}, as user {cluster.runs_as()}"
+        demo.say("Station north has the owner's CA key and makes the roster; west and south ask to be members.")
+        self._found()
+        demo.say("West, on the line, provisions a board; its key is shared with south, which never met the board.")
+        demo.uuid = demo.stack.enter_context(_node(demo, "board", PROFILE))
+        provision_over(demo, self["west"], "can", demo.uuid, BuildOrder(PROFILE, name="joint 1"))
+        self._sync("west", "south", "west")
+        before = self._verdict("verify")
+        demo.say(
+            "West is stolen. North removes it; what it signed before stays, what it signs from now on does not count."
+        )
+        self._stolen()
+        with demo.steps.step("thief") as step:
+            provision_over(demo, self["west"], "can", demo.uuid, BuildOrder(PROFILE, name="joint 1, forged"))
+            step.detail = "who has west's key has signed and written another datasheet"
+        after = self._verdict("verify")
+        if (before, after) != ("authentic", "not authentic"):
+            raise NotAuthentic(f"South found the board {before} before the theft and {after} after it.")
+        by = "files" if self.server is None else "postgresql"
+        return PlantDone(tuple(demo.steps.done), by, before, after, time.monotonic() - began)
+
+    def __getitem__(self, name: str) -> Station:
+        return self.stations[name]
+
+    # -- parts -------------------------------------------------------------------------------------------------------
+
+    def _found(self) -> None:
+        demo = self.demo
+        with demo.steps.step("init") as step:
+            north, _ = initialise(
+                self.places / "north", name="north", keystore="file", ask=self._ask, costs=vault.passphrase.THROWAWAY
+            )
+            self._keep("north", north)
+            for name in _ROLES:
+                request = trust.ask_for_certificate(self.places / name, name=name, keystore="file", ask=self._ask)
+                certificate = trust.sign_request(north, trust.read_request(request))
+                self._keep(name, trust.adopt_certificate(self.places / name, certificate, ask=self._ask))
+            step.detail = "north, west, south, under one CA"
+        with demo.steps.step("registry create") as step:
+            roster, _ = plant.owner.create(north, "demo plant")
+            step.detail = f"registry {roster.registry[:8]}, north is keeper, sign, line, base"
+        if self.server is not None:
+            with demo.steps.step("registry sql") as step:
+                self.server.psql(f"create database {_DATABASE}")
+                self.server.psql(plant.schema.registry_sql(roster.registry), _DATABASE)
+                step.detail = "the schema, by the database's superuser"
+        self._login(north)
+        for name, roles in _ROLES.items():
+            with demo.steps.step("registry add") as step:
+                self._change(plant.owner.add(north, self._login(self[name]), roles))
+                step.detail = f"{name} as {' '.join(sorted(roles))}"
+        with demo.steps.step("registry share") as step:
+            self._change(plant.owner.shared(north, Share(("all", ""), (self["south"].fingerprint,))))
+            step.detail = "every key goes to south by itself"
+        for name in ("north", *_ROLES):
+            with demo.steps.step("registry connect") as step:
+                self._sync("north", tell=False)
+                station = self[name]
+                post = self._post(station)
+                found = plant.membership.found_roster(station, post, None)
+                post.close()
+                plant.owner.join(station, found, url=None, told=list(plant.past.past(station)))
+                step.detail = f"{name}, roster {found.version}"
+
+    def _stolen(self) -> None:
+        north, west = self["north"], self["west"]
+        self._sync("north")
+        with self.demo.steps.step("registry remove") as step:
+            last = plant.status.page_list(north, west.fingerprint)[0][0]
+            self._change(plant.owner.without(north, "west", "stolen", last))
+            if self.server is not None:
+                self.server.psql(plant.schema.close_sql(west.fingerprint), _DATABASE)
+            step.detail = f"west, stolen; its pages count up to {last}"
+        self._sync("north", "south")
+
+    def _verdict(self, what: str) -> str:
+        demo, south = self.demo, self["south"]
+        with demo.steps.step(what) as step:
+            with meet(south, demo.over("can"), demo.uuid, demo.reporter) as node:
+                who = identify(south, node)
+                session_if_keyed(south, node)
+                verified = verify_node(south, node, read_image(node), who.point).verified
+            wrong = next((check.why for check in verified.checks if check.result == "failed"), "")
+            step.detail = f"south finds it {verified.verdict}{f': {wrong}' if wrong else ''}"
+        return verified.verdict
+
+    def _sync(self, *names: str, tell: bool = True) -> None:
+        for name in names:
+            post = self._post(self[name])
+            try:
+                if not tell:
+                    plant.sync.sync(self[name], post)
+                    continue
+                with self.demo.steps.step("registry sync") as step:
+                    done = plant.sync.sync(self[name], post)
+                    parcels = f", {done.parcels_out} parcels out, {done.parcels_in} in"
+                    moved = parcels if done.parcels_in or done.parcels_out else ""
+                    step.detail = f"{name}: {done.pushed} pages out, {done.fetched} in{moved}"
+            finally:
+                post.close()
+
+    def _post(self, station: Station) -> Post:
+        if self.server is None:
+            folder = self.demo.folder / "stick"
+            folder.mkdir(exist_ok=True)
+            return plant.files.FilesPost(folder)
+        return plant.reaching.database(station, self.server.url(_DATABASE))
+
+    def _login(self, station: Station) -> Any:
+        """The station's request, and at the database its login."""
+        asked = open_request(plant.membership.request(station))
+        if self.server is not None:
+            self.server.psql(plant.schema.member_sql(asked.fingerprint, asked.login), _DATABASE)
+        return asked
+
+    def _change(self, draft: Roster) -> None:
+        plant.folding.put_roster(self["north"], plant.owner.signed(self["north"], draft))
+
+    def _keep(self, name: str, station: Station) -> None:
+        self.stations[name] = station
+        self.demo.stack.callback(station.close)
+
+    def _ask(self, prompt: str, confirm: bool) -> str:
+        return self.secret

@@ -1,0 +1,53 @@
+"""What the doctor looks at in the plant: the registry that this station joined. No connection is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from importlib.util import find_spec
+
+from teds_provision.doctor.registry import Finding, System, check
+from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
+from teds_provision.store import Store
+from teds_provision.store.database import has_store
+
+_SYNC = "teds-provision registry sync"
+_LATE = timedelta(days=7)
+
+
+@check("registry", "store")
+def registry(system: System) -> Iterator[Finding]:
+    """Roster, last sync, what waits and what is to be decided; nothing for a station that joined none."""
+    if not has_store(system.home):
+        return
+    with Store.open(system.home) as store:
+        record, row, facts = store.plant(), store.held_roster(), store.facts()
+        if record is None or record.left is not None or row is None or facts is None or facts.ca is None:
+            return
+        now, roster = datetime.now(UTC), open_roster(row.octets, facts.ca)
+        yield _roster(roster, now)
+        if record.url is not None and record.url.startswith("postgres") and find_spec("psycopg") is None:
+            yield Finding("registry", "failed", "psycopg is missing.", "pip install 'teds-provision[registry]'")
+        synced = datetime.fromisoformat(record.synced) if record.synced is not None else None
+        if synced is None or now - synced > _LATE:
+            yield Finding("registry", "warning", f"The last sync was {record.synced or 'never'}.", _SYNC)
+        newest = max((created for _, created in store.page_newest()), default="")
+        if newest and now + timedelta(minutes=5) < datetime.fromisoformat(newest):
+            why = f"The clock is behind the newest page ({newest})."
+            yield Finding("registry", "warning", why, "Set the clock of this machine.")
+        alarms = [one for one in store.alarms() if not one.seen]
+        for one in alarms:
+            yield Finding("registry", "warning", f"Alarm {one.code}: {one.why}.", "teds-provision registry status")
+        conflicts = len({uuid for uuid, _, _ in store.conflicts()})
+        said = f"{store.unsent()} events unsent, {conflicts} conflicts."
+        fix = "teds-provision registry status" if conflicts else ""
+        yield Finding("registry", "warning" if conflicts else "ok", said, fix)
+
+
+def _roster(roster: Roster, now: datetime) -> Finding:
+    until = f"{roster.name}: roster {roster.version} holds until {roster.expires:%Y-%m-%d}."
+    if now >= roster.expires:
+        return Finding("registry", "failed", f"{until} It has expired.", "Where the CA key is: registry renew")
+    if now >= roster.expires - WARN_BEFORE:
+        return Finding("registry", "warning", until, "Where the CA key is: teds-provision registry renew")
+    return Finding("registry", "ok", until)

@@ -1,0 +1,66 @@
+"""A node is looked for where it was met last, if nobody says where; the program alone says what is there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.places import free_bus
+
+from .desk import ANGLE, Desk, Node, Station
+
+pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
+
+
+def alone(station: Station) -> Any:
+    """What ``teds-provision`` without a command says."""
+    return station.ask()
+
+
+def test_a_node_is_found_where_it_was_met_last_and_the_program_alone_says_who_is_there(
+    desk: Desk, station: Station, node: Node
+) -> None:
+    node.start(nfc=False, can=True)
+    at = f"can:{desk.links.can}"
+    said = alone(station)
+    assert (said["station"]["name"], said["links"], said["nodes"]) == ("bench", [], [])
+    assert "config set can" in said["next"]
+    station.ask("config", "set", "can", desk.links.can)
+    said = alone(station)
+    assert [(one["uuid"], one["link"], one["whitelisted"]) for one in said["nodes"]] == [(node.uuid, at, False)]
+    assert said["next"].startswith("teds-provision identify --add")
+    station.ask("config", "unset", "can")
+    station.provision("can", "--profile", ANGLE, "--name", "arm")
+    said = alone(station)
+    assert [(one["name"], one["verdict"]) for one in said["nodes"]] == [("arm", "authentic")], "by its last bus"
+    assert said["next"] == "teds-provision measure arm"
+    assert station.ask("verify", "arm")["verdict"] == "authentic", "no link is named"
+    # the bus that somebody names goes before the one that is remembered, and is remembered from then on
+    node.stop()
+    desk.links = type(desk.links)(desk.links.nfc, free_bus())
+    node.start(nfc=False, can=True)
+    refused = station.refuses("verify", "arm", "--timeout", "2", code=5)
+    assert f"did not answer on {at.removeprefix('can:')} within 2 s" in refused["message"]
+    assert station.ask("verify", "arm", "--can", desk.links.can)["verdict"] == "authentic", "without --via can"
+    assert station.ask("verify", "arm")["verdict"] == "authentic"
+
+
+def test_a_remembered_bus_keeps_nobody_from_a_tap(desk: Desk, station: Station, node: Node) -> None:
+    node.start(nfc=False, can=True)
+    station.provision("can", "--profile", ANGLE)
+    node.stop()
+    node.start()  # it lies on the reader now, and hangs on no bus
+    said = station.refuses("verify", node.uuid, "--nfc", desk.links.nfc, "--can", free_bus(), "--via", "can",
+                           "--timeout", "0.5", code=5)  # fmt: skip
+    assert said["code"] == "no-node"
+    assert station.ask("verify", node.uuid, "--nfc", desk.links.nfc)["verdict"] == "authentic", "a reader is named"
+    agreed = station.refuses("agree", node.uuid, "--timeout", "1", code=5)
+    assert "reader" in agreed["message"], "a key is agreed on by a tap unless a bus is named"
+
+
+def test_an_empty_bus_is_told_with_the_time_that_was_listened(station: Station) -> None:
+    bus = free_bus()
+    said = station.run("identify", "--can", bus, "--timeout", "1.5")
+    assert f"No node answered on {bus.partition(chr(63))[0]} within 1.5 s" in said.err
+    assert "up to 0 s" not in said.err
