@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults model house man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -34,7 +34,7 @@ types: $(VENV)/.dev
 # One more than cores: almost half of the time that a test takes is waiting for a node, a reader, a lock.
 # What holds a rule about time then runs alone.
 WORKERS ?= 3
-USUAL := not soak and not machine
+USUAL := not soak and not machine and not rclpy
 unit: $(VENV)/.dev
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -rs --hypothesis-profile gate -m '$(USUAL) and not realtime'
 	$(BIN)/python -m pytest -rsR -m '$(USUAL) and realtime'
@@ -49,7 +49,7 @@ QUICK := $(wildcard tests/test_[!m]*.py) tests/teds tests/protocol tests/store t
   'tests/e2e/test_whole_runs.py::test_a_tapped_node_is_provisioned_and_a_second_run_finds_nothing_to_do[4]'
 quick: $(VENV)/.dev
 	@$(BIN)/ruff check --quiet .
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow and not soak and not machine' --hypothesis-profile quick $(QUICK)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow and $(USUAL)' --hypothesis-profile quick $(QUICK)
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.provisioning
@@ -59,6 +59,7 @@ bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.teds_codec --images 0
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.radio
+	$(BIN)/python -m benchmarks.plant
 
 bench-teds: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.teds_codec
@@ -75,6 +76,10 @@ bench-measure: $(VENV)/.dev
 SECONDS ?= 20
 bench-ncap: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.ncap --seconds $(SECONDS)
+	$(BIN)/python -m benchmarks.newcomers
+
+bench-page: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.page --seconds $(SECONDS)
 
 bench-handover: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.handover
@@ -86,6 +91,17 @@ bench-scale: $(VENV)/.dev
 test-system: $(VENV)/.dev
 	@sh scripts/install-test-machine || { test -z "$$CI" && echo "Going on without: the tests are skipped."; }
 	$(BIN)/python -m pytest tests/system -m machine -rs --durations=5
+
+# ROS 2 by the real rclpy of PyPI: 251 MB, in an environment of their own.
+ROS_PYTHON ?= $(PYTHON)
+RCLPY := ros-jazzy-rclpy[fastrtps] ros-jazzy-std-msgs ros-jazzy-sensor-msgs ros-jazzy-geometry-msgs ros-jazzy-diagnostic-msgs
+test-rclpy: $(VENV)/.dev .venv-rclpy/.made
+	$(BIN)/python -m pytest tests/measure -m rclpy -rs
+
+.venv-rclpy/.made:
+	$(ROS_PYTHON) -m venv .venv-rclpy
+	.venv-rclpy/bin/python -m pip install --quiet $(foreach each,$(RCLPY),'$(each)')
+	@touch $@
 
 # Coverage-guided fuzzing of every parser of octets: RUNS inputs each (a million take about an hour and a half on one
 # core), or one of them: make fuzz TARGET=nfc RUNS=100000. atheris gets an environment of its own.
@@ -100,6 +116,7 @@ fuzz: .venv-fuzz/.ready
 # backups of 100,000 nodes; an hour and a half, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
+	$(BIN)/pytest -q -m "soak or not soak" tests/plant/test_cut.py
 
 # A service on bad days: its clock set, its disk filled, an adapter pulled, 10,000 invented nodes, in rounds.
 MINUTES ?= 30
@@ -180,10 +197,21 @@ firmware: vectors-c
 	@sh scripts/install-test-packages
 	$(MAKE) --no-print-directory -C firmware all check
 
-# The same for Cortex-M0+ and M4: sizes, stack, instructions held; the M4 image under qemu is checked as a node.
-firmware-arm: $(VENV)/.dev
+# Every test of whole runs whose needs the node in C meets, with it on the desk (tests/firmware/c_node.py).
+OF_C := tests/e2e tests/cli/test_handover.py tests/cli/test_life.py tests/cli/test_messages.py tests/check/test_node_check_cli.py
+test-c: $(VENV)/.dev
+	@sh scripts/install-test-packages
+	TEDS_NODE=c $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -rs -m '$(USUAL) and not realtime' $(OF_C)
+
+# 10 kHz of 16 bits for ten minutes on CAN FD and on 1 Mbit/s, and 200 nodes in C on one bus. Wants a machine for itself.
+firmware-soak: $(VENV)/.dev
+	SECONDS_OF_SOAK=$${SECONDS_OF_SOAK:-600} $(BIN)/python -m pytest tests/firmware/test_soak.py -m soak -s -rs
+
+# The library on Cortex-M0+, M4 and M33: sizes, stack, instructions held; the M4 image under qemu is checked as a node.
+# The C tests as 32 bits and big-endian, too, and what cppcheck and clang-tidy say.
+firmware-arm: $(VENV)/.dev vectors-c
 	@sh scripts/install-firmware-packages
-	$(MAKE) --no-print-directory -C firmware arm
+	$(MAKE) --no-print-directory -C firmware arm others analyse
 	$(BIN)/python -m pytest tests/firmware/test_arm.py -m machine -rs
 
 # What is in an installation, as a CycloneDX bill of materials.

@@ -1,9 +1,9 @@
 """What a user waits for: the shipped commands as processes of their own, from start to verdict.
 
-``python -m benchmarks.commands [--only WORD] [--nodes 200]``: start-up, one ``provision`` warm and cold (nothing
-compiled yet), ``--watch`` with boards that change at once, eight readers, a whole bus. Passphrase and Argon2id as
-shipped, but where many run side by side. Slow nodes take 80 ms for every point operation; beside them stands the floor,
-operations counted × 80 ms.
+``python -m benchmarks.commands [--only WORD] [--nodes 200]``: start-up, what a command costs that is neither link nor
+node nor Argon2id, one ``provision`` warm and cold (nothing compiled yet), ``--watch`` with boards that change at once,
+eight readers, a whole bus. Passphrase and Argon2id as shipped, but where many run side by side. Slow nodes take 80 ms
+for every point operation; beside them stands the floor, operations counted × 80 ms.
 """
 
 from __future__ import annotations
@@ -17,18 +17,21 @@ import subprocess
 import sys
 import tempfile
 import time
+import timeit
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import teds_provision
+from benchmarks.machine import line as machine
 from benchmarks.provisioning import PROFILE, SLOW, next_node, next_nodes, nodes
 from teds_provision.links.ports import free_port
 from teds_provision.station.station import initialise
 from teds_provision.vault import forget_vaults
-from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.passphrase import PRODUCT, THROWAWAY, SealingKey
 
 PASSPHRASE = "correct horse battery"
+ANGLE = "magnetic-angular-position-sensor"
 PROVISION = ("provision", "--profile", PROFILE, "--yes")
 READERS = 8
 _WAIT = 120.0
@@ -103,6 +106,46 @@ def start_up(rows: Rows) -> None:
         rows.tell(f"{name} against it", median(sys.executable, "-m", "teds_provision", name) / floor, "×", aim=1.4)
 
 
+def timed(home: Path, *words: str) -> float:
+    """Seconds of a command that has to succeed."""
+    began = time.perf_counter()
+    finished(started(home, *words))
+    return time.perf_counter() - began
+
+
+def fixed_cost(rows: Rows) -> None:
+    """What a command costs from its start to its verdict beside link, node and Argon2id, least of seven.
+
+    Links are not paced, so a board of ``--watch`` takes what link and node take, and the 10 ms that are ours between
+    the exchanges. ``provision`` over CAN is given the UUID: without it, the contract has it listen 0.3 s for a second
+    node.
+    """
+    stretched = min(timeit.repeat(lambda: SealingKey.derive(PASSPHRASE, costs=PRODUCT), number=1, repeat=7))
+    rows.tell("Argon2id alone", stretched, "s")
+    with station() as home:
+        rows.tell("nodes, of a new station", min(timed(home, "nodes") for _ in range(7)), "s", aim=0.25)
+    for via, link in (
+        ("nfc", f"udp:127.0.0.1:{free_port()}"),
+        ("can", f"udp_multicast:239.74.163.9?port={free_port()}"),
+    ):
+        where = ("--via", via, f"--{via}", link)
+        with station() as home, nodes(via, link) as boards:
+            whole, verify = [], []
+            for _ in range(7):
+                uuid = next_node(boards)[0].hex()
+                time.sleep(0.7)
+                named = (uuid,) if via == "can" else ()
+                whole.append(timed(home, *PROVISION, *named, *where))
+                verify.append(timed(home, "verify", uuid, *where))
+            watch = started(home, *PROVISION, "--watch", *where)
+            board, _ = _changed_at_once(boards, watch, 7)
+            watch.terminate()
+            watch.communicate(timeout=_WAIT)
+        rows.tell(f"provision over {via}, from start to verdict", min(whole), "s")
+        rows.tell("  of it neither link, node nor Argon2id", min(whole) - board - stretched, "s", aim=0.35)
+        rows.tell(f"verify UUID over {via}, without Argon2id", min(verify) - stretched, "s", aim=0.35)
+
+
 def one_command(rows: Rows) -> None:
     """``provision`` from start to verdict, Argon2id and all."""
     for via, link, extra in (
@@ -125,6 +168,32 @@ def one_command(rows: Rows) -> None:
                 _, before = next_node(process)
                 if slow:
                     rows.tell(f"  of it {before.operations} point operations", before.operations * slow, "s")
+
+
+def zeroing(rows: Rows) -> None:
+    """``calibrate zero`` over CAN at 500 kbit/s, from start to verdict: read, signed, written, verified, read again."""
+    bus = f"udp_multicast:239.74.163.9?port={free_port()}&pace=1"
+    for slow in (0.0, SLOW):
+        delay = ("--crypto-delay", str(slow * 1000)) if slow else ()
+        with station() as home, tempfile.TemporaryDirectory() as folder:
+            still, curve = Path(folder) / "still.csv", Path(folder) / "curve.csv"
+            still.write_text("t,angle\n0,45\n100000,45\n")
+            curve.write_text("# date: 2026-10-01\nraw,value [degree]\n0,0\n65536,360\n")
+            made = str(Path(folder) / "node")
+            finished(started(home, "node", "create", made, "--profile", ANGLE, "--name", "joint"))
+            node = started(home, "node", "run", made, "--can", bus, "--source", f"file:{still}", *delay)
+            try:
+                assert node.stdout is not None
+                node.stdout.readline()
+                over = ("--via", "can", "--can", bus)
+                finished(started(home, "provision", "--profile", ANGLE, "--calibration", str(curve), "--yes", *over))
+                words = ("calibrate", "zero", "joint", "1", "--unit", "degree", "--value")
+                taken = [timed(home, *words, str(10 * number), *over) for number in range(1, 6)]
+            finally:
+                node.terminate()
+                node.communicate(timeout=_WAIT)
+        kind = "80 ms node" if slow else "immediate node"
+        rows.tell(f"calibrate zero over CAN, paced, {kind}", statistics.median(taken), "s", aim=None if slow else 3.0)
 
 
 def watching(rows: Rows) -> None:
@@ -232,13 +301,13 @@ def whole_bus(rows: Rows, count: int) -> None:
 
 def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", default="", help="start_up, one_command, watching, eight_readers or whole_bus")
+    parser.add_argument("--only", default="", help="one part, such as fixed_cost or whole_bus")
     parser.add_argument("--nodes", type=int, default=200, help="nodes of the whole bus")
     options = parser.parse_args(words)
     # as an installer leaves it: PYTHONDONTWRITEBYTECODE, here or there, would have each process compile what it loads
     compileall.compile_dir(Path(teds_provision.__file__).parent, quiet=2)
     rows = Rows()
-    for part in (start_up, one_command, watching, eight_readers):
+    for part in (start_up, fixed_cost, one_command, zeroing, watching, eight_readers):
         if options.only in ("", part.__name__):
             part(rows)
     if options.only in ("", "whole_bus"):
@@ -246,5 +315,5 @@ def main(words: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    print(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    print(machine())
     main()

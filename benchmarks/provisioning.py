@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks import limits
+from benchmarks.machine import line as machine
 from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, open_port
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.announce import default_can_address
@@ -342,5 +343,5 @@ def main(words: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    print(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    print(machine())
     main()

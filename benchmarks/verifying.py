@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import compileall
 import os
-import re
 import resource
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import time
 from pathlib import Path
 
 import teds_provision
+from benchmarks.machine import checks_a_second
 from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message
 from teds_provision.station.station import initialise
@@ -63,23 +63,6 @@ def ours(folder: Path, home: Path) -> tuple[float, float, str]:
 def _used() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-def checks_a_second(cores: int) -> float:
-    """Checks of a P-256 signature that openssl makes here and now, in a second of the processor, on so many at once."""
-    words = ["openssl", "speed", "-seconds", "2", "ecdsap256"]
-    speeds = [
-        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for _ in range(cores)
-    ]
-    return sum(_checks(speed.communicate()[0]) for speed in speeds)
-
-
-def _checks(told: str) -> float:
-    """Checks a second, the last number of what ``openssl speed`` tells."""
-    found = re.search(r"nistp256\).*\s(\d+\.\d)\s*$", told, re.MULTILINE)
-    if found is None:
-        raise SystemExit(f"openssl said something else:\n{told}")
-    return float(found[1])
 
 
 def main(count: int) -> None:

@@ -1,0 +1,158 @@
+"""A line's figures: evidence beside the bare signature checks, signatures of an office a second, boards an hour.
+
+Run: ``python -m benchmarks.line [FILES]`` (default 10,000; about two minutes). Evidence is checked by the shipped
+command on all cores, from its start to its last line; theirs is what ``openssl speed ecdsap256`` says of this machine
+now, times four (envelope, fields 100 and 102, the board's proof). The office answers requests that are signed and
+proven by as many boards, in memory and on one core: build, guard, compare, sign, durable. A line builds boards in
+memory with and without a job and evidence, in turn.
+"""
+
+from __future__ import annotations
+
+import compileall
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import teds_provision
+from benchmarks.machine import checks_a_second
+from teds_provision.plant.jobs import take_job
+from teds_provision.plant.line import LineRun
+from teds_provision.plant.office import answer
+from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message, to_pem
+from teds_provision.protocol.plant.evidence import Claim, seal
+from teds_provision.protocol.plant.signing import SignRequest, challenge, seal_request
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.provision import provision
+from teds_provision.talk.progress import Silent
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from tests.bench import Board, talk
+from tests.plant.owner import ANGLE, NOW, alone, job_of
+from tests.plant.proofs import facts_of
+
+CHECKS = 4
+FINISHED = "2026-03-01T11:31:00Z"
+AIM, OFFICE_AIM, LINE_AIM = 1.5, 50.0, 0.9
+REQUESTS, BOARDS = 200, 40
+
+
+def evidence(folder: Path, count: int) -> Path:
+    """So many documents, each of a board with a key of its own; the CA's key beside them."""
+    owner = alone(folder / "home")
+    owner.unlock()
+    credentials, profile = owner.credentials(), load_profile(ANGLE)
+    (folder / "files").mkdir()
+    from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
+
+    for number in range(count):
+        key, uuid = SoftwareKey.generate(), (1 + number).to_bytes(10, "big")
+        keys = NodeKeys(uuid, key.point, key.sign(node_key_message(uuid, key.point)))
+        listed = digests(profile.build(uuid).blocks)
+        unsigned = unsigned_datasheet(
+            keys, owner.point, owner.identity.signature, listed, ca="ca:0", sequence=1, key_epoch=1
+        )
+        teds = sign_datasheet(unsigned, uuid, credentials)
+        claim = Claim(uuid, teds, facts_of(owner, teds))
+        nonce = os.urandom(16)
+        proof = key.sign(prove_message(uuid, claim.challenge(nonce)))
+        document = seal(
+            credentials.key,
+            credentials.station_signature,
+            claim,
+            nonce=nonce,
+            proof=proof,
+            finished="2026-03-01T11:31:00Z",
+        )
+        (folder / "files" / f"{uuid.hex()}.1.json").write_bytes(document)
+    (folder / "ca.pem").write_text(to_pem(owner.identity.ca))
+    owner.close()
+    return folder / "files"
+
+
+def verify_all(files: Path, ca: Path) -> tuple[float, float, str]:
+    """Seconds on the wall and of the processor, and the last line."""
+    command = [sys.executable, "-m", "teds_provision", "-q", "evidence", "verify", str(files), "--ca", str(ca)]
+    before, began = _used(), time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return time.perf_counter() - began, _used() - before, (done.stdout.splitlines() or [done.stderr])[-1]
+
+
+def _used() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def office(folder: Path, count: int) -> tuple[float, float]:
+    """Signatures a second of an office, on the wall and of the processor."""
+    owner = alone(folder / "office")
+    owner.unlock()
+    own = owner.identity.fingerprint
+    job = take_job(owner, job_of(owner, count=count, stations={own: count}, sign=own))
+    key, profile, asked = owner.credentials().key, load_profile(ANGLE), []
+    for number in range(count):
+        node, uuid = SoftwareKey.generate(), (1 + number).to_bytes(10, "big")
+        blocks = profile.build(uuid).blocks
+        nonce = os.urandom(16)
+        proof = node.sign(prove_message(uuid, challenge(nonce, owner.point, uuid, 1, 0, blocks)))
+        signed = node.sign(node_key_message(uuid, node.point))
+        id = f"{number:08x}-2222-4333-8444-555555555555"
+        request = SignRequest(
+            id, own, NOW, job.id, Image(uuid, blocks), 1, 0, None, None, node.point, signed, nonce, proof
+        )
+        asked.append(seal_request(request, key))
+    answer(owner, asked[0])
+    began, used = time.perf_counter(), time.process_time()
+    for octets in asked[1:]:
+        assert answer(owner, octets) is not None
+    wall, cpu = time.perf_counter() - began, time.process_time() - used
+    owner.close()
+    return (count - 1) / wall, (count - 1) / cpu
+
+
+def boards(folder: Path, count: int) -> tuple[float, float]:
+    """Processor seconds of a board without a line, and with a job and evidence; in turn, in one store each."""
+    plain, line = alone(folder / "plain"), alone(folder / "line")
+    plain.unlock()
+    line.unlock()
+    own = line.identity.fingerprint
+    run = LineRun(line, take_job(line, job_of(line, count=count, stations={own: count})))
+    spent = [0.0, 0.0]
+    for number in range(count):
+        for place, (station, order, hook) in enumerate(((plain, BuildOrder(ANGLE), None), (line, run.order, run))):
+            board = Board(uuid=(1 + number).to_bytes(10, "big"))
+            used = time.process_time()
+            with talk(board) as node:
+                provision(station, node, order, accept=lambda who: None, reporter=Silent(), line=hook)
+            spent[place] += time.process_time() - used
+    plain.close()
+    line.close()
+    return spent[0] / count, spent[1] / count
+
+
+def main(count: int) -> None:
+    """Make, measure, print."""
+    compileall.compile_dir(Path(teds_provision.__file__).parent, quiet=2)
+    cores = len(os.sched_getaffinity(0))
+    with tempfile.TemporaryDirectory() as name:
+        files = evidence(Path(name), count)
+        runs = [verify_all(files, Path(name, "ca.pem")) for _ in range(3)]
+        wall, cpu, last = min(runs)
+        floor, alone_floor = CHECKS * count / checks_a_second(cores), CHECKS * count / checks_a_second(1)
+        print(f"{last}  {wall:.2f} s, {cpu:.2f} s of the processor; load {os.getloadavg()[0]:.1f}")
+        print(f"  {CHECKS} bare checks a file on {cores} cores {floor:.2f} s: {wall / floor:.2f} ×, aim {AIM} ×")
+        print(f"  by processor time {cpu / alone_floor:.2f} ×")
+        a_second, by_processor = office(Path(name), REQUESTS)
+        print(f"office: {a_second:.0f} signatures/s, {by_processor:.0f} by processor time; aim {OFFICE_AIM:.0f}")
+        without, with_line = boards(Path(name), BOARDS)
+        ratio = without / with_line
+        print(f"a board: {1000 * without:.1f} ms without, {1000 * with_line:.1f} ms with job and evidence, both ends")
+        print(f"  of the boards an hour without, where the processor is what bounds: {ratio:.2f}; aim {LINE_AIM}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10_000)
