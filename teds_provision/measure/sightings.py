@@ -179,10 +179,14 @@ class Sightings:
             self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
 
     def elsewhere(self, uuid: bytes) -> bool:
-        """Whether it answers somewhere else than where it turned out not to be; waits for the answer of a twin."""
+        """Whether it answers, or ever answered, at more than one place; waits for the answer of a twin.
+
+        A place that was wrong counts: the node itself may have been silent there for a moment, which is when whoever
+        says that he is it comes into question, and refuses.
+        """
 
         def other() -> bool:
-            return bool(self._seen.get(uuid, {}).keys() - self._wrong.get(uuid, {}).keys())
+            return len(self._seen.get(uuid, {}).keys() | self._wrong.get(uuid, {}).keys()) > 1
 
         with self._turn:
             return self._turn.wait_for(other, TWIN)

@@ -140,6 +140,15 @@ def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhe
     assert Patience(0.0).gives_up(NodeRefused("busy", reason=17), proven=True, elsewhere=look)
 
 
+def test_a_copy_that_refuses_while_the_node_is_silent_for_a_moment_is_no_reason_either() -> None:
+    sightings, unknown = Sightings(), PolicyRefused("It knows none of the keys.")
+    for silent_then_copy in (8, 7):
+        sightings.saw(seen(ONE, silent_then_copy))
+        sightings.wrong(seen(ONE, silent_then_copy))
+    look = functools.partial(sightings.elsewhere, ONE)
+    assert not Patience(60.0).gives_up(unknown, proven=False, elsewhere=look)
+
+
 def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
     sightings = Sightings()
     announced = seen(TWO, 8)
