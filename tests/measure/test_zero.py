@@ -231,8 +231,9 @@ def test_a_running_ncap_lets_the_node_go_and_measures_it_by_its_new_zero(hall: H
             until(lambda: (value := last()) is not None and min(value, TURN - value) < 1e-5)
         assert service.process is not None
         service.process.wait_for("let go for calibrate zero")
+        service.end()
     finally:
-        service.kill()
+        service.kill()  # where it failed; a claim of what was killed would last until its lease ends
 
 
 def test_while_somebody_else_measures_it_nothing_is_signed(hall: Hall, angle: Shaft) -> None:
