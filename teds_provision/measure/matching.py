@@ -16,6 +16,7 @@ from fnmatch import fnmatchcase
 from teds_provision.errors import BadData, PolicyRefused, UsageFailure
 from teds_provision.measure.planning import BusTime, plan_node, sensors_of
 from teds_provision.measure.request import MeasurementRequest
+from teds_provision.measure.sinks.base import ROWS
 from teds_provision.station.groups import ALL
 from teds_provision.station.station import Station
 from teds_provision.steps.reading import verdict_of
@@ -146,9 +147,9 @@ class Load:
     channels: int = 0
     rate: float = 0.0
 
-    def messages(self, scalar_rate: float) -> float:
-        """Messages a second on topics: each channel's, and two for each row of the node's array."""
-        return self.channels * min(scalar_rate, self.rate) + 2 * min(self.rate, 1000.0)
+    def messages(self, scalar_rate: float, rows: bool) -> float:
+        """Messages a second on topics: each channel's, and two for each row of the node's array where ``rows`` go."""
+        return self.channels * min(scalar_rate, self.rate) + (2 * min(self.rate, ROWS) if rows else 0)
 
 
 def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: BusTime) -> Load:

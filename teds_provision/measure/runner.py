@@ -172,7 +172,7 @@ class Measurement:
 
     def _is_news(self, sink: Sink) -> bool:
         """Whether a sink failed, waits for its consumers for long or its disk for room, or goes on again."""
-        stats, now, recorder = sink.stats, time.monotonic(), bool(getattr(sink, "recorder", False))
+        stats, now, recorder = sink.stats, time.monotonic(), sink.recorder
         state = "failed" if stats.error else str(stats.state)
         since = self._waits.setdefault(sink.name, now)
         if state != "waiting":
@@ -381,7 +381,7 @@ def _summary(keeper: NodeKeeper) -> dict[str, Any]:
 
 def _as_error(sink: Sink) -> TedsProvisionError | None:
     """What ended a sink: of a recording it is the disk (7), of one that took nothing of what came the way to it (5)."""
-    stats, recorder = sink.stats, bool(getattr(sink, "recorder", False))
+    stats, recorder = sink.stats, sink.recorder
     if stats.dropped and not stats.written and not recorder:
         why = stats.error or f"{sink.name} took nothing: all {stats.dropped} values were dropped."
         return LinkFailure(why, hint=stats.hint or "See whether it runs, and where it listens.")

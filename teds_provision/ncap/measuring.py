@@ -31,6 +31,7 @@ from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.job import Job
 from teds_provision.measure.sinks import Sink
+from teds_provision.measure.sinks.base import BUDGET
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.newcomers import Newcomers
@@ -50,8 +51,6 @@ ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
 SCALAR_RATE: Final = 10.0
 """Values a second on a topic of one value, where a measurement does not say."""
-BUDGET: Final = 5000
-"""Messages a second that ROS 1, ROS 2 and MQTT carried in measurements of this machine's class (docs/ros.md)."""
 
 
 @dataclass
@@ -533,6 +532,7 @@ class Measuring:
         try:
             unverified = one.kept.id == Unsigned.text
             job = one.job = self._new_job(one, unverified=unverified)
+            live = [sink for sink in job.sinks if not sink.recorder]
             newcomers = Newcomers(
                 self._station,
                 self._roster,
@@ -545,7 +545,8 @@ class Measuring:
                 joined=joined,
                 left=left,
                 waiting=waiting,
-                budget=BUDGET if any(sink.wants_rows for sink in job.sinks) else None,
+                budget=BUDGET if live else None,
+                rows=any(sink.wants_rows for sink in live),
             )
             one.newcomers = newcomers
         except TedsProvisionError as error:

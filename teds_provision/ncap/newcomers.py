@@ -76,7 +76,7 @@ class Newcomers:
 
     ``joined`` and ``left`` are told each node (UUID in hex), ``waiting`` each that cannot join, and why.
     ``elsewhere``: whether another measurement has a node; ``listed``: whether the whitelist alone is measured.
-    ``budget`` is how many messages a second may go to topics, None where none do.
+    ``budget`` is how many messages a second may go to topics, None where none do; ``rows``: arrays go to them too.
     """
 
     def __init__(
@@ -94,9 +94,11 @@ class Newcomers:
         left: Callable[[str], None],
         waiting: Callable[[str, str], None],
         budget: float | None,
+        rows: bool,
     ) -> None:
         self._station, self._roster, self._turns, self._buses, self._job = station, roster, turns, buses, job
         self._match, self._elsewhere, self._listed, self._budget = match, elsewhere, listed, budget
+        self._rows = rows
         self._told_joined, self._told_left, self._told_waiting = joined, left, waiting
         self.news, self._anew = threading.Event(), threading.Event()
         self._guard = threading.Lock()
@@ -251,10 +253,9 @@ class Newcomers:
         if self._budget is None:
             return ""
         rate = self._job.kept.scalar_rate
-        used = sum(one.load.messages(rate) for key, one in self._members.items() if key != uuid)
-        return (
-            f"no room in the budget of {self._budget:g} messages/s" if used + load.messages(rate) > self._budget else ""
-        )
+        used = sum(one.load.messages(rate, self._rows) for key, one in self._members.items() if key != uuid)
+        over = used + load.messages(rate, self._rows) > self._budget
+        return f"no room in the budget of {self._budget:g} messages/s" if over else ""
 
     def _join(self, uuid: str, measurement: Measurement) -> None:
         member, octets = self._members[uuid], bytes.fromhex(uuid)

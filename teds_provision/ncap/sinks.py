@@ -129,7 +129,7 @@ def sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
         "dropped": stats.dropped,
         "octets": stats.octets,
         "messages": stats.messages,
-        "recorder": bool(getattr(sink, "recorder", False)),
+        "recorder": sink.recorder,
         "files": [str(file) for file in sink.files],
     }
 

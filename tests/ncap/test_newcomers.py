@@ -13,10 +13,12 @@ import pytest
 
 from teds_provision import client
 from teds_provision.client import ApiError
+from teds_provision.links.ports import free_port
+from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk, Node
 from tests.ncap.service import Service, virtual
 from tests.pace import best_of, until
-from tests.places import free_bus
+from tests.places import free_bus, ros_domain
 
 pytestmark = pytest.mark.link
 
@@ -321,6 +323,34 @@ def test_one_that_finds_no_room_on_the_bus_waits_until_another_one_leaves(lab: L
         lab.service.end()
     finally:
         lab.service.desk.links = type(lab.desk.links)(lab.desk.links.nfc, lab.desk.links.can.partition("&")[0])
+
+
+def test_one_that_finds_no_room_in_the_budget_of_messages_waits_until_another_one_leaves(lab: Lab) -> None:
+    """1000 values and 1000 rows a second of one node are 3000 messages: two nodes are more than the 5000 of a process.
+
+    By MQTT, which carries no rows, both fit.
+    """
+    left, right = lab.nodes
+    right.kill()
+    nobody = f"mqtt://127.0.0.1:{free_port()}"
+    with ros_domain() as domain:
+        own = {**clean_environment(), "ROS_DOMAIN_ID": str(domain)}
+        lab.service.start("--mqtt", nobody, "--ros2", environment=own)
+        with lab.service.client() as asked:
+            asked.request("POST", "/measurements", {"match": "all", "rate": 1000, "scalar_rate": 1000})
+        lab.comes(left)
+        lab.power(right)
+        until(lambda: lab.states(right)[-1:] == ["waiting"], lambda: lab.told(right.uuid))
+        assert lab.told(right.uuid)[-1]["why"] == "no room in the budget of 5000 messages/s"
+        assert lab.told(left.uuid)[-1]["why"] == "", "nobody is slowed"
+        left.kill()
+        until(lambda: lab.states(right)[-1] == "joined")
+        lab.service.end()
+    lab.power(left)
+    lab.service.start("--mqtt", nobody)
+    lab.comes(left)
+    lab.comes(right)
+    lab.service.end()
 
 
 def test_frozen_measures_those_that_were_known_and_lets_none_go(lab: Lab) -> None:

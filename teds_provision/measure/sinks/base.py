@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal, Protocol
+from typing import Final, Literal, Protocol
 
 from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
 from teds_provision.measure.blocks import (
@@ -32,6 +32,8 @@ CommandTaker = Callable[[Command], None]
 
 RECORDER_WAITING = 2_000_000  # values that a recorder may owe: some 200 MB, 40 s at 50,000 values a second
 LIVE_WAITING = 256  # items that a live sink may owe: newest wins
+BUDGET: Final = 5000  # messages a second that one process carried to ROS 1, ROS 2 or MQTT (docs/ros.md)
+ROWS: Final = 1000  # rows a second of an array on a topic, at most; a recorder takes all of them
 TICK = 0.05  # seconds between looks at the clock while nothing comes
 RECORDER_LOOKS = 0.02  # seconds between looks of a recorder at what waits
 TOGETHER = 64  # items that a recorder takes at a time, at most
@@ -48,6 +50,10 @@ class Sink(Protocol):
     @property
     def name(self) -> str:
         """For people and events: ``run.csv``, ``ROS 1``, ``mqtt://host``."""
+
+    @property
+    def recorder(self) -> bool:
+        """Whether it keeps whatever the disk has room for; else it is live, and counts against the budget."""
 
     @property
     def wants_rows(self) -> bool:

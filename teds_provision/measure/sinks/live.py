@@ -40,7 +40,7 @@ from teds_provision.measure.blocks import (
     StationFacts,
     why_invalid,
 )
-from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
+from teds_provision.measure.sinks.base import BUDGET, ROWS, CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.joints import INTERFACES, Joint, joints_of, state_of
 from teds_provision.measure.sinks.lines import facts_as_json
 from teds_provision.measure.sinks.names import Topics, slug
@@ -56,9 +56,7 @@ from teds_provision.measure.sinks.vectors import (
 )
 
 NODE = "teds_provision"
-BUDGET = 5000  # messages a second that one process bears (docs/ros.md)
 STATES, COMMANDS = "joint_states", "joint_commands"  # topics of the station
-ROWS = 1000  # rows a second of an array, at most; a recorder takes all of them
 OK, WARN, ERROR, STALE = range(4)  # of diagnostic_msgs/DiagnosticStatus
 JOINT_STATE, STRING, DIAGNOSTICS = "sensor_msgs/JointState", "std_msgs/String", "diagnostic_msgs/DiagnosticArray"
 
