@@ -205,6 +205,7 @@ def _begin(work: _Work) -> None:
     global _work  # noqa: PLW0603 - set once, in a process of its own
     _work = work
     gc.freeze()
+    gc.disable()  # documents are trees: their count of references alone frees them, a tenth of the time sooner
 
 
 def _done(places: range) -> tuple[list[str], Totals]:
