@@ -97,6 +97,7 @@ ACTS = (
         node=False,
     ),
     Act("measure", "measured", ("measure", "hand", "--duration", "0.5", "--to", "{FILES}/run.csv", "LINK")),
+    Act("zero", "calibrated", ("calibrate", "zero", "{UUID}", "1", "--value", "0.5", "LINK")),
     Act("ncap run", "measured", ("ncap", "run", "--record", "{FILES}/runs", "BUS"), until=TAKEN_UP, cuts_node=False),
 )
 """Every command that changes what lies on a disk or in a node."""
@@ -175,6 +176,10 @@ NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
             ("home", ("provision", "--profile", ANGLE, "--yes", "TAP")),
             ("home", ("group", "create", "hand", "{UUID}")),
         ),
+    ),
+    "calibrated": (
+        "sensor",
+        (("home", ("provision", "--profile", ANGLE, "--calibration", "{FILES}/angle.csv", "--yes", "TAP")),),
     ),
     "grouped": ("provisioned", (("home", ("group", "create", "hand", "{UUID}")),)),
     "revoked": ("provisioned", (("home", ("revoke", "{UUID}", "--why", "lost", "--yes")),)),

@@ -129,7 +129,9 @@ class Desk:
     def node(self, fault: dict[str, str] | None = None, *, nfc: bool = True) -> Iterator[Child]:
         """The virtual node of this desk, on its bus and (unless told otherwise) on its reader."""
         links = [*(["--nfc", self.links.nfc] if nfc else []), "--can", self.links.can]
-        words = ["--json", "--debug", "node", "run", str(self.folder / "flash"), *links]
+        still = self.folder / "files" / "still.csv"
+        source = ["--source", f"file:{still}"] if still.exists() else []
+        words = ["--json", "--debug", "node", "run", str(self.folder / "flash"), *links, *source]
         running = self.zygote.start("teds_provision", words, clean_environment() | (fault or {}), piped=True)
         try:
             running.wait_for('"ready": true', READY)
@@ -197,6 +199,9 @@ class States:
         folder.mkdir()
         (folder / "files").mkdir()
         (folder / "files" / "sheet.csv").write_text(f"uuid,profile\n{UUID},{ANGLE}\n")
+        if hardware:
+            (folder / "files" / "still.csv").write_text("t,angle\n0,90\n100000,90\n")
+        (folder / "files" / "angle.csv").write_text("# date: 2026-10-01\nraw,value [degree]\n0,0\n65536,360\n")
         desk = Desk(folder, self.zygote)
         for home, name in (("home", "bench"), ("other", "crane"), ("third", "lab")):
             station, _ = initialise(

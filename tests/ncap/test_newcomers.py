@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -201,6 +202,38 @@ def test_a_node_is_written_while_it_is_matched_and_nobody_else_notices(lab: Lab)
     assert len(parts) >= 2, "CSV begins a new part for another datasheet"
     channels = [line for part in parts for line in part.read_text().splitlines() if line.startswith("# channel:")]
     assert len({json.loads(line.removeprefix("# channel: "))["fingerprint"] for line in channels}) == 3
+
+
+def test_a_sensor_is_zeroed_while_everybody_is_measured_and_the_gap_is_told(lab: Lab) -> None:
+    """Let go, zeroed, given back: it read a quarter turn before, and reads 0 after; the other goes on."""
+    left, right = lab.nodes
+    right.kill()
+    still = lab.desk.folder / "still.csv"
+    still.write_text("t,angle\n0,90\n100000,90\n")
+    folder = lab.desk.folder / "zeroed"
+    right.start("--source", f"file:{still}", nfc=False, can=True)
+    lab.start("--record", folder)
+    lab.comes(left)
+    lab.comes(right)
+    lab.flows(right)
+    done = lab.service.station.ask("calibrate", "zero", right.uuid, 1, *lab.desk.links.over("can"))
+    assert done["written"]
+    assert done["before"] == pytest.approx(math.pi / 2, abs=1e-3)
+    lab.comes(right, 2)
+    lab.flows(right)
+    assert [(one["state"], one["why"]) for one in lab.told(right.uuid)] == [
+        ("joined", ""),
+        ("left", "let go for calibrate zero"),
+        ("joined", ""),
+    ]
+    with lab.service.client() as asked:
+        last = asked.node(right.uuid)["channels"][0]["last"]["value"]
+    assert min(last, 2 * math.pi - last) < 1e-3
+    assert lab.states(left) == ["joined"]
+    lab.service.end()
+    recorded = "".join(part.read_text() for part in sorted(folder.glob("run-*.csv")))
+    assert "let go for calibrate zero" in recorded
+    right.kill()
 
 
 def test_a_node_that_goes_while_its_writer_has_it_joins_when_it_comes_back(lab: Lab) -> None:

@@ -7,9 +7,11 @@ import queue
 import subprocess
 import sys
 import time
+import xmlrpc.client
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,6 +66,11 @@ class Master:
         command = ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1", topic]
         self.echoes.append(subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, text=True))
         return self.echoes[-1]
+
+    def published(self) -> set[str]:
+        """Topics that somebody publishes, by the master."""
+        state: Any = xmlrpc.client.ServerProxy(self.uri).getSystemState("/test")
+        return {topic for topic, _ in state[2][0]}
 
     def tool(self, *words: str) -> str:
         command = ["/usr/bin/python3", f"/usr/bin/{words[0]}", *words[1:]]
@@ -130,6 +137,19 @@ def test_debians_tools_see_topics_values_metadata_and_parameters(master: Master)
     assert 'key: "lost"' in diagnostics
     sink.close()
     assert sink.stats.error == ""
+
+
+def test_the_datasheet_of_a_node_that_got_another_name_is_found_under_that_alone(master: Master) -> None:
+    """As of an adopted board: its topics begin under the trusted name, and nobody finds the old datasheet any more."""
+    master.start()
+    sink = ros1(master)
+    sink.open([replace(ANGLE, unverified=True)], STATION)
+    until(lambda: "/bench/unverified/arm/teds" in master.published())
+    sink.describe([ANGLE])
+    until(lambda: "/bench/arm/teds" in master.published())
+    until(lambda: "/bench/unverified/arm/teds" not in master.published())
+    assert ANGLE.fingerprint in master.tool("rostopic", "echo", "-n", "1", "/bench/arm/teds")
+    sink.close()
 
 
 def test_a_vector_and_a_wrench_are_messages_of_their_own(master: Master) -> None:
