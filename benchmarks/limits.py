@@ -6,8 +6,11 @@ the initial message, selecting and leaving the service, and t_wait before each a
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from statistics import fmean
 
 from teds_provision.links.can.pacing import classic_bits, fd_seconds
 from teds_provision.links.nfc import message, tnep
@@ -17,6 +20,9 @@ Sizes = Sequence[tuple[int, int]]
 
 BITRATE, DATA_BITRATE = 500_000, 2_000_000
 _IDENTIFIER = 0x18DA21F1
+_DICE = random.Random(1)
+_SEALED = [_DICE.randbytes(64) for _ in range(100)]
+"""What sealed octets look like: as many stuff bits as chance gives, on average."""
 _FLOW = bytes([0x30, 16, 0]).ljust(8, b"\xcc")
 _FRAME_DELAY = (9 * 128 + 84 + 1172) / 13.56e6  # seconds: ISO/IEC 14443-3 clause 6.2, both directions
 _RECORD, _STATUS = 40, 6  # octets: header, type and piece header of the payload record; the Te record
@@ -26,23 +32,28 @@ _BLOCK = 16
 
 def classic(sizes: Sizes) -> float:
     """All frames of these exchanges on a classic bus of 500 kbit/s, flow control included."""
-    bits = classic_bits(_IDENTIFIER, bytes(range(8)))
+    bits = fmean(classic_bits(_IDENTIFIER, octets[:8]) for octets in _SEALED)
     return sum(_classic_frames(size + 1) for size in _each(sizes)) * bits / BITRATE
 
 
 def fd(sizes: Sizes) -> float:
     """The same on FD, 500 kbit/s and 2 Mbit/s."""
-    full = fd_seconds(_IDENTIFIER, bytes(range(64)), BITRATE, DATA_BITRATE)
+    full = _fd_frame(64)
     flow = fd_seconds(_IDENTIFIER, _FLOW, BITRATE, DATA_BITRATE)
     total = 0.0
     for size in _each(sizes):
         octets = size + 1
         if octets <= 62:
-            total += fd_seconds(_IDENTIFIER, bytes(octets + (1 if octets <= 7 else 2)), BITRATE, DATA_BITRATE)
+            total += _fd_frame(octets + (1 if octets <= 7 else 2))
         else:
             consecutive = -(-(octets - 62) // 63)
             total += (1 + consecutive) * full + _flows(consecutive) * flow
     return total
+
+
+@cache
+def _fd_frame(octets: int) -> float:
+    return fmean(fd_seconds(_IDENTIFIER, sealed[:octets], BITRATE, DATA_BITRATE) for sealed in _SEALED)
 
 
 def type4(sizes: Sizes) -> float:

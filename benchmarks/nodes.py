@@ -1,15 +1,20 @@
 """The other side of the provisioning benchmarks: virtual nodes, one after the other on one reader or bus, or many.
 
 Started as a process of its own: ``python -m benchmarks.nodes nfc|can LINK [--pace] [--tag 2] [--crypto-delay MS]``. For
-every line on stdin it takes the present node away and puts a new one down, and answers with four words: the node's
+every line on stdin it takes the present node away and puts a new one down, and answers with six words: the node's
 UUID, how many point operations (signatures, ECDH, checks of signatures; one-time keys are made in idle time) the node
 before it did, how many seconds its flash took to be safe (this machine's disk), and how many it waited, at random,
-before its last answer to everyone. With ``--many N`` there are N nodes on a bus at once, until stdin closes.
+before its last answer to everyone; and of a node in C, which counts no operations but times them, how many seconds
+they took, and how many all the rest of it, from the arrival of what it answers to the first bit of its answer.
+With ``--many N`` there are N nodes on a bus at once, until stdin closes; with ``--c`` each node is
+``firmware/build/host/teds-node``, paced.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
 import sys
 import tempfile
 import time
@@ -22,6 +27,7 @@ from teds_provision.node.nfc.server import NfcServer
 from teds_provision.node.virtual import Delays, VirtualNode
 from teds_provision.protocol.flash import Flash
 
+PROGRAM = Path(__file__).parents[1] / "firmware/build/host/teds-node"
 TAGS: dict[str, Literal["2", "4"]] = {"2": "2", "4": "4"}
 
 
@@ -81,9 +87,30 @@ def one_after_the_other(options: argparse.Namespace, place: Path) -> None:
         else:
             server = CountingServer(options.link, node, counts_as_tapped=node.in_factory_state)
         server.start()
-        print(node.tim.flash.uuid.hex(), operations, flash, waited, flush=True)
+        print(node.tim.flash.uuid.hex(), operations, flash, waited, 0.0, 0.0, flush=True)
     if server is not None:
         server.stop()
+
+
+def one_after_the_other_in_c(options: argparse.Namespace, place: Path) -> None:
+    """A line in, another node in C."""
+    process: subprocess.Popen[str] | None = None
+    for number, _ in enumerate(sys.stdin):
+        told = ended(process) if process is not None else dict.fromkeys(("chip", "flash", "turned"), 0.0)
+        words = [str(PROGRAM), "--flash", str(place / f"{number}.bin"), f"--{options.via}", options.link, "--pace"]
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        uuid = json.loads(process.stdout.readline())["uuid"]
+        print(uuid, 0, told["flash"], 0.0, told["chip"], told["turned"], flush=True)
+    if process is not None:
+        ended(process)
+
+
+def ended(process: subprocess.Popen[str]) -> dict[str, float]:
+    """Take a node in C away: what it says of its own part."""
+    process.terminate()
+    told: dict[str, float] = json.loads(process.communicate(timeout=20)[0])
+    return told
 
 
 def all_at_once(options: argparse.Namespace, place: Path) -> None:
@@ -107,9 +134,11 @@ def main() -> None:
     parser.add_argument("--tag", choices=sorted(TAGS), default="4")
     parser.add_argument("--crypto-delay", type=float, default=0)
     parser.add_argument("--many", type=int, default=0)
+    parser.add_argument("--c", action="store_true")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        (all_at_once if options.many else one_after_the_other)(options, Path(folder))
+        one = one_after_the_other_in_c if options.c else one_after_the_other
+        (all_at_once if options.many else one)(options, Path(folder))
 
 
 if __name__ == "__main__":

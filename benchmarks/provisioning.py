@@ -5,9 +5,11 @@ a test. Nodes are virtual, in a process of their own; paced links last as long a
 the node is known), *tool* (what in this process is neither exchange nor COMMIT), *disk* (time in COMMIT), *link* (the
 least that the octets occupy the wire, finding included), *wait* (what the contract waits: the random wait of this node
 after a question to everyone, t_wait), *node* (point operations × their delay, and its flash), and *rest*: turnarounds,
-both ends' drivers, the scheduler. The ratio is the whole, find included, to link + wait + node, median of what it was
-for each node; the one *before* is to the octets of the exchanges after the finding and the point operations alone, as
-it was reckoned until 2026-11-21.
+both ends' drivers, the scheduler. With a node in C (``firmware/``, built here where gcc and BearSSL are) *node* is what
+its P-256 and its flash took; what else is its own, from the arrival of what it answers to the first bit of its answer,
+stands in a line below, and ``--exchanges`` shows where the station's part lies. The ratio is the whole, find included,
+to link + wait + node, median of what it was for each node; the one *before* is to the octets of the exchanges after the
+finding and the point operations alone, as it was reckoned until 2026-11-21.
 """
 
 from __future__ import annotations
@@ -58,6 +60,7 @@ class Timed:
     inner: Any
     spans: list[Span] = field(default_factory=list)
     sizes: list[tuple[int, int]] = field(default_factory=list)
+    commands: list[str] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
@@ -82,6 +85,7 @@ class Timed:
         finally:
             self.spans.append(Span(began, time.perf_counter()))
         self.sizes.append((len(frame), len(reply)))
+        self.commands.append(f"{frame[2]}.{frame[3]}")
         return reply
 
     def close(self) -> None:
@@ -128,7 +132,8 @@ class Disk:
 class Run:
     """One node. Seconds; of ``link`` the octets take ``octets`` and the contract ``waits``; see limits.Limit.
 
-    ``operations`` are those of the node's chip, ``flash`` the seconds until what it stored was safe.
+    ``operations`` are those of the node's chip, ``flash`` the seconds until what it stored was safe. Of a node in C,
+    ``chip``: the seconds of its P-256; ``turned``: of all the rest of its own part.
     """
 
     find: float
@@ -144,10 +149,13 @@ class Run:
     timed: Timed
     operations: int = 0
     flash: float = 0.0
+    chip: float = 0.0
+    turned: float = 0.0
 
     def ratio(self, delay: float) -> float:
         """The whole, finding included, to the least that link, waits and node take; ``delay`` a point operation."""
-        return (self.find + self.whole) / (self.octets + self.waits + self.operations * delay + self.flash)
+        node = self.operations * delay + self.chip + self.flash
+        return (self.find + self.whole) / (self.octets + self.waits + node)
 
     @property
     def tool(self) -> float:
@@ -167,6 +175,7 @@ class Line:
     delay: float = 0.0
     aim: float | None = None
     named: bool = False
+    in_c: bool = False
 
     @property
     def asks_everyone(self) -> bool:
@@ -185,7 +194,12 @@ LINES = (
     Line("CAN FD 500k/2M", "can", (), limits.FD, "&pace=1&fd=1", aim=1.5),
     Line("CAN FD 500k/2M, named by UUID", "can", (), limits.FD, "&pace=1&fd=1", aim=1.5, named=True),
     Line("CAN 500 kbit/s, slow chip", "can", (), limits.CLASSIC, "&pace=1", SLOW),
+    Line("node in C: NFC Type 4, 106 kbit/s", "nfc", (), limits.TYPE4, aim=1.10, in_c=True),
+    Line("node in C: CAN 500 kbit/s, named", "can", (), limits.CLASSIC, "&pace=1", aim=1.10, named=True, in_c=True),
+    Line("node in C: CAN FD 500k/2M, named", "can", (), limits.FD, "&pace=1&fd=1", aim=1.25, named=True, in_c=True),
 )
+OWN_SHARE = 0.05
+"""Aim: what a node in C takes beside its P-256 and its flash, of the time of the link."""
 
 
 @contextmanager
@@ -206,11 +220,16 @@ def nodes(via: str, link: str, *extra: str) -> Iterator[subprocess.Popen[str]]:
 
 
 class Before(NamedTuple):
-    """What the node before took: point operations, seconds of its flash, and of its wait before it answered all."""
+    """What the node before took: point operations, seconds of its flash, and of its wait before it answered all.
+
+    Of a node in C also the seconds of its P-256, and of all else that was its own.
+    """
 
     operations: int
     flash: float
     waited: float
+    chip: float
+    turned: float
 
 
 def next_node(process: subprocess.Popen[str]) -> tuple[bytes, Before]:
@@ -225,7 +244,7 @@ def next_nodes(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[bytes, 
         process.stdin.write("\n")
         process.stdin.flush()
     lines = [process.stdout.readline().split() for process in processes if process.stdout is not None]
-    return [(bytes.fromhex(line[0]), Before(int(line[1]), float(line[2]), float(line[3]))) for line in lines]
+    return [(bytes.fromhex(line[0]), Before(int(line[1]), *map(float, line[2:]))) for line in lines]
 
 
 def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
@@ -238,7 +257,7 @@ def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
         settings = LinkSettings("can", can=link)
     runs: list[Run] = []
     order = prepare(station, BuildOrder(PROFILE))  # before the tap, as the command does
-    words = (*line.words, *(("--crypto-delay", str(line.delay * 1000)) if line.delay else ()))
+    words = (*line.words, *(("--crypto-delay", str(line.delay * 1000)) if line.delay else ()), *(["--c"] * line.in_c))
     with nodes(line.via, link, *words) as process:
         port = open_port(settings)
         try:
@@ -246,7 +265,8 @@ def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
                 uuid, before = next_node(process)
                 if runs:
                     waits = before.waited if line.asks_everyone else runs[-1].waits
-                    runs[-1] = replace(runs[-1], operations=before.operations, flash=before.flash, waits=waits)
+                    part = {name: getattr(before, name) for name in ("operations", "flash", "chip", "turned")}
+                    runs[-1] = replace(runs[-1], waits=waits, **part)
                 if number == count:
                     break
                 time.sleep(0.7 if line.via == "can" else 0.0)  # its Announce, which is no part of this
@@ -295,7 +315,7 @@ def report(line: Line, runs: list[Run]) -> None:
 
     find, whole, octets, waits = (median(operator.attrgetter(name)) for name in ("find", "whole", "octets", "waits"))
     tool, disk = median(lambda run: run.tool), median(lambda run: run.disk)
-    chip = median(lambda run: run.operations) * line.delay
+    chip = median(lambda run: run.operations) * line.delay + median(lambda run: run.chip)
     node = chip + median(lambda run: run.flash)
     rest = find + whole - tool - disk - octets - waits - node
     spread = f"{min(run.whole for run in runs) * 1e3:.0f}-{max(run.whole for run in runs) * 1e3:.0f}"
@@ -310,12 +330,37 @@ def report(line: Line, runs: list[Run]) -> None:
             print(f"  {line.aim:.2f} {'met' if ratio <= line.aim else 'MISSED'}", end="")
     failed = sum(not run.authentic for run in runs)
     print(f"  {failed} FAILED" if failed else "", flush=True)
+    if line.in_c:
+        own = median(lambda run: run.turned / run.octets)
+        met = "met" if own <= OWN_SHARE else "MISSED"
+        print(f"{'  its own part beside chip and flash':<36}{own:>6.1%} of the link's time; aim {OWN_SHARE:.0%}: {met}")
+
+
+def report_exchanges(line: Line, runs: list[Run]) -> None:
+    """Print each exchange of a row: what it took, the least that its octets take, and what passed before it."""
+    if line.limit is None:
+        return
+    least_of = line.limit.octets
+    print(f"{'':<8}{'octets':>12}{'link':>8}{'taken':>8}{'beyond':>8}{'before it':>11}  ms (median)")
+    for number, sizes in enumerate(runs[0].timed.sizes):
+        like = [run for run in runs if len(run.timed.sizes) == len(runs[0].timed.sizes)]
+        spans = [run.timed.spans[number] for run in like]
+        taken = statistics.median(span.ended - span.began for span in spans) * 1e3
+        gaps = [run.timed.spans[number].began - run.timed.spans[number - 1].ended for run in like] if number else [0.0]
+        least = (least_of([sizes]) - least_of([])) * 1e3
+        name = runs[0].timed.commands[number]
+        octets = f"{sizes[0]}, {sizes[1]}"
+        print(f"  {name:<6}{octets:>12}{least:>8.2f}{taken:>8.2f}", end="")
+        print(f"{taken - least:>8.2f}{statistics.median(gaps) * 1e3:>11.2f}")
 
 
 def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, default=11, help="nodes a row")
+    parser.add_argument("--only", default="", help="rows whose title holds this word")
+    parser.add_argument("--exchanges", action="store_true", help="show each exchange of each row")
     options = parser.parse_args(words)
+    has_c = subprocess.run(["make", "-C", "firmware", "host"], capture_output=True, check=False).returncode == 0
     secret = secrets.token_hex(8)
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_DISK")) as folder:
         station, _ = initialise(
@@ -328,11 +373,20 @@ def main(words: list[str] | None = None) -> None:
         own: list[float] = []
         commits: list[tuple[int, int]] = []
         for line in LINES:
+            if options.only not in line.title or (line.in_c and not has_c):
+                continue
             runs = measure(station, disk, line, options.nodes)
             report(line, runs)
+            if options.exchanges:
+                report_exchanges(line, runs)
             if line is LINES[0]:
                 own = [run.tool + run.disk for run in runs]
                 commits = [(run.commits, run.waited) for run in runs]
+        if not has_c:
+            print("node in C: not built here (make firmware)")
+        if not own:
+            station.close()
+            return
         share, (count, waited) = statistics.median(own) * 1e3, max(commits)
         met = "met" if share <= 10 and count <= 8 else "MISSED"
         print(

@@ -32,13 +32,15 @@ def need(*programs: str, headers: tuple[str, ...] = ("bearssl.h",)) -> None:
 
 
 @functools.cache
-def make(*words: str) -> None:
-    """Run make in firmware/, one process at a time; fails with what the compiler says."""
+def make(*words: str) -> str:
+    """Run make in firmware/, one process at a time: its output. Fails with what the compiler says."""
     BUILD.mkdir(exist_ok=True)
     with (BUILD / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        done = subprocess.run(["make", "-C", str(FIRMWARE), *words], capture_output=True, text=True, check=False)
+        words = ("make", "-C", str(FIRMWARE), "LEVEL=-O0", *words)
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def host() -> Path:
@@ -61,3 +63,10 @@ def library(max_message: int = 1024, staging: int = 4096) -> Path:
     path = BUILD / "host" / f"memory-{max_message}-{staging}.so"
     make(str(path.relative_to(FIRMWARE)))
     return path
+
+
+def objects(max_message: int, staging: int) -> tuple[list[Path], list[str]]:
+    """The objects of that library, and the words by which the compiler made them."""
+    folder = library(max_message, staging).with_suffix("")
+    words = make("-s", "--no-print-directory", f"words-of-{folder.name}").split()
+    return sorted(folder.glob("*.o")), words

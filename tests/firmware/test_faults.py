@@ -23,8 +23,7 @@ from tests.firmware.memory_node import MemoryNode
 
 pytestmark = pytest.mark.system
 
-SIZES = ["-DTEDS_MAX_MESSAGE=2048", "-DTEDS_STAGING=16388", "-DTEDS_NFC=1", "-DTEDS_MAX_NDEF=4160", "-DTEDS_BLE=1"]
-FLAGS = ["-std=c99", "-O0", "-fPIC", "-w", *SIZES]
+MAX_MESSAGE, STAGING = 2048, 16388
 
 
 @pytest.fixture
@@ -35,36 +34,19 @@ def station(tmp_path: Path) -> Iterator[Station]:
     made.close()
 
 
-@pytest.fixture(scope="session")
-def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every file of the library and of the board in memory, compiled once."""
-    builds.need("gcc")
-    folder = tmp_path_factory.mktemp("objects")
-    own = [*(builds.FIRMWARE / "src").glob("*.c"), builds.FIRMWARE / "port/bearssl/teds_bearssl.c", TESTS / "memory.c"]
-    subprocess.run(["gcc", *FLAGS, *INCLUDES, "-c", *map(str, own)], check=True, cwd=folder)
-    return folder
-
-
-TESTS = Path(__file__).parent / "c"
-INCLUDES = [
-    f"-I{folder}" for folder in (*(builds.FIRMWARE / name for name in ("include", "src", "port/bearssl")), TESTS)
-]
-
-
-def built(objects: Path, folder: Path, name: str) -> Path:
+def built(folder: Path, name: str) -> Path:
     """The library with this fault; "" is the good one."""
-    library = folder / "faulty.so"
-    linked = {path.stem: str(path) for path in objects.glob("*.o")}
-    if name:
-        change = CHANGES[name]
-        text = (builds.FIRMWARE / "src" / change.file).read_text(encoding="utf-8")
-        assert text.count(change.old) == 1, f"{change.file} holds {change.old!r} {text.count(change.old)} times"
-        source = folder / change.file
-        source.write_text(text.replace(change.old, change.new), encoding="utf-8")
-        changed = folder / "changed.o"
-        subprocess.run(["gcc", *FLAGS, *INCLUDES, "-c", str(source), "-o", str(changed)], check=True)
-        linked[source.stem] = str(changed)
-    subprocess.run(["gcc", "-shared", *linked.values(), "-o", str(library), "-lbearssl"], check=True)
+    if not name:
+        return builds.library(MAX_MESSAGE, STAGING)
+    objects, words = builds.objects(MAX_MESSAGE, STAGING)
+    change = CHANGES[name]
+    text = (builds.FIRMWARE / "src" / change.file).read_text(encoding="utf-8")
+    assert text.count(change.old) == 1, f"{change.file} holds {change.old!r} {text.count(change.old)} times"
+    source, changed, library = folder / change.file, folder / "changed.o", folder / "faulty.so"
+    source.write_text(text.replace(change.old, change.new), encoding="utf-8")
+    subprocess.run(["gcc", *words, "-w", "-c", str(source), "-o", str(changed)], check=True, cwd=builds.FIRMWARE)
+    others = [str(path) for path in objects if path.stem != source.stem]
+    subprocess.run(["gcc", "-shared", str(changed), *others, "-o", str(library), "-lbearssl"], check=True)
     return library
 
 
@@ -104,8 +86,8 @@ class Board(nodes.Measuring):
         return self.key.secret() if kind == "i" else b"\x01" + os.urandom(size - 1) if kind == "o" else os.urandom(size)
 
 
-def check(objects: Path, folder: Path, station: Station, patch: pytest.MonkeyPatch, name: str) -> nodes.Report:
-    patch.setattr(Board, "library", built(objects, folder, name), raising=False)
+def check(folder: Path, station: Station, patch: pytest.MonkeyPatch, name: str) -> nodes.Report:
+    patch.setattr(Board, "library", built(folder, name), raising=False)
     patch.setattr(nodes, "Measuring", Board)
     patch.setattr(nodes, "Board", Board)
     over = FAULTS[name].over if name else "nfc"
@@ -113,17 +95,15 @@ def check(objects: Path, folder: Path, station: Station, patch: pytest.MonkeyPat
     return nodes.checked(station, patch, nodes.made(over), over=over)
 
 
-def test_a_good_node_keeps_every_rule(
-    objects: Path, tmp_path: Path, station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert nodes.failed(check(objects, tmp_path, station, monkeypatch, "")) == {}
+def test_a_good_node_keeps_every_rule(tmp_path: Path, station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert nodes.failed(check(tmp_path, station, monkeypatch, "")) == {}
 
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_faulty_node_in_c_is_found_by_its_rule(
-    objects: Path, tmp_path: Path, station: Station, monkeypatch: pytest.MonkeyPatch, name: str
+    tmp_path: Path, station: Station, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    found = nodes.failed(check(objects, tmp_path, station, monkeypatch, name))
+    found = nodes.failed(check(tmp_path, station, monkeypatch, name))
     assert FAULTS[name].rule in found, found
     assert FAULTS[name].words in found[FAULTS[name].rule].detail
     assert found[FAULTS[name].rule].slip == FAULTS[name].slip

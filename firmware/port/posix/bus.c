@@ -25,7 +25,24 @@ static const char *option(const char *query, const char *key, const char *otherw
     return otherwise;
 }
 
-int host_bus_open(host_bus *bus, const char *spec, bool fd)
+/* The bit rates, and whether frames take their time; false after words on stderr. */
+static bool read_pace(host_bus *bus, const char *query, host_pace *pace, bool paces)
+{
+    char rate[16], data_rate[16], form[8];
+    bus->bitrate = (uint32_t)strtoul(option(query, "bitrate", "500000", rate, sizeof rate), NULL, 10);
+    bus->data_bitrate = (uint32_t)strtoul(option(query, "data_bitrate", "2000000", data_rate, sizeof data_rate), NULL, 10);
+    if (bus->bitrate == 0 || bus->data_bitrate == 0) {
+        (void)fprintf(stderr, "--can: a bit rate is a number above 0.\n");
+        return false;
+    }
+    if (paces || strcmp(option(query, "pace", "0", form, sizeof form), "1") == 0) {
+        bus->pace = pace;
+        host_pace_start(pace);
+    }
+    return true;
+}
+
+int host_bus_open(host_bus *bus, const char *spec, bool fd, host_pace *pace, bool paces)
 {
     char place[256], host[128], port[16], hops[16], form[8];
     const char *query = strchr(spec, '?');
@@ -46,6 +63,9 @@ int host_bus_open(host_bus *bus, const char *spec, bool fd)
     }
     *channel++ = '\0';
     bus->fd = TEDS_CAN_FD && (fd || strcmp(option(query, "fd", "0", form, sizeof form), "1") == 0);
+    if (!read_pace(bus, query, pace, paces)) {
+        return -1;
+    }
     if (strcmp(place, "udp_multicast") == 0) {
         int number = atoi(option(query, "port", "43113", port, sizeof port));
         if (multicast_open(bus, channel, (uint16_t)number, atoi(option(query, "hop_limit", "0", hops, sizeof hops))) !=
@@ -75,5 +95,8 @@ int host_bus_receive(host_bus *bus, teds_can_frame *frame)
 
 int host_bus_send(host_bus *bus, const teds_can_frame *frame)
 {
+    if (bus->pace != NULL) {
+        host_pace_frame(bus->pace, frame, bus->bitrate, bus->data_bitrate);
+    }
     return bus->is_socketcand ? socketcand_send(bus, frame) : multicast_send(bus, frame);
 }

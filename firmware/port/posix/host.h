@@ -7,6 +7,7 @@
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <sys/socket.h>
 
 #include "teds/node.h"
 
@@ -30,6 +31,33 @@ int host_flash_erase(host_flash *flash, int area);
 int host_flash_write(host_flash *flash, int area, uint32_t at, const uint8_t *octets, size_t length);
 int host_flash_read(const host_flash *flash, int area, uint32_t at, uint8_t *out, size_t length);
 
+/* -- pacing.c: frames that take as long as on a wire or on air ----------------------------------------------------- */
+
+typedef struct host_pace {
+    bool on;
+    uint64_t free_at, last; /* CAN: when the last frame was through, and how long it took */
+    uint64_t came, before;  /* when what waits for an answer came, 0 for nothing; chip and flash until then */
+    uint64_t turns, turned; /* changes of direction, and ns of them beside what follows */
+    uint64_t chip, flash;   /* ns in P-256, and until what was stored was written */
+} host_pace;
+
+void host_pace_start(host_pace *pace);
+/* ns of CLOCK_MONOTONIC. */
+uint64_t host_clock(void);
+/* When the kernel had this datagram, by SO_TIMESTAMPNS; now where it does not say. */
+uint64_t host_arrival(struct msghdr *message);
+void host_pace_came(host_pace *pace, uint64_t at);
+/* Wait until this frame would be through. */
+void host_pace_frame(host_pace *pace, const teds_can_frame *frame, uint32_t bitrate, uint32_t data_bitrate);
+/* Wait until `due`, when an answer would be through. */
+void host_pace_answer(host_pace *pace, uint64_t due);
+void host_hold(uint64_t until);
+/* One line of JSON: how many turnarounds, and seconds of each kind. */
+void host_pace_tell(const host_pace *pace);
+uint64_t host_wire_ns(const teds_can_frame *frame, uint32_t bitrate, uint32_t data_bitrate);
+/* From the first bit of a command to the last of its answer of so many octets, frame delays included. */
+uint64_t host_air_ns(const uint8_t *command, size_t length, size_t answer);
+
 /* -- bus.c, multicast.c, socketcand.c: where frames go --------------------------------------------------------------- */
 
 typedef struct host_bus {
@@ -39,10 +67,13 @@ typedef struct host_bus {
     uint16_t own_port;
     size_t held; /* socketcand: octets of a line that has begun */
     char line[2048];
+    uint32_t bitrate, data_bitrate;
+    host_pace *pace; /* NULL: frames leave at once */
 } host_bus;
 
-/* Open the bus that `spec` names as --can does; 0, or -1 after words on stderr. */
-int host_bus_open(host_bus *bus, const char *spec, bool fd);
+/* Open the bus that `spec` names as --can does; 0, or -1 after words on stderr. With `paces`, or pace=1 in `spec`, frames
+ * take the time of a wire. */
+int host_bus_open(host_bus *bus, const char *spec, bool fd, host_pace *pace, bool paces);
 /* The next frame, if one has come: 1, 0 none, -1 the bus is gone. */
 int host_bus_receive(host_bus *bus, teds_can_frame *frame);
 int host_bus_send(host_bus *bus, const teds_can_frame *frame);
@@ -66,10 +97,14 @@ typedef struct host_nfc {
     uint8_t uid[5]; /* and its check octet */
     struct sockaddr_in reader;
     teds_isodep card;
+    host_pace *pace; /* NULL: answers leave at once */
+    uint64_t came;
+    const uint8_t *command;
+    size_t command_length;
 } host_nfc;
 
 /* Lie down on `path` (udp:localhost:PORT); 0, or -1 after words on stderr. */
-int host_nfc_open(host_nfc *nfc, const char *path, const uint8_t uid[3]);
+int host_nfc_open(host_nfc *nfc, const char *path, const uint8_t uid[3], host_pace *pace);
 /* Answer one frame of the reader; false where none has come. */
 bool host_nfc_serve(host_nfc *nfc, teds_node *node);
 

@@ -24,6 +24,8 @@ typedef struct board {
     host_channels channels;
     host_bus bus;
     host_nfc nfc;
+    host_pace pace;
+    teds_port plain; /* the cryptography behind the watch of a paced port */
     bool has_bus;
     uint64_t started, seed;
 } board;
@@ -39,21 +41,22 @@ static void on_signal(int number)
     }
 }
 
-static uint64_t monotonic(void)
-{
-    struct timespec now;
-    (void)clock_gettime(CLOCK_MONOTONIC, &now);
-    return (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
-}
-
 static int port_erase(void *user, int area)
 {
-    return host_flash_erase(&((board *)user)->flash, area);
+    board *own = user;
+    const uint64_t began = host_clock();
+    const int failed = host_flash_erase(&own->flash, area);
+    own->pace.flash += host_clock() - began;
+    return failed;
 }
 
 static int port_write(void *user, int area, uint32_t at, const uint8_t *octets, size_t length)
 {
-    return host_flash_write(&((board *)user)->flash, area, at, octets, length);
+    board *own = user;
+    const uint64_t began = host_clock();
+    const int failed = host_flash_write(&own->flash, area, at, octets, length);
+    own->pace.flash += host_clock() - began;
+    return failed;
 }
 
 static int port_read(void *user, int area, uint32_t at, uint8_t *out, size_t length)
@@ -77,7 +80,7 @@ static int port_random(void *user, uint8_t *out, size_t length)
 
 static uint64_t port_now(void *user)
 {
-    return monotonic() - ((board *)user)->started;
+    return host_clock() - ((board *)user)->started;
 }
 
 static bool port_sample(void *user, uint8_t channel, uint64_t tick, uint8_t *out)
@@ -149,17 +152,64 @@ static void fill_port(teds_port *port, board *own)
     port->safe = port_safe;
 }
 
+/* -- a paced port tells what P-256 took beside the rest of its own part --------------------------------------------- */
+
+static bool watched_good(void *user, const uint8_t point[65])
+{
+    board *own = user;
+    const uint64_t began = host_clock();
+    const bool good = own->plain.p256_good(user, point);
+    own->pace.chip += host_clock() - began;
+    return good;
+}
+
+static int watched_ecdh(void *user, const teds_key_ref *key, const uint8_t peer[65], uint8_t out[32])
+{
+    board *own = user;
+    const uint64_t began = host_clock();
+    const int failed = own->plain.p256_ecdh(user, key, peer, out);
+    own->pace.chip += host_clock() - began;
+    return failed;
+}
+
+static int watched_sign(void *user, const teds_key_ref *key, const uint8_t hash[32], uint8_t out[64])
+{
+    board *own = user;
+    const uint64_t began = host_clock();
+    const int failed = own->plain.p256_sign(user, key, hash, out);
+    own->pace.chip += host_clock() - began;
+    return failed;
+}
+
+static bool watched_verify(void *user, const uint8_t point[65], const uint8_t hash[32], const uint8_t signature[64])
+{
+    board *own = user;
+    const uint64_t began = host_clock();
+    const bool good = own->plain.p256_verify(user, point, hash, signature);
+    own->pace.chip += host_clock() - began;
+    return good;
+}
+
+static void watch(teds_port *port, board *own)
+{
+    own->plain = *port;
+    port->p256_good = watched_good;
+    port->p256_ecdh = watched_ecdh;
+    port->p256_sign = watched_sign;
+    port->p256_verify = watched_verify;
+}
+
 /* -- options --------------------------------------------------------------------------------------------------------------- */
 
 typedef struct options {
     const char *flash, *can, *nfc, *uuid, *channels, *source, *cut, *seed;
-    bool fd;
+    bool fd, pace;
 } options;
 
 static int usage(void)
 {
     (void)fprintf(stderr, "teds-node --flash FILE [--can SPEC [--fd]] [--nfc udp:localhost:PORT] [--uuid HEX]\n"
-                          "          [--channels FILE] [--source noise|sine:S|ramp:S] [--cut N[:torn]] [--seed N]\n");
+                          "          [--channels FILE] [--source noise|sine:S|ramp:S] [--cut N[:torn]] [--seed N] [--pace]\n");
     return 2;
 }
 
@@ -173,8 +223,9 @@ static int read_options(int count, char **words, options *out)
                  {"--channels", &out->channels}, {"--source", &out->source}, {"--cut", &out->cut},
                  {"--seed", &out->seed}};
     for (int i = 1; i < count; i++) {
-        bool found = strcmp(words[i], "--fd") == 0;
-        out->fd = out->fd || found;
+        bool fd = strcmp(words[i], "--fd") == 0, pace = strcmp(words[i], "--pace") == 0, found = fd || pace;
+        out->fd = out->fd || fd;
+        out->pace = out->pace || pace;
         for (size_t k = 0; k < sizeof known / sizeof known[0] && !found; k++) {
             if (strcmp(words[i], known[k].name) == 0 && i + 1 < count) {
                 *known[k].value = words[++i];
@@ -300,7 +351,7 @@ int main(int count, char **words)
     if (failed) {
         return failed;
     }
-    own.started = monotonic();
+    own.started = host_clock();
     own.seed = given.seed != NULL ? strtoull(given.seed, NULL, 10) : 0;
     own.flash.cut = given.cut != NULL ? atol(given.cut) : 0;
     own.flash.torn = given.cut != NULL && strstr(given.cut, ":torn") != NULL;
@@ -319,6 +370,9 @@ int main(int count, char **words)
         return 1;
     }
 #endif
+    if (given.pace) {
+        watch(&port, &own);
+    }
     config.quick_points = true;
     config.nfc.present = given.nfc != NULL;
     config.nfc.wt_int = 4;
@@ -335,8 +389,9 @@ int main(int count, char **words)
     }
     own.has_bus = given.can != NULL;
     own.nfc.in = -1;
-    if ((own.has_bus && host_bus_open(&own.bus, given.can, given.fd) != 0) ||
-        (given.nfc != NULL && (port_random(&own, uid, sizeof uid) != 0 || host_nfc_open(&own.nfc, given.nfc, uid) != 0))) {
+    if ((own.has_bus && host_bus_open(&own.bus, given.can, given.fd, &own.pace, given.pace) != 0) ||
+        (given.nfc != NULL && (port_random(&own, uid, sizeof uid) != 0 ||
+                               host_nfc_open(&own.nfc, given.nfc, uid, given.pace ? &own.pace : NULL) != 0))) {
         return 5;
     }
     memset(&action, 0, sizeof action);
@@ -345,5 +400,10 @@ int main(int count, char **words)
     (void)sigaction(SIGINT, &action, NULL);
     (void)sigaction(SIGUSR1, &action, NULL);
     say_ready(&node, &port, &given);
-    return run(&own, &node);
+    own.pace.chip = own.pace.flash = 0; /* of its start */
+    failed = run(&own, &node);
+    if (given.pace) {
+        host_pace_tell(&own.pace);
+    }
+    return failed;
 }

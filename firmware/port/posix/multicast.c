@@ -201,6 +201,9 @@ int multicast_open(host_bus *bus, const char *group, uint16_t port, int hop_limi
         return -1;
     }
     (void)setsockopt(bus->in, SOL_SOCKET, SO_RCVBUF, &room, sizeof room);
+    if (bus->pace != NULL) {
+        (void)setsockopt(bus->in, SOL_SOCKET, SO_TIMESTAMPNS, &yes, sizeof yes);
+    }
     bus->own_address = own.sin_addr.s_addr;
     bus->own_port = own.sin_port;
     return 0;
@@ -211,9 +214,10 @@ int multicast_receive(host_bus *bus, teds_can_frame *frame)
     uint8_t datagram[4096];
     for (;;) {
         struct sockaddr_in from = {0};
-        socklen_t from_length = sizeof from;
-        ssize_t length =
-            recvfrom(bus->in, datagram, sizeof datagram, 0, (struct sockaddr *)&from, &from_length);
+        struct iovec where = {datagram, sizeof datagram};
+        char stamp[64];
+        struct msghdr message = {&from, sizeof from, &where, 1, stamp, sizeof stamp, 0};
+        ssize_t length = recvmsg(bus->in, &message, 0);
         if (length < 0) {
             return errno == EAGAIN || errno == EWOULDBLOCK || errno == EINTR ? 0 : -1;
         }
@@ -221,6 +225,9 @@ int multicast_receive(host_bus *bus, teds_can_frame *frame)
             continue; /* a controller does not give back its own frames */
         }
         if (multicast_unpack(datagram, (size_t)length, bus->fd, frame)) {
+            if (bus->pace != NULL) {
+                host_pace_came(bus->pace, host_arrival(&message));
+            }
             return 1;
         }
     }

@@ -14,8 +14,9 @@
 
 #define SAK 0x20u /* ISO-DEP */
 
-int host_nfc_open(host_nfc *nfc, const char *path, const uint8_t uid[3])
+int host_nfc_open(host_nfc *nfc, const char *path, const uint8_t uid[3], host_pace *pace)
 {
+    const int yes = 1;
     struct sockaddr_in own;
     const char *colon = strchr(path, ':'), *port = colon != NULL ? strchr(colon + 1, ':') : NULL;
     unsigned long number = port != NULL ? strtoul(port + 1, NULL, 10) : 54321;
@@ -36,6 +37,11 @@ int host_nfc_open(host_nfc *nfc, const char *path, const uint8_t uid[3])
         (void)fprintf(stderr, errno == EADDRINUSE ? "Another node (or program) lies on %s.\n" : "%s does not open.\n", path);
         return -1;
     }
+    if (pace != NULL) {
+        nfc->pace = pace;
+        host_pace_start(pace);
+        (void)setsockopt(nfc->in, SOL_SOCKET, SO_TIMESTAMPNS, &yes, sizeof yes);
+    }
     nfc->uid[0] = 0x08; /* four octets, random: it tells nobody who this is */
     memcpy(nfc->uid + 1, uid, 3);
     nfc->uid[4] = (uint8_t)(nfc->uid[0] ^ nfc->uid[1] ^ nfc->uid[2] ^ nfc->uid[3]);
@@ -49,6 +55,9 @@ static void say(host_nfc *nfc, const uint8_t *octets, size_t length)
     struct pollfd newer = {nfc->in, POLLIN, 0};
     if (length == 0 || poll(&newer, 1, 0) > 0) {
         return; /* a newer command waits: the reader has given this one up */
+    }
+    if (nfc->pace != NULL) {
+        host_pace_answer(nfc->pace, nfc->came + host_air_ns(nfc->command, nfc->command_length, length));
     }
     for (size_t i = 0; i < length; i++) {
         at += (size_t)sprintf(text + at, "%02x", (unsigned)octets[i]);
@@ -97,8 +106,10 @@ bool host_nfc_serve(host_nfc *nfc, teds_node *node)
 {
     char text[1024];
     uint8_t octets[300], out[256];
-    socklen_t size = sizeof nfc->reader;
-    ssize_t came = recvfrom(nfc->in, text, sizeof text - 1, MSG_DONTWAIT, (struct sockaddr *)&nfc->reader, &size);
+    struct iovec where = {text, sizeof text - 1};
+    char stamp[64];
+    struct msghdr message = {&nfc->reader, sizeof nfc->reader, &where, 1, stamp, sizeof stamp, 0};
+    ssize_t came = recvmsg(nfc->in, &message, MSG_DONTWAIT);
     size_t length;
     if (came < 0) {
         return false;
@@ -114,6 +125,12 @@ bool host_nfc_serve(host_nfc *nfc, teds_node *node)
     length = octets_of(text + 5, octets, sizeof octets);
     if (length == 0) {
         return true;
+    }
+    if (nfc->pace != NULL) {
+        nfc->came = host_arrival(&message);
+        nfc->command = octets;
+        nfc->command_length = length;
+        host_pace_came(nfc->pace, nfc->came);
     }
     if (!nfc->active || (length == 1 && (octets[0] == 0x26 || octets[0] == 0x52))) {
         select_tag(nfc, node, octets, length);
