@@ -480,6 +480,51 @@ class Plant(TypedDict):
     alarms: list[PlantAlarm]
 
 
+class Job(TypedDict):
+    """What a keeper lets a line build; ``units`` and ``passed`` are those of this station."""
+
+    id: str
+    title: str
+    profile: str
+    total: int
+    ends: Time
+    state: Literal["open", "closed"]
+    units: int
+    passed: int
+
+
+class Jobs(TypedDict):
+    """Every job that this station took, oldest first."""
+
+    jobs: list[Job]
+
+
+class LineStation(TypedDict):
+    """One station's part of a job.
+
+    ``first_pass`` is the share of its boards that passed at their first attempt; ``failures`` counts attempts by the
+    code that ended them, ``steps`` holds median and worst seconds of each step: from evidence that is here, of other
+    stations from their pages, which say no seconds.
+    """
+
+    station: str
+    name: str
+    allotment: int
+    units: int
+    passed: int
+    first_pass: float | None
+    attempts: int
+    over: bool
+    failures: dict[str, Any]
+    steps: dict[str, Any]
+
+
+class JobStatus(Job):
+    """How a job goes, station by station."""
+
+    stations: list[LineStation]
+
+
 class Found(TypedDict):
     """The nodes that answered."""
 

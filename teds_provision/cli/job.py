@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -197,7 +196,7 @@ def list_jobs(app: App) -> None:
     station = app.station()
     plant.jobs.take_received(station)
     rows = station.plant.line.jobs()
-    found = [replace(_read(station, row.octets), hash=row.hash) for row in rows]
+    found = [plant.jobs.kept_job(station, row) for row in rows]
     told = [_told(station, one) for one in found]
 
     def table(console: Console) -> None:
@@ -211,12 +210,6 @@ def list_jobs(app: App) -> None:
         print_table(console, shown)
 
     app.emit({"jobs": told}, table if told else "There are no jobs yet. A keeper makes one: teds-provision job new")
-
-
-def _read(station: Station, octets: bytes) -> Job:
-    """A job that was taken, whoever is a keeper today."""
-    roster = station.plant.roster
-    return protocol.plant.job.open_job(octets, roster.point_of if roster is not None else lambda kid: None)
 
 
 @command("teds-provision job show fifty.jws", name="show")

@@ -8,14 +8,24 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision import plant
-from teds_provision.errors import LinkFailure, NotMember, RosterExpired, StoreLocked, TedsProvisionError
+from teds_provision.errors import (
+    LinkFailure,
+    NotAuthentic,
+    NotFound,
+    NotMember,
+    RosterExpired,
+    StoreLocked,
+    TedsProvisionError,
+)
 from teds_provision.ncap.live import Live
 from teds_provision.plant.post import Post
 from teds_provision.plant.postgres import PostgresPost, Registry
+from teds_provision.protocol.plant.job import Job
 from teds_provision.station.station import Station
 
 EVERY: Final = 60.0
@@ -93,6 +103,37 @@ class PlantWatch:
                 for one in found.alarms
             ],
         }  # fmt: skip
+
+    def jobs(self) -> list[dict[str, Any]]:
+        """api.md, `/jobs`."""
+        found = []
+        for row in self._station.plant.line.jobs():
+            with suppress(NotAuthentic):  # of a keeper that no roster names any more
+                found.append(self._job(plant.jobs.kept_job(self._station, row), row.state))
+        return found
+
+    def job(self, text: str) -> dict[str, Any]:
+        """api.md, `/jobs/{id}`; raises NotFound. What a sync brought, and nobody took, is no job yet."""
+        rows = [row for row in self._station.plant.line.jobs() if len(text) >= 4 and row.id.startswith(text.lower())]
+        if len(rows) != 1:
+            raise NotFound(f"{len(rows) or 'No'} jobs begin with {text[:64]}.", hint="GET /jobs lists them.")
+        [row] = rows
+        found = plant.jobs.kept_job(self._station, row)
+        parts = plant.yields.yields(self._station, found, plant.yields.attempts_of(self._station, found.id))
+        return {**self._job(found, row.state), "stations": [part.to_json() for part in parts]}
+
+    def _job(self, found: Job, state: str) -> dict[str, Any]:
+        given, passed, _ = self._station.plant.line.count_units(found.id)
+        return {
+            "id": found.id,
+            "title": found.title,
+            "profile": found.profile,
+            "total": found.total,
+            "ends": found.ends.timestamp(),
+            "state": state,
+            "units": given,
+            "passed": passed,
+        }
 
     # -- threads -----------------------------------------------------------------------------------------------------
 

@@ -52,6 +52,8 @@ class Resources:
             Route("/status", self.status),
             Route("/detection", self.detection, methods=["GET", "PUT"]),
             Route("/plant", self.plant),
+            Route("/jobs", self.jobs),
+            Route("/jobs/{id}", self.job),
             Route("/discover", self.discover, methods=["POST"]),
             Route("/nodes", self.nodes),
             Route("/nodes/{uuid}", self.node),
@@ -101,6 +103,14 @@ class Resources:
         if found is None:
             raise NotFound("This station has joined no registry.", hint="Join one: teds-provision registry connect")
         return _shown(request, found)
+
+    async def jobs(self, request: Request) -> Response:
+        """GET /jobs."""
+        return _shown(request, {"jobs": await asyncio.to_thread(self._daemon.plant.jobs)})
+
+    async def job(self, request: Request) -> Response:
+        """GET /jobs/{id}."""
+        return _shown(request, await reading(self._daemon.plant.job, request.path_params["id"]))
 
     async def discover(self, request: Request) -> Response:
         """POST /discover."""

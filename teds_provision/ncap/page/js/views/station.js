@@ -5,16 +5,19 @@ import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../
 import { channelName, clock, count, grouped, nameOf, short } from "../format.js";
 import { on, refresh, state } from "../state.js";
 import { linkName } from "./facts.js";
+import { linePanel } from "./line.js";
 
 const NAMES = 40; // rows of published names; a press shows as many more
 
 export function stationView(main) {
   const links = h("ul", { class: "lines" });
+  const noLink = h("p", { class: "hint", hidden: true }, "No links. Start ncap run with --can, --nfc or --ble.");
   const sinks = h("ul", { class: "lines" });
   const noSink = h("div", {});
   const plantFacts = h("dl", { class: "facts-list" });
   const plant = h("ul", { class: "lines" });
   const plantPanel = h("section", { class: "panel", "aria-label": "Plant", hidden: true }, h("h3", {}, "Plant"), plantFacts, plant);
+  const line = linePanel();
   const facts = h("dl", { class: "facts-list" });
   const names = h("tbody", {});
   const find = h("input", { type: "search", placeholder: "Node, channel or topic", "aria-label": "Search published names", oninput: () => ((most = NAMES), paint()) });
@@ -27,9 +30,10 @@ export function stationView(main) {
     h(
       "div",
       { class: "grid" },
-      h("section", { class: "panel", "aria-label": "Links" }, h("h3", {}, "Links"), links),
+      h("section", { class: "panel", "aria-label": "Links" }, h("h3", {}, "Links"), noLink, links),
       h("section", { class: "panel", "aria-label": "About" }, h("h3", {}, "About"), facts),
       plantPanel,
+      line.panel,
       h("section", { class: "panel", "aria-label": "Where values go" }, h("h3", {}, "Where values go"), noSink, sinks),
       h("section", { class: "panel", "aria-label": "Published names" }, h("div", { class: "panel-head" }, h("h3", {}, "Published names"), find), noName, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Published names" }, table), further),
     ),
@@ -41,7 +45,7 @@ export function stationView(main) {
       const up = one.state === "up" || one.state === "running";
       again(element, [one.state, one.why], () => [icon(one.kind ?? "can"), h("span", { class: "grow" }, h("strong", {}, linkName(one.kind)), " ", one.name), chip(up ? "good" : "warn", up ? "good" : "warn", one.state), one.why ? h("p", { class: "hint full" }, one.why, one.hint ? ` ${one.hint}` : "") : null]);
     });
-    if (!(status.links ?? []).length && !links.firstChild) fill(links, h("li", { class: "hint" }, "No links. Start ncap run with --can, --nfc or --ble."));
+    noLink.hidden = !state.status || (status.links ?? []).length > 0;
     keyed(sinks, status.sinks ?? [], (one) => one.name, () => h("li", {}), (element, one) => {
       const bad = one.state === "failed";
       again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${count(one.written ?? 0, "value")} written, ${one.dropped ?? 0} dropped`)), chip(bad ? "bad" : one.dropped ? "warn" : "good", bad || one.dropped ? "warn" : "good", one.state), one.error || ((one.recorder || one.state === "waiting") && one.detail) ? h("p", { class: "hint full" }, one.error || one.detail, one.hint ? ` ${one.hint}` : "") : null]);
@@ -111,6 +115,7 @@ export function stationView(main) {
   return {
     end() {
       clearInterval(asking);
+      line.end();
       off();
     },
   };
