@@ -59,7 +59,7 @@ def run(copy: Path, *words: object) -> subprocess.CompletedProcess[str]:
         env=clean_environment(PYTHONPATH=str(copy)),
         capture_output=True,
         text=True,
-        timeout=110,
+        timeout=280,
         check=False,
     )
 
