@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults model house man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults model house man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -192,10 +192,11 @@ $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz]'
 	@touch $@
 
-# The node in C: the host port and its C tests under the sanitizers (firmware/README.md).
-firmware: vectors-c
+# The node in C: the host port, its C tests under the sanitizers, every faulty node (firmware/README.md).
+firmware: vectors-c $(VENV)/.dev
 	@sh scripts/install-test-packages
 	$(MAKE) --no-print-directory -C firmware all check
+	$(BIN)/python -m pytest -q -m 'soak or not soak' tests/firmware/test_faults.py
 
 # Every test of whole runs whose needs the node in C meets, with it on the desk (tests/firmware/c_node.py).
 OF_C := tests/e2e tests/cli/test_handover.py tests/cli/test_life.py tests/cli/test_messages.py tests/check/test_node_check_cli.py
@@ -206,6 +207,17 @@ test-c: $(VENV)/.dev
 # 10 kHz of 16 bits for ten minutes on CAN FD and on 1 Mbit/s, and 200 nodes in C on one bus. Wants a machine for itself.
 firmware-soak: $(VENV)/.dev
 	SECONDS_OF_SOAK=$${SECONDS_OF_SOAK:-600} $(BIN)/python -m pytest tests/firmware/test_soak.py -m soak -s -rs
+
+# Lines and branches of firmware/src that its tests reach, by gcov: the C tests, those in one process and the host port.
+# Four minutes; not the faulty nodes, which are copies.
+COUNTED := LEVEL=-O0 --coverage,HOST_LEVEL=-O0 --coverage
+firmware-coverage: vectors-c $(VENV)/.dev
+	@sh scripts/install-test-packages
+	rm -rf firmware/build/counted
+	$(MAKE) --no-print-directory -C firmware BUILD=build/counted SANITIZED="-O0 -g --coverage" check
+	TEDS_C_BUILD=build/counted TEDS_C_WORDS="$(COUNTED)" $(BIN)/python -m pytest -q -n 2 -m '$(USUAL)' \
+	  --ignore tests/firmware/test_faults.py --ignore tests/firmware/test_c_tests.py tests/firmware
+	$(BIN)/python -m tests.firmware.coverage firmware/build/counted
 
 # The library on Cortex-M0+, M4 and M33: sizes, stack, instructions held; the M4 image under qemu is checked as a node.
 # The C tests as 32 bits and big-endian, too, and what cppcheck and clang-tidy say.

@@ -13,7 +13,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 FIRMWARE = ROOT / "firmware"
-BUILD = FIRMWARE / "build"
+BUILD = FIRMWARE / os.environ.get("TEDS_C_BUILD", "build")
+WORDS = tuple(os.environ.get("TEDS_C_WORDS", "LEVEL=-O0").split(","))
+"""Where and how the tests build: make firmware-coverage has a place of its own."""
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 
@@ -34,11 +36,11 @@ def need(*programs: str, headers: tuple[str, ...] = ("bearssl.h",)) -> None:
 @functools.cache
 def make(*words: str) -> str:
     """Run make in firmware/, one process at a time: its output. Fails with what the compiler says."""
-    BUILD.mkdir(exist_ok=True)
+    BUILD.mkdir(parents=True, exist_ok=True)
     with (BUILD / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        words = ("make", "-C", str(FIRMWARE), "LEVEL=-O0", *words)
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        command = ["make", "-C", str(FIRMWARE), f"BUILD={BUILD.relative_to(FIRMWARE)}", *WORDS, *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

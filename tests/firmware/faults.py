@@ -11,11 +11,35 @@ from typing import Final, NamedTuple
 
 
 class Change(NamedTuple):
-    """In this file of firmware/src: ``old`` becomes ``new``."""
+    """In this file of firmware/src: ``old`` becomes ``new``; ``helper`` stands behind the first include."""
 
     file: str
     old: str
     new: str
+    helper: str = ""
+
+    def made(self, text: str) -> str:
+        """The changed text; raises AssertionError where the place is not there once."""
+        assert text.count(self.old) == 1, f"{self.file} holds {self.old!r} {text.count(self.old)} times"
+        first = '#include "inside.h"\n'
+        return text.replace(self.old, self.new).replace(first, first + self.helper, 1)
+
+
+HIGH: Final = """
+static void high(uint8_t *s)
+{
+    static const uint8_t n[32] = {0xFF, 0xFF, 0xFF, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF,
+                                  0xBC, 0xE6, 0xFA, 0xAD, 0xA7, 0x17, 0x9E, 0x84, 0xF3, 0xB9, 0xCA, 0xC2, 0xFC, 0x63,
+                                  0x25, 0x51};
+    int borrow = 0;
+    for (int i = 31; i >= 0; i--) {
+        int value = n[i] - s[i] - borrow;
+        borrow = value < 0;
+        s[i] = (uint8_t)value;
+    }
+}
+"""
+"""n - s for a low s."""
 
 
 CHANGES: Final[dict[str, Change]] = {
@@ -195,4 +219,210 @@ CHANGES: Final[dict[str, Change]] = {
         "    case TEDS_REQUEST: return 0;\n    case TEDS_CONFIRM:\n    case TEDS_SET_CAN_ADDRESS: return",
     ),
     "FAULT_RESET_LEAVES_REQUEST": Change("node.c", "    teds_pending_forget(node);\n    return 64;", "    return 64;"),
+    # -- the agreement, once more
+    "FAULT_TRANSCRIPT_EPOCH_LITTLE_ENDIAN": Change(
+        "agree.c",
+        "    /* reply_head: nonceN, epoch, En as they stand in the reply */\n",
+        "    uint8_t head[85];\n    const uint32_t next = node->state.epoch + 1;\n    memcpy(head, reply_head, 85);\n"
+        "    memcpy(head + 16, &next, 4);\n    reply_head = head;\n",
+    ),
+    "FAULT_EPOCH_STANDS_STILL": Change(
+        "agree.c", "teds_put32(out + 16, node->state.epoch + 1);", "teds_put32(out + 16, node->state.epoch);"
+    ),
+    "FAULT_TRANSCRIPT_DIGEST_OF_DATA_BLOCK": Change(
+        "agree.c",
+        "    /* reply_head: nonceN, epoch, En as they stand in the reply */\n",
+        "    uint8_t image[2048];\n    teds_source_read(node, &source, 0, image, source.length);\n"
+        "    const teds_part block = {image + 4, source.length - 6};\n    teds_sha256_parts(node, &block, 1, teds);\n",
+    ),
+    "FAULT_TRANSCRIPT_DIGEST_OF_NEW_EPOCH": Change(
+        "agree.c",
+        "    if (!teds_find(node, TEDS_SECURITY_ID, &source) || teds_source_hash(node, &source, teds) != 0) {",
+        "    node->state.epoch++;\n    int failed = !teds_find(node, TEDS_SECURITY_ID, &source) ||\n"
+        "                 teds_source_hash(node, &source, teds) != 0;\n    node->state.epoch--;\n    if (failed) {",
+    ),
+    "FAULT_Z_LITTLE_ENDIAN": Change(
+        "agree.c",
+        "                 derive(node, z, out, script, out + 85) != 0;",
+        "                 (turned(z), turned(z + 32), derive(node, z, out, script, out + 85)) != 0;",
+        "static void turned(uint8_t *at)\n{\n    for (size_t i = 0; i < 16; i++) {\n        uint8_t low = at[i];\n"
+        "        at[i] = at[31 - i];\n        at[31 - i] = low;\n    }\n}\n",
+    ),
+    "FAULT_M_OF_48_OCTETS": Change(
+        "agree.c",
+        "    uint8_t okm[48], mac[32];\n    int failed = teds_hkdf(node, nonce, 16, z, 64, info, 2, okm, 48);\n"
+        "    if (!failed) {\n        failed = port->hmac(port->user, okm + 16, 32,",
+        "    uint8_t okm[64], mac[32];\n    int failed = teds_hkdf(node, nonce, 16, z, 64, info, 2, okm, 64);\n"
+        "    if (!failed) {\n        failed = port->hmac(port->user, okm + 16, 48,",
+    ),
+    "FAULT_SIGN_WITHOUT_LABEL": Change(
+        "agree.c", '{LABEL("TEDS1 agree"), {script, 32}}', "{{script, 0}, {script, 32}}"
+    ),
+    "FAULT_SIGN_WITH_ONE_TIME_KEY": Change(
+        "agree.c",
+        "failed = teds_sign(node, hash, out + 101) != 0;",
+        "teds_node other = *node;\n        other.key = own->key;\n"
+        "        failed = teds_sign(&other, hash, out + 101) != 0;",
+    ),
+    "FAULT_SIGN_LITTLE_ENDIAN": Change(
+        "agree.c",
+        "failed = teds_sign(node, hash, out + 101) != 0;",
+        "failed = teds_sign(node, hash, out + 101) != 0;\n        turned(out + 101);\n        turned(out + 133);",
+        "static void turned(uint8_t *at)\n{\n    for (size_t i = 0; i < 16; i++) {\n        uint8_t low = at[i];\n"
+        "        at[i] = at[31 - i];\n        at[31 - i] = low;\n    }\n}\n",
+    ),
+    "FAULT_SIGN_HIGH_S": Change(
+        "agree.c",
+        "failed = teds_sign(node, hash, out + 101) != 0;",
+        "failed = teds_sign(node, hash, out + 101) != 0;\n        high(out + 133);",
+        HIGH,
+    ),
+    "FAULT_PROVE_HIGH_S": Change(
+        "node.c",
+        "    return teds_sign(node, hash, out) == 0 ? 64 : -TEDS_FAILURE;",
+        "    teds_sign(node, hash, out);\n    high(out + 32);\n    return 64;",
+        HIGH,
+    ),
+    "FAULT_RESET_HIGH_S": Change(
+        "node.c",
+        "    if (teds_sign(node, hash, out) != 0) {\n        return -TEDS_FAILURE;\n    }\n",
+        "    teds_sign(node, hash, out);\n    high(out + 32);\n",
+        HIGH,
+    ),
+    "FAULT_REPLY_WITH_TEDS": Change(
+        "agree.c",
+        "    return failed ? -TEDS_FAILURE : 165;",
+        "    teds_source source;\n    teds_find(node, TEDS_SECURITY_ID, &source);\n"
+        "    teds_source_read(node, &source, 0, out + 165, source.length);\n"
+        "    return failed ? -TEDS_FAILURE : 465;",
+    ),
+    "FAULT_K_ELSEWHERE": Change(
+        "agree.c", "memcpy(node->pending.key, okm, 16);", "memcpy(node->pending.key, okm + 16, 16);"
+    ),
+    "FAULT_SAME_ONE_TIME_KEY": Change(
+        "agree.c",
+        "teds_one_time_take(node, own) != 0;",
+        "(kept.ready ? 0 : teds_one_time_take(node, &kept)) != 0;\n    *own = kept;",
+        "static teds_one_time kept;\n",
+    ),
+    "FAULT_SIGNATURE_BEFORE_POINTS": Change(
+        "agree.c",
+        "    if (!teds_point_good(node, station) || !teds_point_good(node, ca)",
+        "    teds_sha256_parts(node, certified, 2, hash);\n    if (!teds_verify(node, ca, hash, signature)) {\n"
+        "        return -TEDS_BAD_SIGNATURE;\n    }\n    if (!teds_point_good(node, station) || !teds_point_good(node, ca)",
+    ),
+    "FAULT_CONFIRM_FROM_ANY_LINK": Change(
+        "agree.c", "pending->link != origin->link ||\n        pending->session", "pending->session"
+    ),
+    "FAULT_CONFIRM_BESIDE": Change(
+        "agree.c", "pending->link != origin->link ||\n        pending->session != origin->session", "false"
+    ),
+    "FAULT_HALF_OPEN_SURVIVES_CONFIRM": Change(
+        "session.c", "    teds_wipe(node->half_open, sizeof node->half_open);\n    teds_pending", "    teds_pending"
+    ),
+    # -- frames and states, once more
+    "FAULT_UNKNOWN_IS_SILENT": Change(
+        "node.c",
+        "    octets = close_reply(reply, outcome);\n",
+        "    octets = outcome == -TEDS_UNKNOWN_COMMAND && frame[3] == 99 ? 0 : close_reply(reply, outcome);\n",
+    ),
+    "FAULT_LONG_REFUSAL": Change("node.c", "        outcome = 1;\n", "        reply[4] = 0;\n        outcome = 2;\n"),
+    "FAULT_LENGTH_BEFORE_STATE": Change(
+        "node.c",
+        "    refused = permitted(node, command, origin);\n",
+        "    if (command->command_class == TEDS_CLASS_COMMON && command->function == TEDS_WRITE && length == 6) {\n"
+        "        return -TEDS_BAD_FORM;\n    }\n    refused = permitted(node, command, origin);\n",
+    ),
+    "FAULT_LONGER_THAN_MAX_MESSAGE": Change(
+        "node.c", "    if (length > TEDS_MAX_MESSAGE) {", "    if (length >= TEDS_MAX_MESSAGE) {"
+    ),
+    "FAULT_PROVE_OTHER_KEY": Change(
+        "node.c",
+        "    return teds_sign(node, hash, out) == 0 ? 64 : -TEDS_FAILURE;",
+        "    teds_node other = *node;\n    other.key.octets[20] ^= 1;\n    return teds_sign(&other, hash, out) == 0 ? 64 : -1;",
+    ),
+    "FAULT_PROVE_NOT_HASHED": Change(
+        "node.c",
+        "    return teds_sign(node, hash, out) == 0 ? 64 : -TEDS_FAILURE;",
+        "    return teds_sign(node, command->payload, out) == 0 ? 64 : -TEDS_FAILURE;",
+    ),
+    "FAULT_LIST_TWICE": Change(
+        "node.c",
+        "        length += 3;\n",
+        "        length += 3;\n        if (length == 3) {\n            memcpy(out + 3, out, 3);\n            length = 6;\n        }\n",
+    ),
+    "FAULT_ABSENT_AVAILABLE": Change(
+        "teds_store.c", "(read_only ? 1u : 0u) | (there ? 0u : 2u)", "(read_only ? 1u : 0u)"
+    ),
+    "FAULT_TEXT_ATTRIBUTE": Change("teds_store.c", "code >= 128 ? 0x40u :", "code >= 128 ? 0x50u :"),
+    "FAULT_TEDS_CHECKSUM": Change(
+        "security_teds.c", "teds_put16(at, teds_checksum(sum));", "teds_put16(at, teds_checksum(sum) ^ 1);"
+    ),
+    "FAULT_NOT_CANONICAL": Change("security_teds.c", "tuple(at, 109, &suite, 1)", "tuple(at, 110, &suite, 1)"),
+    "FAULT_OTHER_SUITE": Change("security_teds.c", "version = 1, suite = 2,", "version = 1, suite = 1,"),
+    "FAULT_READ_END_REFUSED": Change(
+        "teds_store.c",
+        "    offset = offset < source.length ? offset : source.length;\n",
+        "    if (offset >= source.length) {\n        return -TEDS_NO_SUCH_TEDS;\n    }\n",
+    ),
+    # -- sessions and writing, once more
+    "FAULT_OPEN_SAME_ONE_TIME_KEY": Change(
+        "session.c",
+        "    failed = teds_one_time_take(node, &own) != 0;",
+        "    failed = (kept.ready ? 0 : teds_one_time_take(node, &kept)) != 0;\n    own = kept;",
+        "static teds_one_time kept;\n",
+    ),
+    "FAULT_OPEN_ENDS_SESSION": Change(
+        "session.c",
+        "        keep_half_open(node, origin->link, &keys);\n",
+        "        keep_half_open(node, origin->link, &keys);\n        teds_session_end(node, teds_session_on(node, origin->link));\n",
+    ),
+    "FAULT_FIRST_OPEN_STAYS": Change(
+        "session.c",
+        "    teds_half_open *place = half_open_on(node, link);\n",
+        "    teds_half_open *place = half_open_on(node, link);\n    if (place != NULL) {\n        return;\n    }\n",
+    ),
+    "FAULT_C_LITTLE_ENDIAN": Change(
+        "session.c",
+        "    node->opens++;\n",
+        "    node->opens = __builtin_bswap64(__builtin_bswap64(node->opens) + 1);\n",
+    ),
+    "FAULT_ONE_SESSION": Change(
+        "session.c",
+        "    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {\n        if (!node->sessions[i].used) {",
+        "    for (int8_t i = 0; i < 1; i++) {\n        if (!node->sessions[i].used) {",
+    ),
+    "FAULT_STRANGER_ENDS_SESSION": Change(
+        "node.c",
+        "    outcome = cut(node, frame, length, &origin, &command);\n    if (",
+        "    outcome = cut(node, frame, length, &origin, &command);\n"
+        "    for (int8_t i = 0; !outcome && command.function == TEDS_IDENTIFY && i < TEDS_SESSIONS; i++) {\n"
+        "        if (command.command_class == TEDS_CLASS_SECURITY && teds_session_on(node, link) < 0) {\n"
+        "            teds_session_end(node, i);\n        }\n    }\n    if (",
+    ),
+    "FAULT_ANY_SIZE": Change(
+        "teds_store.c",
+        "    if (end - before + offset + length > TEDS_STAGING) {\n        return -TEDS_TOO_LARGE;\n    }\n",
+        "    if (end - before + offset + length > TEDS_STAGING) {\n        return 0;\n    }\n",
+    ),
+    "FAULT_REFUSED_WRITE_DROPS": Change(
+        "teds_store.c",
+        "    if (offset > staged) {\n        return -TEDS_BAD_FORM;",
+        "    if (offset > staged) {\n        teds_staging_drop(node);\n        return -TEDS_BAD_FORM;",
+    ),
+    "FAULT_EMPTY_WRITE": Change(
+        "teds_store.c",
+        "    failed = stage(node, (uint16_t)id, offset, command->payload + 5, command->length - 5);\n",
+        "    failed = command->length == 5\n"
+        "                 ? 0 : stage(node, (uint16_t)id, offset, command->payload + 5, command->length - 5);\n",
+    ),
+    "FAULT_REFUSED_COMMIT_COUNTS": Change(
+        "commit.c",
+        "    failed = check(node, &teds, image, length);\n    if (failed) {\n",
+        "    failed = check(node, &teds, image, length);\n    if (failed) {\n        node->state.sequence = teds.sequence;\n",
+    ),
+    "FAULT_DATASHEET_HIGH_S": Change("agree.c", "memcmp(signature + 32, HALF_ORDER, 32) > 0", "false"),
+    "FAULT_BASE64_NOT_STRICT": Change(
+        "security_teds.c", "return out[65] == 0 && (length == 65 || out[64] == 0);", "return true;"
+    ),
 }

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import signal
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -31,18 +34,41 @@ def ahead(node: CNode) -> None:
     node.program = script
 
 
+def dropped_while(running: Running, desk: Desk) -> str:
+    """What the kernel says of the sockets on this bus (``/proc/net/udp``) until the station's program ends.
+
+    What a socket's filter keeps out counts as dropped there: the station's own frames.
+    """
+    port = int(desk.links.can.partition("port=")[2].partition("&")[0])
+    dropped = queued = 0
+    while running.runs:
+        for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+            fields = line.split()
+            if int(fields[1].partition(":")[2], 16) == port:
+                dropped = max(dropped, int(fields[-1]))
+                queued = max(queued, int(fields[4].partition(":")[2], 16))
+        running.read(0.5)
+    return f"{dropped} dropped, its own frames among them; {queued} octets waiting at most"
+
+
 @pytest.mark.timeout(SECONDS + 300)
 @pytest.mark.parametrize("bus", ["&fd=1&bitrate=500000&data_bitrate=2000000", "&bitrate=1000000"], ids=["fd", "1M"])
 def test_ten_thousand_samples_a_second_are_all_there(desk: Desk, station: Station, node: CNode, bus: str) -> None:
     ahead(node)
-    node.start(*(["--fd"] if "fd=1" in bus else []), "--source", "ramp:1")
+    node.start(*(["--fd"] if "fd=1" in bus else []), "--source", "ramp:1", "--tell")
     links = ["--via", "can", "--can", desk.links.can + bus]
     done = station.ask("provision", "--profile", ANGLE, "--yes", *links)
     assert done["verdict"] == "authentic"
     request = ["--rate", "10000", "--duration", str(SECONDS), "--test-pattern"]
     running = station.start("measure", node.uuid, *request, *links)
     os.sched_setscheduler(running.process.pid, os.SCHED_FIFO, os.sched_param(10))
+    dropped = dropped_while(running, desk)
     said = running.end(SECONDS + 120)
+    assert node.process is not None
+    node.process.signal(signal.SIGTERM)
+    told = json.loads(node.process.end().out.splitlines()[-1])
+    print(f"node: {told['missed']} messages not sent, {told['dropped']} frames dropped by its socket")
+    print(f"sockets: {dropped}")
     counts = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", said.out + said.err)
     assert counts is not None, said
     values, _, lost, late, bad = map(int, counts.groups())

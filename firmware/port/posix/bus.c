@@ -1,5 +1,5 @@
 /* --can: INTERFACE:CHANNEL[?key=value&…], as the station's option; udp_multicast and socketcand. */
-#define _POSIX_C_SOURCE 200809L
+#define _DEFAULT_SOURCE
 #include "host.h"
 
 #include <errno.h>
@@ -99,4 +99,11 @@ int host_bus_send(host_bus *bus, const teds_can_frame *frame)
         host_pace_frame(bus->pace, frame, bus->bitrate, bus->data_bitrate);
     }
     return bus->is_socketcand ? socketcand_send(bus, frame) : multicast_send(bus, frame);
+}
+
+uint32_t host_bus_dropped(const host_bus *bus)
+{
+    uint32_t counts[9] = {0}; /* the last is SK_MEMINFO_DROPS (linux/sock_diag.h) */
+    socklen_t length = sizeof counts;
+    return getsockopt(bus->in, SOL_SOCKET, SO_MEMINFO, counts, &length) == 0 ? counts[8] : 0;
 }

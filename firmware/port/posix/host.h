@@ -37,6 +37,7 @@ typedef struct host_pace {
     bool on;
     uint64_t free_at, last; /* CAN: when the last frame was through, and how long it took */
     uint64_t came, before;  /* when what waits for an answer came, 0 for nothing; chip and flash until then */
+    uint64_t heard;         /* when a frame came last */
     uint64_t turns, turned; /* changes of direction, and ns of them beside what follows */
     uint64_t chip, flash;   /* ns in P-256, and until what was stored was written */
 } host_pace;
@@ -52,8 +53,6 @@ void host_pace_frame(host_pace *pace, const teds_can_frame *frame, uint32_t bitr
 /* Wait until `due`, when an answer would be through. */
 void host_pace_answer(host_pace *pace, uint64_t due);
 void host_hold(uint64_t until);
-/* One line of JSON: how many turnarounds, and seconds of each kind. */
-void host_pace_tell(const host_pace *pace);
 uint64_t host_wire_ns(const teds_can_frame *frame, uint32_t bitrate, uint32_t data_bitrate);
 /* From the first bit of a command to the last of its answer of so many octets, frame delays included. */
 uint64_t host_air_ns(const uint8_t *command, size_t length, size_t answer);
@@ -77,6 +76,8 @@ int host_bus_open(host_bus *bus, const char *spec, bool fd, host_pace *pace, boo
 /* The next frame, if one has come: 1, 0 none, -1 the bus is gone. */
 int host_bus_receive(host_bus *bus, teds_can_frame *frame);
 int host_bus_send(host_bus *bus, const teds_can_frame *frame);
+/* Datagrams that found no room in the socket (Linux: SO_MEMINFO). */
+uint32_t host_bus_dropped(const host_bus *bus);
 
 int multicast_open(host_bus *bus, const char *group, uint16_t port, int hop_limit);
 int multicast_receive(host_bus *bus, teds_can_frame *frame);

@@ -5,7 +5,6 @@
 #define _GNU_SOURCE
 #include "host.h"
 
-#include <stdio.h>
 #include <string.h>
 #include <sys/prctl.h>
 #include <time.h>
@@ -129,6 +128,7 @@ void host_hold(uint64_t until)
 void host_pace_start(host_pace *pace)
 {
     pace->on = true;
+    pace->heard = host_clock();
     (void)prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0); /* else Linux adds up to 50 us to each sleep */
 }
 
@@ -152,7 +152,7 @@ uint64_t host_arrival(struct msghdr *message)
 /* What came asks for an answer from here on; the time of chip and flash is told apart. */
 void host_pace_came(host_pace *pace, uint64_t at)
 {
-    pace->came = at;
+    pace->came = pace->heard = at;
     pace->before = pace->chip + pace->flash;
 }
 
@@ -187,11 +187,4 @@ void host_pace_answer(host_pace *pace, uint64_t due)
     pace->turns++;
     pace->came = 0;
     host_hold(due);
-}
-
-void host_pace_tell(const host_pace *pace)
-{
-    (void)printf("{\"turns\": %lu, \"turned\": %.6f, \"chip\": %.6f, \"flash\": %.6f}\n", (unsigned long)pace->turns,
-                 (double)pace->turned / 1e9, (double)pace->chip / 1e9, (double)pace->flash / 1e9);
-    (void)fflush(stdout);
 }

@@ -1,0 +1,69 @@
+"""What gcov counted in all builds of the library, together: ``python -m tests.firmware.coverage BUILD``.
+
+A line or a branch counts as reached where one build reached it; a build leaves out what it was not given.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+
+from tests.firmware.builds import FIRMWARE
+
+Counts = dict[tuple[int, int], bool]
+
+
+def counted(build: Path) -> dict[str, Counts]:
+    """By file of ``firmware/src``: each branch (line, number) and each line (line, -1), and whether it was reached."""
+    found: dict[str, Counts] = defaultdict(dict)
+    with tempfile.TemporaryDirectory() as folder:
+        for data in sorted(build.rglob("*.gcda")):
+            words = ["gcov", "--json-format", "--branch-probabilities", str(data.resolve())]
+            subprocess.run(words, cwd=folder, check=True, capture_output=True)
+            for written in Path(folder).glob("*.gcov.json.gz"):
+                take(json.loads(gzip.decompress(written.read_bytes())), found)
+                written.unlink()
+    return found
+
+
+def take(said: dict[str, list[dict[str, object]]], found: dict[str, Counts]) -> None:
+    """Add what gcov says of one object."""
+    for each in said["files"]:
+        path = Path(str(each["file"]))
+        if path.parent.name != "src" or path.suffix != ".c":
+            continue
+        counts = found[path.name]
+        lines: list[dict[str, object]] = each["lines"]  # type: ignore[assignment]
+        for line in lines:
+            number: int = line["line_number"]  # type: ignore[assignment]
+            branches: list[dict[str, int]] = line["branches"]  # type: ignore[assignment]
+            counts[number, -1] = counts.get((number, -1), False) or line["count"] != 0
+            for place, branch in enumerate(branches):
+                counts[number, place] = counts.get((number, place), False) or branch["count"] != 0
+
+
+def share(counts: list[Counts], branches: bool) -> str:
+    """Of so many, so many per cent."""
+    reached = [seen for each in counts for (_, place), seen in each.items() if (place >= 0) is branches]
+    return f"{sum(reached) / max(1, len(reached)):7.1%} of {len(reached):5,}"
+
+
+def main(arguments: list[str]) -> None:
+    """Print a line for each file, what it did not reach, and the sum."""
+    found = counted(Path(arguments[0]))
+    missing = {path.name for path in (FIRMWARE / "src").glob("*.c")} - set(found)
+    assert not missing, f"nothing was counted of {', '.join(sorted(missing))}"
+    for name, counts in sorted(found.items()):
+        lines = sorted(number for (number, place), seen in counts.items() if place == -1 and not seen)
+        print(f"{name:<20}lines {share([counts], False)}   branches {share([counts], True)}   {lines}")
+    every = list(found.values())
+    print(f"{'together':<20}lines {share(every, False)}   branches {share(every, True)}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
