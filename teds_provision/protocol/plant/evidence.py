@@ -51,6 +51,9 @@ GOOD_RESULTS: Final = frozenset({"ok", "done", "nothing to do", "skipped"})
 _MAX_SEPARATORS: Final = 40_000
 _MAX_STEPS: Final = 64
 _DEPTH: Final = 4
+_spelled: Final = json.JSONEncoder(
+    sort_keys=True, separators=(",", ":"), ensure_ascii=False, check_circular=False
+).encode
 _UUID_NAME: Final = re.compile(r"teds:([0-9a-f]{20})")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
@@ -112,9 +115,8 @@ class Claim:
 
 def canonical(facts: Mapping[str, Any], subject: object) -> bytes:
     """RFC 8785 form of ``{facts, subject}``, which hold texts, whole numbers, lists and null alone."""
-    members = {"facts": facts, "subject": subject}
     try:
-        return json.dumps(members, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
+        return _spelled({"facts": facts, "subject": subject}).encode()
     except UnicodeEncodeError as error:  # half a surrogate pair
         raise BadData("A text of the evidence is not Unicode.") from error
 
@@ -200,7 +202,8 @@ class Evidence:
 def read(octets: bytes) -> Evidence:
     """Read an envelope; raises BadData for what is not of our form, whatever the octets."""
     check_size(len(octets), MAX_OCTETS, "the evidence")
-    refuse_many(separators(octets), 64, "an envelope of evidence")
+    if len(octets) > _MAX_SEPARATORS:
+        refuse_many(separators(octets), 64, "an envelope of evidence")
     envelope = load_object(octets, "The evidence")
     if envelope.keys() != {"payload", "payloadType", "signatures"} or envelope["payloadType"] != PAYLOAD_TYPE:
         raise BadData(f"This is not a DSSE envelope of {PAYLOAD_TYPE}.", hint="Evidence comes from: evidence export")
@@ -276,8 +279,7 @@ class Signatures(NamedTuple):
 def ready(evidence: Evidence) -> Ready:
     """Look at everything that comes before the signatures."""
     try:
-        shown = security.decode(evidence.teds)
-        signed = security.tbs(evidence.uuid, evidence.teds)
+        shown, signed = security.decode_with_tbs(evidence.uuid, evidence.teds)
     except BadData as error:
         return Ready(evidence, None, error.message, b"", b"")
     asked = prove_message(evidence.uuid, challenge(evidence.nonce, evidence.bound)) if evidence.proof else b""
@@ -443,10 +445,11 @@ def _heads(heads: object) -> tuple[str, int]:
 
 def _sha256(members: Members, name: str) -> str:
     """As ``Members.sha256``, and in lower case: another spelling is another text to the board's signature."""
-    text = members.sha256(name)
-    if text != members.get(name):
-        raise BadData(f"The facts: {name} is not in lower case.")
-    return text
+    text = members.get(name)
+    if isinstance(text, str) and _DIGEST.fullmatch(text):
+        return text
+    members.sha256(name)
+    raise BadData(f"The facts: {name} is not in lower case.")
 
 
 def _sha256_or_none(members: Members, name: str) -> str | None:

@@ -151,6 +151,17 @@ def decode_block(block: bytes) -> SecurityTeds:
         parts = _places(block)
     except BadData as error:
         raise NotCanonical(error.message) from error
+    return _read(block, parts)
+
+
+def decode_with_tbs(uuid: bytes, teds: bytes) -> tuple[SecurityTeds, bytes]:
+    """:func:`decode` and :func:`tbs` in one walk, for who judges many that are each seen once."""
+    block = unframe(teds)
+    places = _places(block)
+    return _read(block, places), _without_signature(uuid, block, places)
+
+
+def _read(block: bytes, parts: list[tuple[int, int, int]]) -> SecurityTeds:
     if block[:6] != TEDSID_TUPLE:
         raise NotCanonical("The first tuple of the Security TEDS is not exactly 03 04 00 80 01 01.")
     values, blocks = _ascending(block, parts[1:])
@@ -177,8 +188,12 @@ def decode_block(block: bytes) -> SecurityTeds:
 def tbs(uuid: bytes, teds: bytes) -> bytes:
     """What field 100 signs: label ‖ UUID ‖ the data block without the tuple of type 100, cut from the octets."""
     block = unframe(teds)
+    return _without_signature(uuid, block, _places(block))
+
+
+def _without_signature(uuid: bytes, block: bytes, places: list[tuple[int, int, int]]) -> bytes:
     kept, done = [b"TEDS1 datasheet\0", uuid], 0
-    for number, start, end in _places(block):
+    for number, start, end in places:
         if number == SIGNATURE:
             kept.append(block[done : start - 2])
             done = end
