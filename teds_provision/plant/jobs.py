@@ -129,6 +129,15 @@ def require_open(station: Station, job: Job, *, for_station: str | None = None) 
         raise PolicyRefused(f"The job “{job.title}” cannot be worked on: {why}.", hint="Ask the keeper for a new job.")
 
 
+def require_adopted(station: Station) -> None:
+    """Raise PolicyRefused where a backup rebuilt this home and it does not know yet which units it gave since."""
+    if station.plant.restored:
+        raise PolicyRefused(
+            "This home came back from a backup: which units it gave since then, only its pages say.",
+            hint="Bring them: teds-provision registry sync",
+        )
+
+
 def close_job(station: Station, job: Job) -> None:
     """Take no further board of a job here, and tell the others."""
     with station.durable("job"):

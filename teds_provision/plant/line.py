@@ -15,7 +15,7 @@ from teds_provision.files import read_limited
 from teds_provision.plant.asking import Office, Wanted, by_office
 from teds_provision.plant.evidence import TOOL, make_folder, sign_evidence
 from teds_provision.plant.folding import heads_digest
-from teds_provision.plant.jobs import digest_of_file, profile_file, require_open
+from teds_provision.plant.jobs import digest_of_file, profile_file, require_adopted, require_open
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
@@ -223,6 +223,7 @@ class LineRun:
         kept = tables.unit(job.id, uuid)
         if kept is not None:
             return replace(kept, attempts=kept.attempts + 1)
+        require_adopted(self.station)
         given, _, greatest = tables.count_units(job.id)
         allotment = job.stations[self._own] if job.count is not None else len(job.boards)
         if given >= allotment:

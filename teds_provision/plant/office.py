@@ -14,7 +14,7 @@ from typing import Final
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProvisionError
 from teds_provision.plant.asking import name_of, received, send
-from teds_provision.plant.jobs import now_of, profile_file, read_job, require_open, roster_of
+from teds_provision.plant.jobs import now_of, profile_file, read_job, require_adopted, require_open, roster_of
 from teds_provision.plant.post import Post
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.fingerprints import same_key
@@ -60,6 +60,7 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
             "This station signs no datasheets: the roster does not give it the role sign.",
             hint="Have the owner give it: teds-provision registry role NAME sign",
         )
+    require_adopted(station)
     try:
         request = open_request(octets, roster.point_of)
     except (BadData, NotAuthentic):

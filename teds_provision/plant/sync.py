@@ -29,12 +29,13 @@ from teds_provision.plant.post import Carried, Post
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.document import NewerFormat, hash_of
+from teds_provision.protocol.plant.evidence import PASSED
 from teds_provision.protocol.plant.fold import View
 from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Draft, Page, open_page, seal_page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant import new_home
 from teds_provision.station.station import Station
-from teds_provision.store import StoreLock, utc_now
+from teds_provision.store import StoreLock, UnitRow, utc_now
 from teds_provision.store.tables.plant import Chain
 
 LOCK_FILE: Final = "registry.lock"
@@ -210,9 +211,11 @@ def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
 
 
 def _know_again(station: Station, page: Page) -> None:
-    """Epochs and sequences that this station reached before it was put back: none of them is given out twice."""
+    """Epochs, sequences and units that this station gave before it was put back: none of them is given out twice."""
     reached: dict[bytes, tuple[int, int]] = {}
     for one in map(event.read, page.events):
+        if isinstance(one, event.Event) and one.act == "evidence" and one.uuid is not None and one.members["unit"]:
+            _know_unit(station, one.uuid, one)
         if isinstance(one, event.Event) and one.act in ("agreed", "signed", "written") and one.uuid is not None:
             epoch, sequence = reached.get(one.uuid, (0, 0))
             reached[one.uuid] = max(epoch, one.members["epoch"]), max(sequence, one.members.get("sequence", 0))
@@ -220,6 +223,22 @@ def _know_again(station: Station, page: Page) -> None:
         node = station.nodes.get(uuid)
         if node is not None:
             station.nodes.remember(uuid, epoch=max(node.epoch, epoch), sequence=max(node.sequence, sequence))
+
+
+def _know_unit(station: Station, uuid: bytes, said: event.Event) -> None:
+    """The unit that an attempt was about, and one attempt more; passed over where another board has it by now."""
+    job, unit, tables = said.members["job"], said.members["unit"], station.plant.line
+    if job is None:
+        return
+    kept = tables.unit(job, uuid)
+    if kept is None and any(row.unit == unit for row in tables.units(job)):
+        station.notice(
+            f"Unit {unit} of the job {job} was given twice: also to {uuid.hex()}, before this home was put back."
+        )
+        return
+    row = UnitRow(job, uuid, unit, said.at) if kept is None else replace(kept, attempts=kept.attempts + 1)
+    passed = row.attempts if said.members["verdict"] == PASSED and not row.passed else row.passed
+    tables.put_unit(replace(row, passed=passed))
 
 
 def _after_restore(station: Station, roster: Roster, there: set[int]) -> None:

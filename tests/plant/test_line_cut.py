@@ -1,0 +1,205 @@
+"""A line and its office cut at every durable step: the same command carries on, and no unit is given twice or lost.
+
+What lies on the disk at a commit, or before a file gets its name, is set aside as kill -9 would leave it; the board
+stays what it is by then, and the work is carried on from that disk. A small share runs in the gate; ``make faults``
+runs all.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from teds_provision import files
+from teds_provision.errors import PolicyRefused
+from teds_provision.plant.files import FilesPost
+from teds_provision.plant.jobs import find_job, take_job
+from teds_provision.plant.line import LineRun
+from teds_provision.plant.office import answer
+from teds_provision.plant.sync import sync
+from teds_provision.protocol.plant import evidence as codec
+from teds_provision.station.station import Station
+from teds_provision.store.connection import Connection
+
+from .owner import alone, job_of
+from .stations import Plant, ask
+from .test_jobs import board, build, units
+from .test_office import AtHand
+
+Homes = dict[str, Station]
+
+
+class Killed(BaseException):
+    """The machine stopped."""
+
+
+@contextmanager
+def killed_at(step: int, folder: Path, disk: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Stop before the durable step of this number, and keep as ``disk`` what ``folder`` held then."""
+    left = step
+    execute, publish = Connection.execute, files._publish
+
+    def one_step() -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            if not disk.exists():
+                shutil.copytree(folder, disk)
+            raise Killed
+
+    def counted(self: Connection, statement: str, values: object = ()) -> object:
+        if statement == "COMMIT":
+            one_step()
+        return execute(self, statement, values)  # type: ignore[arg-type]
+
+    def published(draft: Path, path: Path, *, replace: bool) -> None:
+        one_step()
+        publish(draft, path, replace=replace)
+
+    with patch.context() as patched:
+        patched.setattr(Connection, "execute", counted)
+        patched.setattr(files, "_publish", published)
+        yield
+
+
+@contextmanager
+def opened(folder: Path, *names: str) -> Iterator[Homes]:
+    homes = {name: Station.open(folder / name, ask=ask) for name in names}
+    try:
+        for one in homes.values():
+            one.unlock()
+        yield homes
+    finally:
+        for one in homes.values():
+            one.close()
+
+
+def cut(
+    folder: Path, names: tuple[str, ...], steps: range, patch: pytest.MonkeyPatch, line_of: Callable[[Homes], LineRun]
+) -> Iterator[Homes]:
+    """Build a board and be cut at each step, carry on, build another; gives the homes as they are then."""
+    for step in steps:
+        work, disk, one = folder / "work", folder / "disk", board(1)
+        shutil.copytree(folder / "kept", work)
+        with opened(work, *names) as homes:
+            line = line_of(homes)
+            with killed_at(step, work, disk, patch), suppress(Killed):
+                build(line, one)
+        if not disk.exists():
+            return
+        with opened(disk, *names) as homes:
+            line = line_of(homes)
+            assert build(line, one).verified.verdict == "authentic", step
+            assert build(line, board(2)).verified.verdict == "authentic", step
+            given = units(line)
+            assert [unit for unit, _, _ in given] == [1, 2], step
+            assert all(passed for _, _, passed in given), step
+            rows = list(line.station.plant.line.evidence())
+            assert {row.unit for row in rows if row.verdict == codec.PASSED} == {1, 2}, step
+            assert len({(row.uuid, row.attempt) for row in rows}) == len(rows), step
+            assert all(codec.faults(codec.read(row.document), line.station.identity.ca) == [] for row in rows), step
+            yield homes
+        shutil.rmtree(work)
+        shutil.rmtree(disk)
+
+
+def cut_line(folder: Path, steps: range, patch: pytest.MonkeyPatch) -> int:
+    station = alone(folder / "kept" / "home")
+    job = take_job(station, job_of(station))
+    station.close()
+    return sum(
+        1
+        for _ in cut(
+            folder, ("home",), steps, patch, lambda homes: LineRun(homes["home"], find_job(homes["home"], job.id))
+        )
+    )
+
+
+def cut_office(folder: Path, steps: range, patch: pytest.MonkeyPatch) -> int:
+    (folder / "kept").mkdir()
+    plant = Plant(folder / "kept")
+    west, north = plant.member("west", "line"), plant.north
+    north.unlock()
+    own = {"stations": {west.identity.fingerprint: 3}, "sign": north.identity.fingerprint}
+    document = job_of(north, registry=plant.roster.registry, **own)
+    take_job(north, document)
+    job = take_job(west, document)
+    plant.close()
+
+    def line_of(homes: Homes) -> LineRun:
+        return LineRun(homes["west"], find_job(homes["west"], job.id), office=AtHand(homes["north"]))
+
+    done = 0
+    for homes in cut(folder, ("north", "west"), steps, patch, line_of):
+        tables = homes["north"].plant.line
+        assert [row.unit for row in tables.units(job.id)] == [1, 2]
+        for row in tables.units(job.id):
+            answered = [one.sequence for one in tables.sign_requests(job.id, row.uuid, "in")]
+            assert len(set(answered)) == len(answered), "each request has a sequence of its own"
+            for one in tables.sign_requests(job.id, row.uuid, "in"):
+                assert answer(homes["north"], one.request) == one.answer, "the same request gets the same answer"
+        done += 1
+    return done
+
+
+def test_a_line_that_is_killed_carries_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cut_line(tmp_path, range(1, 12, 4), monkeypatch) >= 2
+
+
+def test_an_office_that_is_killed_carries_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cut_office(tmp_path, range(3, 12, 4), monkeypatch) >= 2
+
+
+@pytest.mark.soak
+def test_a_line_that_is_killed_at_any_step_carries_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cut_line(tmp_path, range(100), monkeypatch) >= 6
+
+
+@pytest.mark.soak
+def test_an_office_that_is_killed_at_any_step_carries_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cut_office(tmp_path, range(100), monkeypatch) >= 8
+
+
+def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_since(tmp_path: Path) -> None:
+    plant = Plant(tmp_path)
+    west = plant.member("west", "line", "sign")
+    plant.north.unlock()
+    own = {"stations": {west.identity.fingerprint: 3}}
+    job = take_job(west, job_of(plant.north, registry=plant.roster.registry, **own))
+    west.unlock()
+    build(LineRun(west, job), board(1))
+    sync(west, FilesPost(plant.stick))
+    west.close()
+    shutil.copytree(tmp_path / "west", tmp_path / "backup")
+    with opened(tmp_path, "west") as homes:
+        build(LineRun(homes["west"], job), board(2))
+        sync(homes["west"], FilesPost(plant.stick))
+    with opened(tmp_path, "backup") as homes:
+        back = homes["backup"]
+        back.plant.begin_restored()
+        line, third = LineRun(back, job), board(3)
+        with pytest.raises(PolicyRefused, match="came back from a backup"):
+            build(line, third)
+        assert units(line) == [(1, 1, 1)]
+        sync(back, FilesPost(plant.stick))
+        assert units(line) == [(1, 1, 1), (2, 1, 1)]
+        build(line, third)
+        assert [unit for unit, _, _ in units(line)] == [1, 2, 3]
+        with pytest.raises(PolicyRefused, match="one too many"):
+            build(line, board(4))
+    plant.north.close()
+
+
+def test_an_office_out_of_an_old_backup_answers_nobody_before_it_knows_its_pages(tmp_path: Path) -> None:
+    plant = Plant(tmp_path)
+    plant.north.unlock()
+    plant.north.plant.begin_restored()
+    with pytest.raises(PolicyRefused, match="came back from a backup"):
+        answer(plant.north, b"")
+    plant.sync(plant.north)
+    assert answer(plant.north, b"") is None
+    plant.north.close()
