@@ -84,6 +84,10 @@ class LinkFailure(TedsProvisionError):
     code = "link"
 
 
+class KeyStolen(LinkFailure):
+    """A session ended because a thief has its key; the next one begins with a new key."""
+
+
 class NoReader(LinkFailure):
     """The reader or the CAN adapter cannot be opened."""
 

@@ -127,7 +127,8 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
             require_same(type(plan) is type(shown))
             done = plant.parcels.import_parcel(station, row, plan)
         one["fresh"] = done.fresh
-    text = f"{len(told)} parcels." if dry_run else f"{len(told)} parcels taken in; receipts leave with the next sync."
+    count = f"{len(told)} parcel{'s' * (len(told) != 1)}"
+    text = f"{count}." if dry_run else f"{count} taken in; receipts leave with the next sync."
     app.emit({"received": told, "plan": dry_run}, text if told else "Nothing waits.")
 
 

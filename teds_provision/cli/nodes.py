@@ -76,7 +76,7 @@ def nodes(
     if fits is not None:
         show_fits(app, station, fits, found)
         return
-    described = inventory(station, found)
+    described = _with_conflicts(station, inventory(station, found))
     if app.json or form == "json":
         print_json_list("nodes", described)
     elif form == "csv":
@@ -89,6 +89,14 @@ def nodes(
         _table(described)
 
 
+def _with_conflicts(station: Station, described: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Each node with what the stations of the plant do not agree on; the same nodes where none was joined."""
+    found: dict[str, list[dict[str, str]]] = {}
+    for uuid, name, why in station.plant.tables.conflicts() if station.plant.joined is not None else ():
+        found.setdefault(uuid.hex(), []).append({"name": name, "why": why})
+    return ({**node, "conflicts": found.get(node["uuid"], [])} for node in described)
+
+
 def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) -> None:
     """What the stations of the plant say of nodes, those too that this one never met."""
     described = plant.status.nodes(station, plant.folding.require_roster(station), text)
@@ -97,10 +105,11 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
         return
     for node in described:
         says = node["says"]
-        holders = ", ".join(name for names in says["holders"].values() for name in names) or "nobody"
+        holders = ", ".join(name for names in says["holders"].values() for name in names)
         written = f", datasheet {says['sequence']} by {says['written_by']}" if says["written_by"] else ""
         banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
-        line = f"{node['uuid']}  {shown(node['name'])}  held by {holders} (epoch {says['epoch']}){written}{banned}"
+        held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "held by nobody"
+        line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), f"{held}{written}{banned}")))
         app.lines([line, *(f"  {one['name']}: {shown(one['why'])}" for one in node["conflicts"])])
 
 
@@ -236,6 +245,7 @@ _LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
     ("groups", lambda node: ", ".join(node["groups"])),
     ("link key", _link_keys),
     ("rotation", lambda node: node["rotation_due"] or ""),
+    ("conflict", lambda node: [f"{one['name']}: {one['why']}" for one in node["conflicts"]]),
     ("remarks", _remarks),
 )
 

@@ -472,11 +472,12 @@ def sync(app: App, files: Path | None) -> None:
 
 
 def _synced(station: Station, done: Synced, alarms: Sequence[Any]) -> str:
-    lines = [f"{done.pushed} pages out, {done.fetched} in"]
+    lines = [f"{_count(done.pushed, 'page')} out, {done.fetched} in"]
     if done.parcels_in or done.parcels_out:
-        lines.append(f"{done.parcels_out} parcels out, {done.parcels_in} in")
+        lines.append(f"{_count(done.parcels_out, 'parcel')} out, {done.parcels_in} in")
     if done.waiting:
-        lines.append(f"{done.waiting} parcels wait for a person: teds-provision import-keys --received")
+        waits = f"{_count(done.waiting, 'parcel')} {'waits' if done.waiting == 1 else 'wait'}"
+        lines.append(f"{waits} for a person: teds-provision import-keys --received")
     lines += [f"roster {version} counts from now on" for version in done.rosters]
     lines += done.told
     lines += [f"ALARM {_alarm_line(station, one)}" for one in alarms]
@@ -553,7 +554,7 @@ def _shown(station: Station, found: Status) -> str:
         age = _age(one.age) if one.age is not None else "-"
         lines.append(f"{one.name:<{wide}}  {' '.join(one.roles):<{roles}}  page {one.n:>5}  {age:>8}  {one.state}")
     last = f"last sync {local_time(found.record.synced)}" if found.record.synced else "never synced"
-    lines.append(f"{found.conflicts} conflicts, {found.unsent} events unsent, {last}")
+    lines.append(f"{_count(found.conflicts, 'conflict')}, {_count(found.unsent, 'event')} unsent, {last}")
     review, due = plant.leaving.last(station), plant.leaving.due(station)
     if review is not None and (due or review.alone):
         tap = f"; {review.alone} need a tap" if review.alone else ""
@@ -564,6 +565,10 @@ def _shown(station: Station, found: Status) -> str:
     elif found.expires_soon:
         lines.append("The roster expires soon: where the CA key is, registry renew")
     return "\n".join(lines)
+
+
+def _count(number: int, one: str) -> str:
+    return f"{number} {one}{'' if number == 1 else 's'}"
 
 
 def _age(seconds: int) -> str:
@@ -640,7 +645,7 @@ def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool)
     station.unlock()
     with station.lock("registry vouch", app.note):
         done = plant.membership.vouch(station, found)
-    app.emit({**told, "done": done}, f"Vouched for {done} datasheets. To tell the others: registry sync")
+    app.emit({**told, "done": done}, f"Vouched for {_count(done, 'datasheet')}. To tell the others: registry sync")
 
 
 @command("teds-provision registry accept west --page 4f1c09aa77e012bd", name="accept")
@@ -648,13 +653,18 @@ def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool)
 @click.option("--page", metavar="HASH", help="The first page of the branch: at least 8 digits of its H.")
 @_files
 @yes_option
+@dry_run_option
 @pass_app
-def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool) -> None:
+def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool, dry_run: bool) -> None:
     """Take one of a station's two histories, here alone. A roster that removes it goes before this."""
     station = app.station()
     held = plant.folding.require_roster(station)
     member = plant.owner.require_member(held, name)
     post = plant.files.FilesPost(files) if files is not None else plant.reaching.post_of(station)
+    if dry_run:
+        n, hash = plant.membership.branch(station, member.fingerprint, page, post)
+        app.emit({"done": 0, "n": n, "hash": hash, "plan": True}, f"Plan: page {n} ({hash[:16]}) would count here.")
+        return
     app.confirm(f"Take this history of {member.name}?", yes=yes, named="--page")
     station.unlock()
     with plant.sync.alone(station):
@@ -666,8 +676,9 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool)
 @command("teds-provision registry resume", name="resume")
 @_files
 @yes_option
+@dry_run_option
 @pass_app
-def resume(app: App, files: Path | None, yes: bool) -> None:
+def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
     """Go on after a fork.
 
     Pages under this station's key that lie there are taken for its own.
@@ -676,10 +687,14 @@ def resume(app: App, files: Path | None, yes: bool) -> None:
     """
     station = app.station()
     post, _ = _post(station, files)
+    if dry_run:
+        there = len(plant.sync.strange(station, post))
+        app.emit({"done": 0, "adopts": there, "plan": True}, f"Plan: {_count(there, 'page')} would be adopted.")
+        return
     app.note("If a copy of this home is at work elsewhere, end it first; in doubt have this station removed.")
     app.confirm("Is this the only home with this station's key?", yes=yes)
     done = plant.sync.resume(station, post)
-    app.emit({"done": done}, f"{done} pages were adopted. Next: teds-provision registry sync")
+    app.emit({"done": done}, f"Adopted: {_count(done, 'page')}. Next: teds-provision registry sync")
 
 
 @command("teds-provision registry seen", name="seen")
@@ -694,7 +709,7 @@ def seen(app: App) -> None:
     with station.lock("registry seen", app.note):
         done = station.plant.tables.see_alarms()
         station.audit("registry", None, "seen", alarms=done)
-    app.emit({"done": done}, f"{done} alarms seen.")
+    app.emit({"done": done}, f"{_count(done, 'alarm')} seen.")
 
 
 @command(

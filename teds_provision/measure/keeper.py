@@ -19,6 +19,7 @@ from teds_provision.errors import (
     BadData,
     BadDatasheet,
     Bug,
+    KeyStolen,
     LinkFailure,
     NodeRefused,
     NoRoom,
@@ -269,7 +270,7 @@ class NodeKeeper:
                 standing.drives = self._driven is not None
                 self._keep(bus, trusted, standing)
                 answers = True
-            except (NotAuthentic, PolicyRefused, BadData):
+            except (NotAuthentic, PolicyRefused, BadData, KeyStolen):
                 answers = True  # what it was asked for would go on until its lease ends
                 raise
             finally:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadData, KeyStolen, PolicyRefused
 from teds_provision.links.ports import Timed
 from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.measure.blocks import Kind as KindWord
@@ -198,10 +198,14 @@ class Standing:
     def __init__(self, station: Station, uuid: bytes) -> None:
         self._station, self._uuid = station, uuid
         self._version = station.version()
+        self._stolen = station.keys.stolen(uuid)  # known when it began: the session was opened all the same
         self.drives = False
 
     def require(self) -> None:
-        """Raise PolicyRefused where the node may not be measured, or not be moved, any more."""
+        """Raise PolicyRefused where the node may not be measured, or not be moved, any more.
+
+        KeyStolen where it may, under a new key: the session ends, and the next one begins with a rotation.
+        """
         version = self._station.version()
         if version == self._version:
             return
@@ -213,6 +217,11 @@ class Standing:
             raise PolicyRefused(f"Node {self._uuid.hex()} was revoked: {revoked.why}.")
         if not self._station.keys.held(self._uuid):
             raise PolicyRefused(f"The key of node {self._uuid.hex()} is not held here any more.")
+        stolen = self._station.keys.stolen(self._uuid)
+        if stolen is None:
+            self._stolen = None
+        elif stolen != self._stolen:
+            raise KeyStolen(f"Node {self._uuid.hex()} gets a new key: {stolen}.")
         if self.drives:
             require_whitelisted(self._station, self._uuid)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from functools import lru_cache
@@ -20,6 +20,7 @@ from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim, Key
 from teds_provision.protocol.plant.roster import Removed, Roster, open_roster
+from teds_provision.station.node_keys import STOLEN
 from teds_provision.station.station import Station
 from teds_provision.store import KeyRecord
 
@@ -58,7 +59,7 @@ def review(station: Station, roster: Roster, now: datetime) -> Review | None:
     beyond = _beyond(station, roster)
     of = 0
     for page in _pages(station):
-        keys = {key.uuid: key for key in station.keys.of_page(page) if key.state == "active"}
+        keys = _held(station, page)
         of += len(keys)
         _mark(station, roster, keys, beyond, now, ours)
     found = Review(now.isoformat(), named, of, _alone(station, roster))
@@ -80,14 +81,25 @@ def due(station: Station) -> int:
 
 def _pages(station: Station) -> Iterable[list[bytes]]:
     page: list[bytes] = []
-    for uuid, _, _, state in station.keys.each_name():
-        if state == "active":
+    seen: set[bytes] = set()
+    for uuid, _, _, _ in station.keys.each_name():
+        if uuid not in seen:
+            seen.add(uuid)
             page.append(uuid)
         if len(page) == _PAGE:
             yield page
             page = []
     if page:
         yield page
+
+
+def _held(station: Station, page: Sequence[bytes]) -> dict[bytes, KeyRecord]:
+    """The key of each node: the active one, or the newest of those that no session has proven yet (copies)."""
+    found: dict[bytes, KeyRecord] = {}
+    for key in station.keys.of_page(page):
+        if key.uuid not in found or found[key.uuid].state != "active":
+            found[key.uuid] = key
+    return found
 
 
 def _mark(
@@ -103,7 +115,8 @@ def _mark(
     marked = station.keys.due_of_page(list(keys))
     wanted: dict[bytes, str] = {}
     for uuid, key in keys.items():
-        if uuid in marked:
+        already = station.keys.rotation_due(uuid) or "" if uuid in marked else None
+        if already is not None and (already.startswith(STOLEN) or not already.startswith(WHY)):
             continue
         said = {one: Claim.from_json(text) for one, text in claims.get(uuid, {}).items()}
         had = beyond.get((uuid, key.epoch, key.key_id), set()) | {
@@ -116,7 +129,11 @@ def _mark(
             if one.why == "retired" and forgot >= key.epoch:
                 continue
             if key.source == "agreement" or now - ours.get(one.fingerprint, now) >= OTHERS:
+                if one.why == "stolen":
+                    wanted[uuid] = f"{STOLEN}{one.name} has had this key"
+                    break
                 wanted[uuid] = f"{WHY}{one.name} ({one.why}) has had this key"
+    wanted = {uuid: why for uuid, why in wanted.items() if uuid not in marked or why.startswith(STOLEN)}
     if wanted:
         with station.durable(_COMMAND):
             for uuid, why in wanted.items():
@@ -171,7 +188,7 @@ def _alone(station: Station, roster: Roster) -> int:
     count, after = 0, b""
     while page := station.plant.tables.claimed_nodes(after, _PAGE):
         after = page[-1]
-        held = {key.uuid for key in station.keys.of_page(page) if key.state == "active"}
+        held = _held(station, page).keys()
         seen = views(station, roster, page)
         count += sum(not seen[uuid].held and bool(seen[uuid].left) and uuid not in held for uuid in page)
     return count

@@ -139,6 +139,17 @@ def accept(station: Station, of: str, hash: str | None, post: Post | None) -> tu
 
     Local: others decide for themselves, and a roster's ``last`` goes before it. Returns the page that was taken.
     """
+    n, wanted = branch(station, of, hash, post)
+    tables = station.plant.tables
+    with station.transaction():
+        tables.put_chain(replace(tables.chain(of), accepted=(n, wanted)))
+        recount(station, tables.chain(of), require_roster(station))
+        station.audit("registry", None, "accepted", station=of, n=n, hash=wanted)
+    return n, wanted
+
+
+def branch(station: Station, of: str, hash: str | None, post: Post | None) -> tuple[int, str]:
+    """The branch that :func:`accept` takes: number and H of its first page. Raises NotFound, PolicyRefused."""
     roster = require_roster(station)
     tables = station.plant.tables
     chain: Chain = tables.chain(of)
@@ -156,8 +167,4 @@ def accept(station: Station, of: str, hash: str | None, post: Post | None) -> tu
         raise PolicyRefused(
             f"Page {n} of {roster.name_of(of)} is here twice: {listed}.", hint="Name the one to take: --page HASH"
         )
-    with station.transaction():
-        tables.put_chain(replace(chain, accepted=(n, wanted[0])))
-        recount(station, tables.chain(of), roster)
-        station.audit("registry", None, "accepted", station=of, n=n, hash=wanted[0])
     return n, wanted[0]

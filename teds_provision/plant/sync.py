@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from teds_provision.errors import NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.errors import Fork, NotAuthentic, NotMember, PolicyRefused, TedsProvisionError
 from teds_provision.plant import leaving, parcels
 from teds_provision.plant.folding import (
     EVENTS_AT_ONCE,
@@ -41,18 +41,6 @@ from teds_provision.store.tables.plant import Chain
 LOCK_FILE: Final = "registry.lock"
 _ROOM: Final = 20_000
 """Octets of a page that are kept for its heads and its other members."""
-
-
-class NotMember(PolicyRefused):
-    """A station does not belong to the registry (any more)."""
-
-    code = "not-member"
-
-
-class Fork(NotAuthentic):
-    """Pages under this station's key that it did not write: a disk image was put back, or a copy of it is at work."""
-
-    code = "fork"
 
 
 @dataclass
@@ -120,7 +108,7 @@ def _rosters(station: Station, post: Post, done: Synced) -> list[tuple[Roster, s
         )
     told = take_rosters(station, post.rosters())
     for roster, how, why in told:
-        if how != "taken":
+        if how not in ("taken", "older"):  # each member posts the newest that it knows: some are behind
             done.told.append(f"roster {roster.version}: {how}: {why}")
     held = station.plant.tables.held_roster()
     if held is not None:
@@ -264,9 +252,8 @@ def resume(station: Station, post: Post) -> int:
     with alone(station):
         roster = require_roster(station)
         chain = own_chain(station)
-        found, _ = read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)
-        known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain)}
-        new = [page for page in found if (page.n, page.hash) not in known]
+        found = _under_our_key(station, post, roster)
+        new = _strange(station, found)
         with station.transaction():
             if new:
                 newest = max(new, key=lambda one: (one.n, one.hash))
@@ -284,6 +271,21 @@ def resume(station: Station, post: Post) -> int:
             station.audit("registry", None, "resumed", adopted=len(new))
         new_home(station.home)
     return len(new)
+
+
+def strange(station: Station, post: Post) -> list[Page]:
+    """The pages under this station's key that lie there and that it does not know: what :func:`resume` adopts."""
+    return _strange(station, _under_our_key(station, post, require_roster(station)))
+
+
+def _under_our_key(station: Station, post: Post, roster: Roster) -> list[Page]:
+    post.registry()  # a database is looked at anew
+    return read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)[0]
+
+
+def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
+    known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(own_chain(station).chain)}
+    return [page for page in found if (page.n, page.hash) not in known]
 
 
 def _counted(station: Station, chain: Chain) -> list[tuple[int, str]]:

@@ -25,6 +25,8 @@ _NO_MARKS: Final = Marks()
 
 RESTORED = "restored from a backup"
 """Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
+STOLEN = "registry: stolen: "
+"""Begins the reason of a rotation for which a running session ends at once: a thief has that key."""
 CONFIRM_MAY_ARRIVE = timedelta(minutes=2)
 """For how long after an agreement its Confirm may still reach the node: 60 s of the profile, and a bus that is slow."""
 
@@ -316,6 +318,11 @@ class NodeKeys:
     def restored(self, uuid: bytes) -> bool:
         """Whether the keys of a node came back from a backup and none was agreed since."""
         return (self.rotation_due(uuid) or "").startswith(RESTORED)
+
+    def stolen(self, uuid: bytes) -> str | None:
+        """Why the key of a node must not even end the session that it is in: a station that was stolen has had it."""
+        why = self.rotation_due(uuid) or ""
+        return why if why.startswith(STOLEN) else None
 
     def demand_rotation(self, uuid: bytes, why: str) -> None:
         """Have the next session with a node rotate its key before anything else.

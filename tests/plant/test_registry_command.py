@@ -184,6 +184,9 @@ def test_a_fork_stops_the_copy_and_a_person_resumes(desk: Desk) -> None:
     told = desk.ask("west", "registry", "sync", "--files", desk.stick, code=4)
     assert told["error"]["code"] == "fork"  # type: ignore[index]
     assert desk.ask("west", "registry", "status", code=4)["alarms"]
+    planned = desk.ask("west", "registry", "resume", "--files", desk.stick, "--dry-run")
+    assert (planned["done"], planned["adopts"]) == (0, 1)
+    assert desk.ask("west", "registry", "status", code=4)["alarms"], "a plan resumes nothing"
     assert desk.ask("west", "registry", "resume", "--files", desk.stick, "--yes")["done"] == 1
     desk.sync("west")
 
@@ -205,3 +208,42 @@ def test_a_home_rebuilt_from_a_backup_takes_its_own_pages_back(desk: Desk) -> No
     assert desk.ask("west", "registry", "status")["unsent"] == 0
     desk.sync("north")
     assert len(desk.ask("north", "registry", "log", "--station", "west")["events"]) == 2  # type: ignore[arg-type]
+
+
+def test_a_person_accepts_one_of_two_histories_and_sees_it_first(desk: Desk, tmp_path: Path) -> None:
+    joined(desk)
+    desk.sync("west")
+    shutil.copytree(desk.folder / "west", desk.folder / "copy")
+    other = tmp_path / "other stick"
+    shutil.copytree(desk.stick, other)
+    desk.ask("west", "whitelist", "add", UUID, "--fingerprint", KEY)
+    desk.sync("west")
+    desk.ask("copy", "whitelist", "add", UUID, "--fingerprint", "cd" * 32)
+    desk.ask("copy", "registry", "sync", "--files", other)
+    desk.sync("north")
+    told = desk.ask("north", "registry", "sync", "--files", other, code=4)
+    assert [one["code"] for one in told["alarms"]] == ["two-histories"]  # type: ignore[attr-defined]
+    refused = desk.run("north", "registry", "accept", "west", "--yes")
+    assert refused.code == 6
+    assert "--page" in refused.err
+    (branch,) = [word for word in refused.err.replace(",", " ").split() if len(word) == 16][:1]
+    plan = desk.ask("north", "registry", "accept", "west", "--page", branch, "--dry-run")
+    assert (plan["done"], plan["n"]) == (0, 1)
+    assert desk.ask("north", "registry", "status", code=4)["alarms"]
+    taken = desk.ask("north", "registry", "accept", "west", "--page", branch, "--yes")
+    assert (taken["done"], taken["hash"]) == (1, plan["hash"])
+    (node,) = desk.ask("north", "nodes", "--plant")["nodes"]  # type: ignore[misc]
+    assert len(node["says"]["pinned_by"]) == 1
+
+
+def test_a_node_on_which_stations_do_not_agree_says_so_itself(desk: Desk) -> None:
+    joined(desk)
+    desk.ask("north", "whitelist", "add", UUID, "--fingerprint", KEY)
+    desk.ask("south", "whitelist", "add", UUID, "--fingerprint", "cd" * 32)
+    desk.sync("north", "south")
+    (node,) = desk.ask("south", "nodes", UUID)["nodes"]  # type: ignore[misc]
+    assert [one["name"] for one in node["conflicts"]] == ["other pin"]
+    assert "conflict     other pin: keepers pin" in desk.run("south", "nodes", UUID).out
+    shown = desk.run("south", "nodes", "--plant", UUID).out
+    assert "held by nobody\n" in shown
+    assert "1 conflict," in desk.run("south", "registry", "status").out

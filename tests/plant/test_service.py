@@ -112,3 +112,18 @@ def test_an_alarm_is_told(office: Office) -> None:
         until(lambda: any(one["state"] == "alarm" for one in told), told)
     finally:
         watch.stop()
+
+
+def test_a_removed_station_is_told_so_once_and_goes_on_by_itself(office: Office) -> None:
+    from teds_provision import plant
+
+    south = by_url(office, office.plant.stations[1])
+    office.plant.change(plant.owner.without(office.north, "south", "retired", None))
+    office.sync(office.north)
+    watch, told, _ = watching(south)
+    watch.start()
+    try:
+        until(lambda: any(one["state"] == "removed" for one in told), told)
+        assert [one["state"] for one in told] == ["removed"]
+    finally:
+        watch.stop()

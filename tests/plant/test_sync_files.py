@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from teds_provision import plant
-from teds_provision.errors import LinkFailure, PolicyRefused
+from teds_provision.errors import Fork, LinkFailure, NotMember, PolicyRefused, StoreLocked
+from teds_provision.plant.files import FilesPost
 from teds_provision.plant.folding import heads_digest, views
-from teds_provision.plant.sync import Fork, NotMember, resume
+from teds_provision.plant.sync import resume
+from teds_provision.protocol.plant.document import hash_of
+from teds_provision.protocol.plant.page import Draft, seal_page
 from teds_provision.station.station import Station
 from teds_provision.store import WhitelistEntry
 from tests.plant.stations import Plant, ask
@@ -225,3 +230,86 @@ def test_a_person_names_the_branch_or_the_roster_does(plants: Plant) -> None:
     chain = replace(plants.north.plant.tables.chain("f" * 64), accepted=(3, "a" * 64))
     plants.north.plant.tables.put_chain(chain)
     assert plants.north.plant.tables.chain("f" * 64) == chain
+
+
+def test_a_roster_that_lies_behind_is_no_news(plants: Plant) -> None:
+    plants.member("south", "base")
+    first = (plants.north.plant.tables.held_roster() or pytest.fail("no roster")).version
+    plants.sync(plants.north)
+    plants.change(plant.owner.renewed(plants.north, timedelta(days=30)))
+    west = plants.member("west", "line")  # it never saw the first ones
+    done = plants.sync(west)
+    assert (plants.stick / "roster" / f"{first}.jws").exists()
+    assert done.told == []
+
+
+def test_a_clock_a_year_ahead_makes_no_roster_that_counts(plants: Plant) -> None:
+    south = plants.member("south", "base")
+    plants.round()
+    draft = plant.owner.renewed(plants.north, timedelta(days=30))
+    ahead = replace(draft, created=draft.created + timedelta(days=365), expires=draft.expires + timedelta(days=365))
+    version = south.plant.roster.version if south.plant.roster else 0
+    signed = plant.owner.signed(plants.north, ahead)
+    FilesPost(plants.stick).post_roster(signed.version, signed.hash, signed.octets)
+    done = plants.sync(south)
+    assert any("check the clock" in line for line in done.told)
+    assert south.plant.roster is not None
+    assert south.plant.roster.version == version
+
+
+def test_a_clock_that_was_put_back_a_year_revives_no_roster(plants: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    roster = plants.north.plant.roster
+    record = plants.north.plant.joined
+    assert roster is not None
+    assert record is not None
+    monkeypatch.setattr(plant.status, "now", lambda: datetime.now(UTC) - timedelta(days=365))
+    assert plant.status.moment(roster) == roster.created
+    assert not plant.status.status(plants.north, record, roster).expired
+    monkeypatch.setattr(plant.status, "now", lambda: datetime.now(UTC) + timedelta(days=365))
+    assert plant.status.status(plants.north, record, roster).exit_code == 6
+
+
+def test_a_page_of_a_clock_a_year_ahead_counts_and_no_name_of_it_wins_for_ever(plants: Plant) -> None:
+    south = plants.member("south", "base")
+    plants.round()
+    pin(south)
+    chain, roster = south.plant.tables.chain(south.fingerprint), south.plant.roster
+    assert roster is not None
+    ahead = datetime.now(UTC) + timedelta(days=365)
+    draft = Draft(roster.registry, chain.counted[0] + 1, chain.counted[1], "0" * 16, ahead, {}, (1, "0" * 64))
+    octets = seal_page(draft, [], south.vault.identity())
+    FilesPost(plants.stick).append(south.fingerprint, draft.n, draft.previous, hash_of(octets), octets)
+    plants.sync(plants.north)
+    assert plants.north.plant.tables.chain(south.fingerprint).counted[0] == draft.n
+    assert alarms(plants.north) == []
+
+
+def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None:
+    nodes = [bytes([n] * 10) for n in range(1, 9)]
+    homes = [Station.open(plants.north.home, ask=ask) for _ in nodes]
+    ends: list[str] = []
+    gate = threading.Barrier(len(homes))
+
+    def one(station: Station, uuid: bytes) -> None:
+        gate.wait()
+        pin(station, uuid)
+        try:
+            plants.sync(station)
+            ends.append("done")
+        except StoreLocked:  # another one had it for 10 s
+            ends.append("locked")
+
+    threads = [threading.Thread(target=one, args=pair) for pair in zip(homes, nodes, strict=True)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(ends) == len(homes)
+    assert set(ends) <= {"done", "locked"}
+    plants.sync(plants.north)
+    said = [one.event["uuid"] for one in plant.status.log(plants.north)]
+    assert sorted(said) == [uuid.hex() for uuid in nodes]
+    assert plants.north.plant.tables.unsent() == 0
+    assert alarms(plants.north) == []
+    for station in homes:
+        station.close()

@@ -1,0 +1,163 @@
+"""A station left: which keys are rotated, by whom and when, and what only a tap can heal (contract, section 7)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from teds_provision import plant
+from teds_provision.errors import KeyStolen
+from teds_provision.measure.trusting import Standing
+from teds_provision.plant import leaving
+from teds_provision.protocol.plant.roster import Share, Why
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import session_if_keyed
+from tests.bench import talk
+from tests.plant.handing import board_of
+from tests.plant.stations import Plant, ask
+
+
+class Scene:
+    """North (keeper, the CA key), west on the line, and south, to whom every key is copied."""
+
+    def __init__(self, folder: Path) -> None:
+        self.plant = Plant(folder)
+        self.north = self.plant.north
+        self.south = self.plant.member("south", "base")
+        self.west = self.plant.member("west", "line", "base")
+        to = (self.south.fingerprint,)
+        self.plant.change(plant.owner.shared(self.north, Share(("all", ""), to)))
+        self.plant.round()
+
+    def sync(self, *stations: Station) -> None:
+        for station in stations:
+            self.plant.sync(station)
+
+    def keyed_by(self, station: Station) -> bytes:
+        """A board that a station keyed and that south has a copy of."""
+        uuid = board_of(station, os.urandom(10)).uuid
+        self.sync(station, self.south, station, self.north)
+        return uuid
+
+    def remove(self, station: Station, why: Why) -> None:
+        last = self.north.plant.tables.chain(station.fingerprint).counted[0]
+        self.plant.change(plant.owner.without(self.north, station.identity.name, why, last))
+        self.sync(self.north)
+
+    def marks(self, station: Station) -> list[bytes]:
+        return [uuid for uuid, why in station.keys.rotations_due().items() if why.startswith(leaving.WHY)]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    made = Scene(tmp_path)
+    yield made
+    made.plant.close()
+
+
+def later(station: Station, hours: float) -> None:
+    """What a sync finds so many hours from now."""
+    roster = station.plant.roster
+    assert roster is not None
+    leaving.review(station, roster, datetime.now(UTC) + timedelta(hours=hours))
+
+
+def test_who_made_a_key_that_a_thief_has_rotates_it_at_the_next_contact(scene: Scene) -> None:
+    board = board_of(scene.north, os.urandom(10))
+    other = scene.keyed_by(scene.west)
+    scene.sync(scene.north, scene.south, scene.north)
+    scene.remove(scene.south, "stolen")
+    assert scene.marks(scene.north) == [board.uuid]
+    assert leaving.due(scene.north) == 1
+    before = scene.north.keys.of(board.uuid)[-1].epoch
+    with talk(board) as node:
+        session_if_keyed(scene.north, node)
+    assert scene.north.keys.of(board.uuid)[-1].epoch == before + 1
+    scene.sync(scene.north)
+    assert scene.marks(scene.north) == []
+    scene.sync(scene.west)
+    assert scene.marks(scene.west) == [other]
+
+
+def test_who_has_a_copy_rotates_it_a_day_later(scene: Scene) -> None:
+    uuid = scene.keyed_by(scene.west)
+    scene.remove(scene.west, "lost")
+    scene.sync(scene.south)
+    assert scene.marks(scene.south) == []
+    later(scene.south, 23)
+    assert scene.marks(scene.south) == []
+    later(scene.south, 25)
+    assert scene.marks(scene.south) == [uuid]
+    assert scene.south.keys.rotation_due(uuid) == "registry: west (lost) has had this key"
+
+
+def test_a_retired_one_that_forgot_has_no_key_any_more(scene: Scene) -> None:
+    kept, forgotten = (board_of(scene.north, os.urandom(10)).uuid for _ in range(2))
+    scene.sync(scene.north, scene.south, scene.north)
+    with scene.south.transaction():
+        scene.south.plant.tell("forgot", forgotten, epoch=1)
+    scene.sync(scene.south, scene.north)
+    scene.remove(scene.south, "retired")
+    assert scene.marks(scene.north) == [kept]
+
+
+def test_a_stolen_one_that_says_it_forgot_is_not_believed(scene: Scene) -> None:
+    uuid = board_of(scene.north, os.urandom(10)).uuid
+    scene.sync(scene.north, scene.south, scene.north)
+    with scene.south.transaction():
+        scene.south.plant.tell("forgot", uuid, epoch=1)
+    scene.sync(scene.south, scene.north)
+    scene.remove(scene.south, "stolen")
+    assert scene.marks(scene.north) == [uuid]
+
+
+def test_what_only_the_lost_one_held_is_counted_as_a_tap(scene: Scene) -> None:
+    scene.plant.change(plant.owner.unshared(scene.north, ("all", "")))
+    scene.sync(scene.north, scene.west)
+    board_of(scene.west, os.urandom(10))
+    scene.sync(scene.west, scene.north)
+    scene.remove(scene.west, "lost")
+    review = leaving.last(scene.north)
+    assert review is not None
+    assert (review.alone, leaving.due(scene.north)) == (1, 0)
+
+
+def test_nobody_left_and_nothing_is_due(scene: Scene) -> None:
+    scene.keyed_by(scene.west)
+    assert (leaving.last(scene.north), leaving.due(scene.west)) == (None, 0)
+
+
+@pytest.mark.parametrize(("why", "cut"), [("stolen", True), ("lost", False), ("retired", False)])
+def test_a_running_measurement_ends_for_a_thief_alone(scene: Scene, why: Why, cut: bool) -> None:
+    uuid = board_of(scene.north, os.urandom(10)).uuid
+    scene.sync(scene.north, scene.south, scene.north)
+    measuring = Station.open(scene.north.home, ask=ask)  # the process that measures, beside `registry remove`
+    standing = Standing(measuring, uuid)
+    standing.require()
+    scene.remove(scene.south, why)
+    assert scene.marks(scene.north) == [uuid]
+    if cut:
+        with pytest.raises(KeyStolen, match=r"stolen: south has had this key"):
+            standing.require()
+    standing.require()
+    Standing(measuring, uuid).require()  # a session that began since is not ended again
+    measuring.close()
+
+
+def test_a_key_that_was_due_for_somebody_else_is_cut_off_when_one_is_stolen(scene: Scene) -> None:
+    uuid = board_of(scene.west, os.urandom(10)).uuid
+    to = (scene.south.fingerprint, scene.north.fingerprint)
+    scene.plant.change(plant.owner.unshared(scene.north, ("all", "")))
+    scene.plant.change(plant.owner.shared(scene.north, Share(("all", ""), to)))
+    scene.sync(scene.north, scene.west, scene.south, scene.north, scene.west, scene.south, scene.north)
+    assert scene.north.keys.of(uuid)
+    scene.remove(scene.west, "lost")
+    later(scene.north, 25)
+    assert scene.north.keys.stolen(uuid) is None
+    scene.remove(scene.south, "stolen")
+    later(scene.north, 50)
+    assert scene.north.keys.stolen(uuid) == "registry: stolen: south has had this key"
