@@ -47,7 +47,8 @@ def fd(sizes: Sizes) -> float:
             total += _fd_frame(octets + (1 if octets <= 7 else 2))
         else:
             consecutive = -(-(octets - 62) // 63)
-            total += (1 + consecutive) * full + _flows(consecutive) * flow
+            last = octets - 62 - 63 * (consecutive - 1) + 1
+            total += consecutive * full + _fd_frame(last) + _flows(consecutive) * flow
     return total
 
 

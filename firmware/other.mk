@@ -25,7 +25,7 @@ $(BUILD)/other/$(1)/bearssl.a: arm.mk other.mk
 $(BUILD)/other/$(1)/%: $(MEMORY) $(HEADERS) $(wildcard $(TESTS)/*) $(BUILD)/other/$(1)/bearssl.a
 	$(CC_$(1)) $(filter-out -Wmissing-prototypes,$(WARNINGS)) -O1 $(IN_TESTS) $$(if $$(filter vectors,$$*),$(OF_VECTORS)) \
 	  $$(if $$(filter corpus,$$*),-DTEDS_FUZZ_ALONE) $(INCLUDES) -isystem $(BEARSSL)/inc -I$(TESTS) -I$(VECTORS) $(MEMORY) \
-	  $(TESTS)/$$(if $$(filter corpus,$$*),fuzz,$$*).c $$(if $$(filter vectors,$$*),$$(wildcard $(VECTORS)/*.c)) \
+	  $(TESTS)/$$(subst isotp,frames,$$(subst corpus,fuzz,$$*)).c $$(if $$(filter vectors,$$*),$$(wildcard $(VECTORS)/*.c)) \
 	  $(BUILD)/other/$(1)/bearssl.a -o $$@
 endef
 $(foreach cpu,$(OTHERS),$(eval $(call OTHER_RULE,$(cpu))))
