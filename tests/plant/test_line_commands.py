@@ -11,8 +11,10 @@ import pytest
 
 from teds_provision.protocol.keys import to_pem
 from teds_provision.station.station import Station as InMemory
+from teds_provision.station.station import initialise
 from tests.bench import PASSPHRASE
 from tests.e2e.desk import Desk, Station
+from tests.vault.softhsm import PIN, loaded, unload
 
 from .owner import ALL, ANGLE, alone, join, member, roster_of
 from .stations import certified
@@ -174,6 +176,45 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
     west.ask("write", other.uuid, "--image", tmp_path / "signed.json", *nfc(desk))
     done = west.provision("nfc", "--job", job, "--files", stick)
     assert (done["verdict"], done["attempt"]) == ("authentic", 2)
+
+
+@pytest.mark.system
+@pytest.mark.slow
+def test_an_office_whose_key_lies_in_a_token_signs_for_a_line(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its key is in SoftHSM; the line, whose role is not to sign, makes authentic boards through it."""
+    (tmp_path / "hsm").mkdir()
+    uri = loaded(tmp_path / "hsm", monkeypatch, ("office",))["office"]
+    station, _ = initialise(desk.folder / "office", name="office", keystore=uri, ask=lambda prompt, confirm: PIN)
+    try:
+        made = certified(desk.folder / "west", "west", station)
+        roster = roster_of(station, member(station, "office", *ALL), member(made, "west", "line"))
+        for one in (station, made):
+            join(one, roster)
+        made.close()
+    finally:
+        station.close()
+        unload()
+    office, west = Station(desk, desk.folder / "office", PIN), Station(desk, desk.folder / "west")
+    stick, job = tmp_path / "stick", tmp_path / "one.jws"
+    stick.mkdir()
+    more = ("--count", 1, "--output", job, "--sign", "office")
+    named = office.ask("job", "new", "--title", "one", "--profile", ANGLE, "--station", "west", *ENDS, *more)
+    signer = office.start("--json", "signer", "run", "--job", named["id"], "--files", stick)
+    node = desk.node().start()
+    done = west.provision("nfc", "--job", job, "--files", stick)
+    assert (done["verdict"], done["unit"]) == ("authentic", 1)
+    assert signer.wait_for_lines(1)[0]["uuid"] == node.uuid
+    signer.signal(15)
+    assert signer.end().code == 0
+    # and by a file
+    west.ask("build", node.uuid, "--profile", ANGLE, "--name", "another")
+    asked, signed = tmp_path / "request.jws", tmp_path / "signed.json"
+    west.ask("sign", node.uuid, "--by", "office", "--job", job, "--output", asked, *nfc(desk))
+    assert office.ask("signer", "once", asked, "--output", signed)["sequence"] == 2
+    west.ask("write", node.uuid, "--image", signed, *nfc(desk))
+    assert west.ask("verify", node.uuid, *nfc(desk))["verdict"] == "authentic", "west may not sign: the office did"
 
 
 def nfc(desk: Desk) -> list[str]:
