@@ -50,7 +50,7 @@ class ChannelFacts:
     due: str | None = None
     overdue: bool = False
     fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty where nobody signed it
-    sample_form: str = ""  # of the raw value: uint16, float32 …
+    sample_form: str = ""  # of the raw value, as its SampleForm is called: "unsigned integer, 2 octets"
     period: float | None = None  # seconds between samples as measured; None for events
     unsigned: bool = False  # nobody has signed the datasheet: there are raw values alone
     unverified: bool = False  # nobody has signed it, and values are calibrated by it all the same: a person's word

@@ -536,9 +536,10 @@ _STYLE: Final = (
     "text-align:left;white-space:nowrap}td:last-child{white-space:normal}"
     ".passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
     # on paper: A4 lying, the head of the table on each sheet, no board torn in two, colours as on the screen
-    "@page{size:A4 landscape;margin:12mm}@media print{body{font-size:8.5pt;margin:0}thead{display:table-header-group}"
-    "tr{break-inside:avoid}td,th{padding:.15em .35em;white-space:normal;overflow-wrap:anywhere}"
-    "td:nth-child(2){white-space:nowrap}"
+    "@page{size:A4 landscape;margin:12mm}@media print{body{font-size:8pt;margin:0}thead{display:table-header-group}"
+    "tr{break-inside:avoid}td,th{padding:.15em .35em}thead th,td:nth-child(4){white-space:normal}"
+    "td:nth-child(3),td:last-child{white-space:normal;overflow-wrap:anywhere}"
+    "td:nth-child(3),td:nth-child(4){min-width:10em}td:nth-child(10){min-width:16em}"
     "*{print-color-adjust:exact;-webkit-print-color-adjust:exact}}"
 )
 

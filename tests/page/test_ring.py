@@ -22,6 +22,31 @@ BINS = """async ([source, points, silence]) => {
   return ring.bins(0, 40, 4, silence).map((one) => (one === undefined ? "nothing" : one));
 }"""
 
+RESTLESS = """async ([source, course]) => {
+  const { restless } = await import("data:text/javascript," + encodeURIComponent(source));
+  return restless(course);
+}"""
+
+
+@pytest.mark.parametrize(
+    ("course", "restless"),
+    [
+        ([number % 100 for number in range(2000)], False),  # twenty turns of a shaft
+        ([5] * 900, False),
+        ([None] * 900, False),
+        ([], False),
+        ([3 if number % 2 else 7 for number in range(50)], False),
+        ([[3, 7, None][number % 3] for number in range(900)], True),
+    ],
+)
+def test_a_curve_that_fills_the_plot_gets_no_dash(browser: Browser, course: list[float | None], restless: bool) -> None:
+    """Nobody would see it, and a browser without a GPU took seconds to paint it."""
+    page = browser.new_page()
+    try:
+        assert page.evaluate(RESTLESS, [RING.read_text(), course]) is restless
+    finally:
+        page.close()
+
 
 @pytest.mark.parametrize(
     ("points", "silence", "bins"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -90,6 +90,25 @@ def stacked(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 def _are_floats(column: NDArray[Any]) -> bool:
     return column.dtype.kind == "f" or bool(((column >= -_EXACT) & (column <= _EXACT)).all())
+
+
+RawKind = Literal["float", "int64", "uint64", "integer", ""]
+_FLOATS: Final = ("Float32", "Float64", "fraction", "long fraction", "time of day")
+_INTEGERS: Final = ("unsigned integer", "bit sequence", "long integer")
+
+
+def raw_kind(form: str) -> RawKind:
+    """What holds the raw values of a form (``SampleForm.name``, "unsigned integer, 2 octets"); "" for an unknown one.
+
+    ``integer``: whole numbers of more than 64 bits.
+    """
+    model, _, size = form.partition(", ")
+    if model in _FLOATS:
+        return "float"
+    octets = size.partition(" ")[0]
+    if model not in _INTEGERS or not octets.isdecimal():
+        return ""
+    return "int64" if int(octets) < 8 else "uint64" if int(octets) == 8 else "integer"
 
 
 def integers(values: Sequence[int]) -> NDArray[Any]:

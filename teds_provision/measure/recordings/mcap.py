@@ -19,7 +19,7 @@ import numpy as np
 from teds_provision.errors import BadData
 from teds_provision.files import open_to_read
 from teds_provision.measure.blocks import Block, ChannelFacts, Note
-from teds_provision.measure.recordings.columns import Joined
+from teds_provision.measure.recordings.columns import Joined, raw_kind
 from teds_provision.measure.recordings.json_lines import report_of
 from teds_provision.measure.recordings.source import MOST, Entry, Recording, facts_of, station_of, unix_of
 from teds_provision.measure.sinks.mcap.recording import LITTLE_ENDIAN, TYPE, layout
@@ -240,7 +240,7 @@ class McapRecording(Recording):
 
     def _block(self, topic: _Topic, rows: NDArray[Any], error: float, *, test: bool) -> Block:
         raw = np.ascontiguousarray(rows["raw"])
-        if raw.dtype.kind == "i" and any(one.sample_form == "uint64" for one in topic.facts):
+        if raw.dtype.kind == "i" and any(raw_kind(one.sample_form) == "uint64" for one in topic.facts):
             raw = raw.view(np.uint64)
         value = np.ascontiguousarray(rows["value"])
         time = rows["times"][:, 0].astype(np.float64) / 1e9

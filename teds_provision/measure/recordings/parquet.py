@@ -17,7 +17,7 @@ import numpy as np
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.lazy import how_to_install
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, Note, StationFacts
-from teds_provision.measure.recordings.columns import Rows, Streams
+from teds_provision.measure.recordings.columns import Rows, Streams, raw_kind
 from teds_provision.measure.recordings.json_lines import report_of
 from teds_provision.measure.recordings.source import MOST, ROWS, Entry, Recording, facts_of, station_of
 from teds_provision.measure.sinks.lines import facts_as_json, iso, status_line
@@ -78,11 +78,8 @@ class ParquetWriter:
         self._log: list[dict[str, Any]] = []
 
     def _raw_type(self, form: str) -> Any:
-        if form.startswith("float"):
-            return self._pa.float64()
-        if form == "uint64":
-            return self._pa.uint64()
-        return self._pa.int64() if form.startswith(("uint", "int")) else self._pa.string()
+        pa = self._pa
+        return {"float": pa.float64(), "uint64": pa.uint64(), "int64": pa.int64()}.get(raw_kind(form), pa.string())
 
     def take(self, entry: Entry) -> None:
         """One entry; raises BadData for a raw value that is not what its channel's datasheet says."""
@@ -288,7 +285,7 @@ def _floats(column: Any) -> NDArray[Any]:
 
 
 def _exact(column: Any) -> NDArray[Any]:
-    """Raw values: whole numbers and floats as they are, else octets of hex digits."""
+    """Raw values: numbers as they are; of text long whole numbers, else octets of hex digits."""
     kind = str(column.type)
     if kind in ("int64", "uint64"):
         filled: NDArray[Any] = column.fill_null(0).to_numpy(zero_copy_only=False)
@@ -296,8 +293,12 @@ def _exact(column: Any) -> NDArray[Any]:
     if kind == "double":
         return _floats(column)
     found = np.empty(len(column), dtype=object)
-    found[:] = [bytes.fromhex(one) if one else b"" for one in column.to_pylist()]
+    found[:] = [_long(one) if one else b"" for one in column.to_pylist()]
     return found
+
+
+def _long(text: str) -> int | bytes:
+    return int(text) if text.isdecimal() and text.isascii() else bytes.fromhex(text)
 
 
 def _first_line(error: Exception) -> str:

@@ -14,7 +14,7 @@ from teds_provision.errors import BadData
 from teds_provision.files import open_to_read
 from teds_provision.limits import load_json
 from teds_provision.measure.blocks import ChannelFacts, GroupRows, NodeReport, Note, State
-from teds_provision.measure.recordings.columns import Rows, Streams, integers
+from teds_provision.measure.recordings.columns import Rows, Streams, integers, raw_kind
 from teds_provision.measure.recordings.source import MOST, ROWS, Entry, Recording, facts_of, station_of, unix_of
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def _number(cell: str) -> float:
 
 def _raw(cells: Sequence[str], form: str) -> NDArray[Any]:
     """A column of raw values, exactly; where the datasheet does not say what they are, what they look like."""
-    if not form.startswith("float"):
+    if raw_kind(form) != "float":
         try:
             return integers([int(cell) if cell else 0 for cell in cells])
         except ValueError:

@@ -33,8 +33,8 @@ CURVE = Calibration(
 )
 FACTS = (
     replace(ANGLE, units=parse_units("rad"), calibration=CURVE, frame="{node}_tip", deviation=0.002, own_period=1e-4),
-    replace(FORCE, sample_form="int16"),
-    replace(OIL, sample_form="float32"),
+    replace(FORCE, sample_form="unsigned integer, 4 octets, 24 bits"),
+    replace(OIL, sample_form="Float32, 4 octets"),
 )
 
 

@@ -33,7 +33,7 @@ ANGLE = ChannelFacts(
     calibrated="2026-03-01",
     due="2027-03-01",
     fingerprint="ab" * 32,
-    sample_form="uint16",
+    sample_form="unsigned integer, 2 octets",
     period=0.01,
 )
 FORCE = ChannelFacts(HAND, "hand", 2, "force", unit="N", uncertainty=0.1, fingerprint="cd" * 32, period=0.01)

@@ -78,6 +78,11 @@ export function nameOf(node) {
   return node?.name || (node?.uuid ? `node ${node.uuid.slice(0, 8)}` : "unknown node");
 }
 
+const { compare } = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
+
+/** Order of nodes as people look for them: by name, "finger 2" before "finger 10"; namesakes by UUID. */
+export const byName = (one, other) => compare(nameOf(one), nameOf(other)) || compare(one.uuid, other.uuid);
+
 /** What a channel is called. */
 export function channelName(channel) {
   return channel.name || `channel ${channel.number}`;

@@ -3,6 +3,7 @@
 import { h, fill, text } from "./dom.js";
 import { count, figure, hertz, number } from "./format.js";
 import { between, columnsOf, Hour, seed } from "./past.js";
+import { restless } from "./ring.js";
 import { changed, now, on, ringOf, state } from "./state.js";
 
 const FRAME = 50; // ms between two drawings
@@ -10,6 +11,7 @@ const SHARE = 0.35; // of the time that drawing may take
 const BEHIND = 0.25; // s: the right edge lies so far back, so that what comes in batches does not jump
 const COLOURS = 8;
 const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3]];
+const PAINT = 17; // ms from one frame to the next of a browser that is not busy
 
 const LIVE = 120; // s that are drawn from what came to this page; more comes from the station's memory
 const ASK = 3000; // ms between two looks at that memory
@@ -45,6 +47,7 @@ export class LivePlot {
     this.drawn = 0;
     this.skipped = 0;
     this.next = 0;
+    this.began = 0; // when the last drawing began, until the frame after it
     this.second = { at: performance.now(), frames: 0, received: state.received };
     this.charts = h("div", { class: "charts" });
     this.foot = h("p", { class: "plot-foot" });
@@ -59,6 +62,7 @@ export class LivePlot {
     this.asking = setInterval(() => this.ask(), ASK);
     this.loop = (time) => {
       if (this.ended) return;
+      this.painted(time);
       this.draw(time);
       requestAnimationFrame(this.loop);
     };
@@ -179,7 +183,14 @@ export class LivePlot {
     this.drawn += 1;
     this.second.frames += 1;
     this.next = time + Math.max(FRAME, took / SHARE) - 8;
+    this.began = time;
     this.told();
+  }
+
+  /** Lines are painted after the drawing, which the next frame waits for: that counts as well. */
+  painted(time) {
+    if (this.began) this.next = Math.max(this.next, this.began + (time - this.began - PAINT) / SHARE);
+    this.began = 0;
   }
 
   one(frame, right, time) {
@@ -198,6 +209,7 @@ export class LivePlot {
       return ringOf(channel.uuid, channel.number).bins(from, end, columns, silence);
     });
     frame.marks = frame.channels.map((channel) => [this.hour(channel).bins, left, right]);
+    courses.forEach((course, index) => (frame.chart.series[index + 1].dash = restless(course) ? [] : dash(index)));
     frame.chart.batch(() => {
       frame.chart.setData([times, ...courses], false);
       frame.chart.setScale("x", { min: left, max: right });
@@ -274,7 +286,7 @@ function options(channels, colours) {
       ...channels.map((channel, index) => ({
         label: channel.label,
         stroke: colours.lines[index % COLOURS],
-        width: 1.5,
+        width: 1, // a browser without a GPU paints a wider line up to thirty times as slowly
         dash: dash(index),
         points: { show: false },
       })),

@@ -2,6 +2,21 @@
 
 const POINTS = 12000; // two minutes at the 100 points a second that the station sends at most
 
+const TRAVEL = 60; // times its own height that a curve may go up and down and still have a dash
+
+/** Whether a curve goes up and down so often that no dash is seen on it; to paint one there takes many times as long. */
+export function restless(course) {
+  let [low, high, before, travel] = [Infinity, -Infinity, null, 0];
+  for (const value of course) {
+    if (typeof value !== "number") continue;
+    if (value < low) low = value;
+    if (value > high) high = value;
+    if (before !== null) travel += Math.abs(value - before);
+    before = value;
+  }
+  return travel > TRAVEL * Math.max(0, high - low);
+}
+
 /** Times (unix s) and values; NaN where there was none. */
 export class Ring {
   constructor(size = POINTS) {

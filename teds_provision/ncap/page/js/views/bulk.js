@@ -15,7 +15,7 @@ export class Bulk {
     this.changed = changed;
     this.toggle = button("Select", { "aria-pressed": "false", onclick: () => this.turn(!this.on) }, "list");
     this.total = h("strong", {});
-    this.every = button("All listed", { class: "quiet", onclick: () => this.all() });
+    this.every = button("All listed", { onclick: () => this.all() });
     this.verify = button("Verify", { onclick: () => this.verify.busy(() => this.verified()) }, "good");
     this.group = h("input", { type: "text", maxlength: "64", autocomplete: "off", placeholder: "Group", "aria-label": "Group to add to", list: "groups-known", class: "narrow" });
     this.known = h("datalist", { id: "groups-known" });

@@ -2,7 +2,7 @@
 
 import { change, paths, post, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, trouble } from "../dom.js";
-import { channelName, count, nameOf, verdict } from "../format.js";
+import { byName, channelName, count, nameOf, verdict } from "../format.js";
 import { LivePlot } from "../plot.js";
 import { measuring, membersOf, on, refresh, state } from "../state.js";
 import { SetPoints } from "./setpoints.js";
@@ -40,7 +40,7 @@ class Groups {
     keyed(this.list, state.groups, (group) => group.name, (group) => new GroupCard(group.name).element, (element, group) => element.card.paint(group, may));
     const lone = state.measurements.filter((one) => !one.group);
     keyed(this.others, lone, (one) => `${one.id}`, (one) => loneCard(one), (element, one) => element.paint(one, may));
-    const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false);
+    const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false).sort(byName);
     keyed(this.members.lastChild, nodes, (node) => node.uuid, tick, (element, node) => {
       text(element.querySelector("span"), nameOf(node));
       text(element.querySelector(".hint"), verdict(node)[2].toLowerCase());
@@ -145,7 +145,7 @@ class GroupCard {
 
   /** Nodes to tick, those of the group ticked; left alone while somebody ticks. */
   paintMembers(group, frozen) {
-    const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false);
+    const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false).sort(byName);
     const told = JSON.stringify([group.uuids, nodes.map((node) => [node.uuid, node.name]), frozen]);
     if (this.toldMembers === told) return;
     this.toldMembers = told;
@@ -193,6 +193,15 @@ class GroupCard {
   }
 }
 
+/** How the nodes of a measurement fare together: "15 running, 2 lost, 4200 samples, none lost". */
+function inAll(measurement) {
+  const states = new Map();
+  for (const node of measurement.nodes ?? []) states.set(node.state, (states.get(node.state) ?? 0) + 1);
+  const sum = (what) => (measurement.nodes ?? []).reduce((all, node) => all + (node[what] ?? 0), 0);
+  const lost = sum("lost");
+  return [...[...states].map(([word, many]) => `${many} ${word}`), count(sum("samples"), "sample"), lost ? `${lost} lost` : "none lost"].join(", ");
+}
+
 function loneCard(one) {
   const name = h("h4", {});
   const words = h("p", { class: "hint" });
@@ -209,15 +218,18 @@ function loneCard(one) {
     }),
   );
   element.paint = (now, may) => {
-    const members = membersOf(now);
-    const names = members.map((uuid) => nameOf(state.nodes.get(uuid) ?? { uuid })).join(", ");
+    const members = membersOf(now).map((uuid) => state.nodes.get(uuid) ?? { uuid }).sort(byName);
+    const names = members.map(nameOf).join(", ");
     if (now.match) {
       const waiting = now.nodes.filter((node) => node.state === "waiting" && node.why);
       text(name, now.match === "all" ? "Everything that is trusted" : now.match);
       text(words, [`${count(members.length, "node")} measured${names ? `: ${names}` : ""}`, ...waiting.map((node) => `${nameOf(state.nodes.get(node.uuid) ?? node)} waits: ${node.why}`)].join(". "));
+    } else if (members.length > 1) {
+      text(name, count(members.length, "node"));
+      text(words, `${inAll(now)}: ${names}.`);
     } else {
       text(name, names);
-      fill(words, told(now, members[0]));
+      fill(words, told(now, members[0]?.uuid));
     }
     if (stop.getAttribute("aria-busy") !== "true") stop.disabled = !may;
   };
@@ -239,7 +251,7 @@ class Course {
   }
 
   all() {
-    return [...state.nodes.values()].flatMap((node) => (node.channels ?? []).filter((channel) => channel.kind !== "actuator").map((channel) => ({ node, channel, key: `${node.uuid}/${channel.number}` })));
+    return [...state.nodes.values()].sort(byName).flatMap((node) => (node.channels ?? []).filter((channel) => channel.kind !== "actuator").map((channel) => ({ node, channel, key: `${node.uuid}/${channel.number}` })));
   }
 
   paint() {

@@ -1,7 +1,7 @@
 // The nodes that are there, and the one that is open.
 
 import { button, chip, empty, fill, h, icon, keyed, text } from "../dom.js";
-import { channelName, count, figure, nameOf, verdict } from "../format.js";
+import { byName, channelName, count, figure, nameOf, verdict } from "../format.js";
 import { isStale, lastOf, now, on, state } from "../state.js";
 import { Bulk } from "./bulk.js";
 import { facts } from "./facts.js";
@@ -13,8 +13,7 @@ const MARKED = 8000; // ms that a tapped node stays marked
 const SHOWN_VALUES = 3;
 const SEARCH_FROM = 7; // nodes
 const DRAWN = 100; // cards that are drawn at once; a press draws as many more
-const { compare } = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
-const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || compare(nameOf(one), nameOf(other)) || compare(one.uuid, other.uuid);
+const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || byName(one, other);
 
 export function nodesView(main, rest) {
   const filters = new Filters(() => ((drawn = DRAWN), paint()));

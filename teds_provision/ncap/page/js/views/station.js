@@ -2,7 +2,7 @@
 
 import { change, get } from "../api.js";
 import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../dom.js";
-import { channelName, clock, count, grouped, nameOf, short } from "../format.js";
+import { byName, channelName, clock, count, grouped, nameOf, short } from "../format.js";
 import { on, refresh, state } from "../state.js";
 import { linkName } from "./facts.js";
 import { linePanel } from "./line.js";
@@ -57,7 +57,8 @@ export function stationView(main) {
     if (state.names.length) noName.replaceChildren();
     else if (!noName.firstChild) fill(noName, empty("No channels are published yet.", h("p", {}, "Names appear once a node has a datasheet.")));
     const words = find.value.trim().toLowerCase();
-    const meant = words ? state.names.filter((one) => `${one.topic ?? ""} ${labelOf(one)}`.toLowerCase().includes(words)) : state.names;
+    const every = [...state.names].sort((one, other) => byName(nodeOf(one), nodeOf(other)) || one.channel - other.channel);
+    const meant = words ? every.filter((one) => `${one.topic ?? ""} ${labelOf(one)}`.toLowerCase().includes(words)) : every;
     find.hidden = state.names.length <= NAMES && !words;
     further.hidden = meant.length <= most;
     text(further.lastChild, `Show ${Math.min(NAMES, meant.length - most)} more of ${meant.length}`);
@@ -136,9 +137,11 @@ function again(element, facts, make) {
   fill(element, make());
 }
 
+const nodeOf = (one) => state.nodes.get(one.uuid) ?? { uuid: one.uuid };
+
 /** What a published name belongs to. */
 function labelOf(one) {
-  const node = state.nodes.get(one.uuid) ?? { uuid: one.uuid };
+  const node = nodeOf(one);
   const channel = node.channels?.find((each) => each.number === one.channel);
   return one.channel ? `${nameOf(node)}: ${channel ? channelName(channel) : `channel ${one.channel}`}` : `${nameOf(node)} (the node)`;
 }
