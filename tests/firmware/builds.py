@@ -59,6 +59,13 @@ def host_psa() -> Path:
     return BUILD / "host" / "teds-node-psa"
 
 
+def board(name: str) -> Path:
+    """An example board over the stand-in for Zephyr, built."""
+    need("make", "gcc", headers=("psa/crypto.h",))
+    make("boards")
+    return BUILD / "boards" / name
+
+
 def library(max_message: int = 1024, staging: int = 4096) -> Path:
     """The node over flash in memory, built for these sizes."""
     need("make", "gcc")

@@ -92,6 +92,7 @@ int socketcand_send(host_bus *bus, const teds_can_frame *frame);
 
 /* -- nfc_udp.c: a simulated NFC reader ---------------------------------------------------------------------------------- */
 
+#if TEDS_NFC
 typedef struct host_nfc {
     int in; /* -1: none */
     bool chosen, active;
@@ -108,6 +109,7 @@ typedef struct host_nfc {
 int host_nfc_open(host_nfc *nfc, const char *path, const uint8_t uid[3], host_pace *pace);
 /* Answer one frame of the reader; false where none has come. */
 bool host_nfc_serve(host_nfc *nfc, teds_node *node);
+#endif
 
 /* -- channels.c: fake hardware ------------------------------------------------------------------------------------------ */
 

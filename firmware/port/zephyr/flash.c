@@ -1,0 +1,51 @@
+/* Three raw partitions. No file system and no NVS: none has a transaction over several keys (docs/internals). */
+#include "teds_zephyr.h"
+
+#include <zephyr/storage/flash_map.h>
+
+static const struct flash_area *areas[3];
+
+static int port_erase(void *user, int area)
+{
+    (void)user;
+    return flash_area_erase(areas[area], 0, areas[area]->fa_size);
+}
+
+static int port_write(void *user, int area, uint32_t at, const uint8_t *octets, size_t length)
+{
+    (void)user;
+    return flash_area_write(areas[area], (off_t)at, octets, length);
+}
+
+static int port_read(void *user, int area, uint32_t at, uint8_t *out, size_t length)
+{
+    (void)user;
+    return flash_area_read(areas[area], (off_t)at, out, length);
+}
+
+int teds_zephyr_flash(teds_port *port)
+{
+    static const uint8_t ids[3] = {FIXED_PARTITION_ID(teds_identity), FIXED_PARTITION_ID(teds_slot_a),
+                                   FIXED_PARTITION_ID(teds_slot_b)};
+    uint32_t unit = 1;
+    size_t slot;
+    for (size_t i = 0; i < 3; i++) {
+        const int failed = flash_area_open(ids[i], &areas[i]);
+        if (failed != 0) {
+            return failed;
+        }
+        unit = flash_area_align(areas[i]) > unit ? flash_area_align(areas[i]) : unit;
+    }
+    slot = areas[1]->fa_size < areas[2]->fa_size ? areas[1]->fa_size : areas[2]->fa_size;
+    if (unit > 32 || slot < TEDS_STAGING + 256 || areas[0]->fa_size < 256) {
+        return TEDS_E_USAGE;
+    }
+    port->slot_octets = (uint32_t)slot;
+    port->identity_octets = (uint32_t)areas[0]->fa_size;
+    port->unit = (uint8_t)unit;
+    port->erased = flash_area_erased_val(areas[0]);
+    port->erase = port_erase;
+    port->write = port_write;
+    port->read = port_read;
+    return 0;
+}

@@ -1,0 +1,47 @@
+/* A node on Zephyr: one thread that owns it, a message queue from the CAN callback, flash partitions, PSA Crypto.
+ *
+ * The application fills in its channels and starts it. Devicetree: `chosen` zephyr,canbus; fixed partitions labelled
+ * teds_identity, teds_slot_a, teds_slot_b, each of whole erase pages, slots of CONFIG_TEDS_NODE_STAGING + 256 or more.
+ * Written from Zephyr's headers (3.5 and later) and compiled against stubs of them: no board has run it yet.
+ */
+#ifndef TEDS_ZEPHYR_H
+#define TEDS_ZEPHYR_H
+
+#include "teds/node.h"
+
+/* What an application says of its board; channel functions as in teds_port, called from the node's thread. The rest of
+ * the port is filled in here. Both must outlive the node. */
+typedef struct teds_zephyr_board {
+    teds_port *port;
+    teds_config *config; /* an UUID of zeros: made of the chip's own number (hwinfo) */
+} teds_zephyr_board;
+
+/* Fill in the port, start the node and its thread. 0, TEDS_E_…, or Zephyr's negative errno where a device is not ready. */
+int teds_zephyr_start(const teds_zephyr_board *board);
+
+/* ns since the start; the port's clock, for ticks of events. Also from an interrupt. */
+uint64_t teds_zephyr_now(void);
+
+/* A pad was held for five seconds: the effect of Reset, soon, on the node's thread. Also from an interrupt. */
+void teds_zephyr_reset_by_hand(void);
+
+/* teds_sensor_event, and the node's thread is woken. From an interrupt or a thread. */
+void teds_zephyr_event(uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid);
+
+/* Frames of the bus that found no room on their way to the node, since the start. */
+uint32_t teds_zephyr_dropped(void);
+
+/* -- between the files of this port ---------------------------------------------------------------------------------- */
+
+int teds_zephyr_flash(teds_port *port);
+int teds_zephyr_can_start(void);
+/* Give the node what came and the controller what may leave; true where something moved. */
+bool teds_zephyr_can_work(teds_node *node);
+int teds_zephyr_nfc_start(void);
+bool teds_zephyr_nfc_work(teds_node *node);
+int teds_zephyr_ble_start(teds_config *config); /* and say the address that a tap tells */
+bool teds_zephyr_ble_work(teds_node *node);
+/* Wake the node's thread. Also from an interrupt. */
+void teds_zephyr_wake(void);
+
+#endif

@@ -1,0 +1,117 @@
+"""The example boards: the Zephyr port compiled against a stand-in of Zephyr, and run on a bus of this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.bench import make_station
+from tests.e2e.desk import Desk, Running, Station
+from tests.firmware import builds
+from tests.pace import until
+
+pytestmark = pytest.mark.system
+LOAD, GRIPPER = "loadcell_hx711", "gripper_servo"
+CALIBRATION = "# date: 2026-10-01\n# method: linear\n4194304,-499\n12582912,499\n"
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stations")
+    make_station(folder / "bench", "bench").close()
+    return folder
+
+
+@pytest.fixture
+def desk(tmp_path: Path, prepared: Path) -> Iterator[Desk]:
+    desk = Desk(tmp_path, prepared)
+    yield desk
+    desk.clear()
+
+
+def powered(desk: Desk, name: str, chip: int, **more: str) -> Running:
+    """A board on the bus; its identity key lies in the folder where it runs, as PSA's storage."""
+    folder = desk.folder / name
+    folder.mkdir(exist_ok=True)
+    around = os.environ | {"TEDS_FLASH": "flash.bin", "TEDS_CAN": desk.links.can, "TEDS_CHIP": str(chip), **more}
+    running = desk.start(program=(str(builds.board(name)),), fork=False, cwd=folder, environment=around)
+    assert running.wait_for_lines(1)[0]["ready"]
+    return running
+
+
+def servo(board: Running) -> list[dict[str, Any]]:
+    while board.read(0.05):
+        pass
+    return [line for line in map(json.loads, board.out.splitlines()) if "servo" in line]
+
+
+def test_a_load_cell_reads_its_bridge_and_knows_itself_after_a_start(desk: Desk) -> None:
+    station: Station = desk.station()
+    calibration = desk.folder / "load.csv"
+    calibration.write_text(CALIBRATION)
+    board = powered(desk, LOAD, 1, TEDS_RAW="0x100000")  # 1,048,576 above no load
+    over = desk.links.over("can")
+    done = station.ask("provision", "--profile", "load-cell", "--calibration", calibration, "--yes", *over)
+    assert done["verdict"] == "authentic"
+    assert {step["name"]: step["result"] for step in done["steps"]}["check"] == "done", "the hardware bears it"
+    (shown,) = station.ask("sample", done["uuid"], *over)["samples"]
+    assert shown["raw"] == 0x800000 + 0x100000
+    assert shown["value"] == pytest.approx(499 * 0x100000 / 0x400000, abs=1e-3)
+    board.process.kill()
+    board.end()
+    powered(desk, LOAD, 1, TEDS_RAW="0x7fffff")  # an input is torn off
+    assert station.ask("verify", done["uuid"], *over)["verdict"] == "authentic"
+    assert not station.ask("sample", done["uuid"], *over)["samples"][0]["valid"]
+
+
+def test_a_gripper_moves_and_lets_go_when_its_station_is_gone(desk: Desk) -> None:
+    station: Station = desk.station()
+    board = powered(desk, GRIPPER, 2)
+    over = desk.links.over("can")
+    calibration = desk.folder / "gripper.toml"
+    head = "[[calibration]]\ndate = 2026-11-01\n"
+    whole = [
+        f'{head}channel = {channel}\nunit = "{unit}"\npoints = [[0, 0], [4095, {most}]]\n'
+        for channel, unit, most in ((1, "mm", 110), (2, "mm", 110), (3, "N", 140))
+    ]
+    calibration.write_text("".join(whole))
+    done = station.ask("provision", "--profile", "gripper", "--calibration", calibration, "--yes", *over)
+    assert done["verdict"] == "authentic"
+    assert servo(board) == [], "a servo has no power before its first set point"
+    holds = station.start("--json", "set", done["uuid"], 1, 55, "--unit", "mm", "--dead-man", 200, *over)
+
+    def moves() -> bool:
+        holds.read(0.01)
+        return any(line["servo"] == "on" for line in servo(board))
+
+    until(moves, lambda: holds.out + holds.err)
+    assert servo(board)[-1]["pulse"] == pytest.approx(1_500_000, abs=1000), "half of its stroke"
+    holds.process.kill()
+    holds.end()
+    until(lambda: servo(board)[-1]["servo"] == "off")
+
+
+def test_the_parts_for_nfc_and_bluetooth_compile() -> None:
+    """Against stub headers alone: what they name is not on this machine."""
+    builds.need("make", "gcc", headers=("psa/crypto.h",))
+    builds.make("boards-radio")
+
+
+@pytest.mark.parametrize("name", [LOAD, GRIPPER])
+def test_what_zephyr_needs_lies_beside_each_board(name: str) -> None:
+    """West builds it from these; nothing of that can run here."""
+    folder = builds.FIRMWARE / "boards" / name
+    words = (folder / "CMakeLists.txt").read_text()
+    assert f"project({name})" in words
+    assert all((folder / source).exists() for source in words.split("PRIVATE ")[1].rstrip(")\n").split())
+    kconfig = (builds.FIRMWARE / "zephyr" / "Kconfig").read_text()
+    ours = [line.split("=")[0] for line in (folder / "prj.conf").read_text().splitlines() if "TEDS_NODE" in line]
+    assert ours
+    assert all(f"config {option.removeprefix('CONFIG_')}\n" in kconfig for option in ours)
+    overlay = (folder / "nucleo_g474re.overlay").read_text()
+    assert all(f"{label}: partition@" in overlay for label in ("teds_identity", "teds_slot_a", "teds_slot_b"))
