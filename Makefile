@@ -209,13 +209,13 @@ firmware-soak: $(VENV)/.dev
 	SECONDS_OF_SOAK=$${SECONDS_OF_SOAK:-600} $(BIN)/python -m pytest tests/firmware/test_soak.py -m soak -s -rs
 
 # Lines and branches of firmware/src that its tests reach, by gcov: the C tests, those in one process and the host port.
-# Two minutes; not the faulty nodes, which are copies. Goes on where a test fails, as coverage does.
+# Three minutes; not the faulty nodes, which are copies. Goes on where a test fails, as coverage does.
 COUNTED := LEVEL=-O0 --coverage,HOST_LEVEL=-O0 --coverage
 firmware-coverage: vectors-c $(VENV)/.dev
 	@sh scripts/install-test-packages
 	rm -rf firmware/build/counted
 	$(MAKE) --no-print-directory -C firmware BUILD=build/counted SANITIZED="-O0 -g --coverage" check
-	-TEDS_C_BUILD=build/counted TEDS_C_WORDS="$(COUNTED)" $(BIN)/python -m pytest -q -m '$(USUAL) and not realtime' \
+	-TEDS_C_BUILD=build/counted TEDS_C_WORDS="$(COUNTED)" $(BIN)/python -m pytest -q -m '$(USUAL)' \
 	  --ignore tests/firmware/test_faults.py --ignore tests/firmware/test_c_tests.py tests/firmware
 	$(BIN)/python -m tests.firmware.coverage firmware/build/counted
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,6 +75,10 @@ def station(desk: Desk) -> Station:
 
 
 @pytest.fixture
-def node(desk: Desk) -> CNode:
-    """A new node in C that is not powered yet."""
-    return CNode(desk, builds.host(), desk.folder / "flash.bin", desk.new_uuid().hex())
+def node(desk: Desk) -> Iterator[CNode]:
+    """A new node in C that is not powered yet; ended politely, so that make firmware-coverage has its counts."""
+    made = CNode(desk, builds.host(), desk.folder / "flash.bin", desk.new_uuid().hex())
+    yield made
+    if made.process is not None and made.process.runs:
+        made.process.signal(signal.SIGTERM)
+        made.process.end()
