@@ -116,7 +116,8 @@ fuzz: .venv-fuzz/.ready
 # backups of 100,000 nodes; an hour and a half, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
-	$(BIN)/pytest -q -m "soak or not soak" tests/plant/test_cut.py tests/plant/test_line_cut.py
+	$(BIN)/pytest -q -m "soak or not soak" tests/plant/test_cut.py tests/plant/test_line_cut.py \
+	  tests/plant/test_server_faults.py
 
 # A service on bad days: its clock set, its disk filled, an adapter pulled, 10,000 invented nodes, in rounds.
 MINUTES ?= 30

@@ -1,7 +1,8 @@
 """The registry on a PostgreSQL of its own: 50 stations that push at once, waking, and a sync that finds nothing.
 
-``python -m benchmarks.plant [--stations 50] [--pages 20] [--events 20]``. Times are ratios: client and server share the
-machine. The floor beside it is as many empty round trips over the same connections.
+``python -m benchmarks.plant [--stations 50] [--pages 20] [--events 20]``; ``--history NODES`` alone: a newcomer takes
+in what was told of so many nodes, four events each, in a process of its own. Times are ratios: client and server share
+the machine. The floor beside it is as many empty round trips over the same connections.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -16,14 +19,19 @@ import uuid
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from teds_provision.demo import cluster
 from teds_provision.links.ports import free_port
 from teds_provision.plant import postgres, schema, scram
+from teds_provision.plant.files import FilesPost
+from teds_provision.plant.sync import sync
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.page import Draft, seal_page
+from teds_provision.station.station import Station
+from tests.plant.stations import Plant, ask
 
 REGISTRY = str(uuid.uuid4())
 Pages = list[tuple[int, str, bytes]]
@@ -69,7 +77,12 @@ def main() -> None:
     asked.add_argument("--stations", type=int, default=50)
     asked.add_argument("--pages", type=int, default=20)
     asked.add_argument("--events", type=int, default=20)
+    asked.add_argument("--history", type=int, metavar="NODES")
+    asked.add_argument("--take-in", type=Path, metavar="FOLDER", help=argparse.SUPPRESS)
     size = asked.parse_args()
+    if size.history or size.take_in:
+        _take_in(size.take_in) if size.take_in else _history(size.history)
+        return
     found = cluster.programs()
     if found is None:
         raise SystemExit("PostgreSQL 15 is not installed.")
@@ -91,6 +104,56 @@ def main() -> None:
             _woken(posts, keys)
             for post in posts:
                 post.close()
+
+
+def _history(nodes: int) -> None:
+    """The whole past of a plant lies on a stick; who joins today reads it there."""
+    with tempfile.TemporaryDirectory(prefix="plant-history-") as folder:
+        made = Plant(Path(folder))
+        west, _ = made.member("west", "line", "sign"), made.member("south", "base")
+        stick, key, place = FilesPost(made.stick), west.vault.identity(), (0, "")
+        made.sync(made.north)
+        for _ in range(0, nodes, 250):
+            told = [one for _ in range(250) for one in _told_of(os.urandom(10))]
+            draft = Draft(made.roster.registry, place[0] + 1, place[1], "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
+            octets = seal_page(draft, told, key)
+            place = draft.n, hash_of(octets)
+            stick.append(west.fingerprint, draft.n, draft.previous, place[1], octets)
+        made.close()
+        print(f"{nodes} nodes, {4 * nodes} events, {place[0]} pages:", flush=True)
+        subprocess.run([sys.executable, "-m", "benchmarks.plant", "--take-in", folder], check=True)
+
+
+def _told_of(uuid: bytes) -> list[dict[str, Any]]:
+    """What a line says of a board that it provisioned."""
+    at, who, digest = "2026-11-23T09:00:00Z", os.urandom(32).hex(), os.urandom(32).hex()
+    written = {"epoch": 1, "sequence": 1, "teds_sha256": digest}
+    kind = {"profile": "magnetic-angular-position-sensor", "profile_sha256": "ab" * 32, "due": "2027-11-23"}
+    said: list[tuple[str, dict[str, Any]]] = [
+        ("pinned", {"fingerprint": who, "assurance": "tap"}),
+        ("agreed", {"fingerprint": who, "epoch": 1, "key_id": os.urandom(8).hex()}),
+        ("signed", written),
+        ("written", {**written, **kind}),
+    ]
+    return [event.made(act, os.urandom(8).hex(), at, uuid, members) for act, members in said]
+
+
+def _take_in(folder: Path) -> None:
+    south = Station.open(folder / "south", ask=ask)
+    south.unlock()
+    before, cpu, began = _peak(), time.process_time(), time.monotonic()
+    done = sync(south, FilesPost(folder / "stick"))
+    spent, took = time.process_time() - cpu, time.monotonic() - began
+    store = sum(path.stat().st_size for path in (folder / "south").rglob("*") if path.is_file())
+    south.close()
+    print(f"  {done.fetched} pages in: {spent:.1f} s of CPU ({took:.1f} s by the clock), {_peak():.0f} MB at most")
+    print(f"  ({before:.0f} MB before it), home {store / 1e6:.0f} MB")
+
+
+def _peak() -> float:
+    """MB that this process took at most; getrusage would count its parent's before the exec."""
+    (line,) = [one for one in Path("/proc/self/status").read_text().splitlines() if one.startswith("VmHWM")]
+    return int(line.split()[1]) / 1024
 
 
 def _pushed(posts: list[postgres.Registry], chains: list[Pages], size: argparse.Namespace) -> None:

@@ -455,6 +455,7 @@ def sync(app: App, files: Path | None) -> None:
     post, connected = _post(station, files)
     try:
         done = plant.sync.sync(station, post, connected=connected)
+        doors = post.open_doors() if isinstance(post, plant.postgres.PostgresPost) else []
     finally:
         post.close()
     alarms = [one for one in station.plant.tables.alarms() if not one.seen]
@@ -465,7 +466,13 @@ def sync(app: App, files: Path | None) -> None:
         "alarms": [_alarm(station, one) for one in alarms],
         "told": done.told,
         "rosters": done.rosters,
+        "open_doors": doors,
     }
+    if doors:
+        app.warn(
+            f"A station's login may do there what none should: {', '.join(doors)}. The database's superuser runs:"
+            " registry sql | psql"
+        )
     app.emit(told, _synced(station, done, alarms))
     if alarms:
         raise click.exceptions.Exit(4)

@@ -299,6 +299,10 @@ class PostgresPost:
         self._seen = self._registry.look()
         return self._seen.registry
 
+    def open_doors(self) -> list[str]:
+        """What this station's login may do there that no member should: after a pg_restore, for one."""
+        return self._registry.open_doors()
+
     def rosters(self) -> Iterator[bytes]:
         """What members posted."""
         yield from self._look.rosters

@@ -34,7 +34,8 @@ def registry_sql(registry: str, removed: Iterable[str] = ()) -> str:
     Running it again is harmless, and the cure after a pg_restore.
     """
     text = (files("teds_provision.plant") / "registry.sql").read_text(encoding="utf-8")
-    return text.replace(":'registry'", f"'{UUID(registry)}'") + "".join(map(close_sql, removed))
+    quiet = "set client_min_messages = warning;\n"  # run again, each table that is there would be a notice
+    return quiet + text.replace(":'registry'", f"'{UUID(registry)}'") + "".join(map(close_sql, removed))
 
 
 def member_sql(fingerprint: str, verifier: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -12,18 +13,18 @@ import pytest
 
 from teds_provision import plant as plant_room
 from teds_provision.demo.cluster import Cluster
-from teds_provision.errors import NotAuthentic, RegistryFailure
+from teds_provision.errors import Fork, NotAuthentic, RegistryFailure
 from teds_provision.plant.postgres import PostgresPost, Registry, parameters
 from teds_provision.plant.schema import member_sql, mend_sql, registry_sql
 from teds_provision.plant.scram import verifier
-from teds_provision.plant.sync import Synced, sync
+from teds_provision.plant.sync import Synced, resume, sync
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
-from teds_provision.store import TrustRecord
+from teds_provision.store import TrustRecord, WhitelistEntry
 from tests.plant.handing import board_of
 from tests.plant.postgres import Database
 from tests.plant.relay import relay
-from tests.plant.stations import Plant
+from tests.plant.stations import Plant, ask
 
 pytestmark = pytest.mark.system
 
@@ -190,3 +191,39 @@ def test_a_sync_that_is_cut_anywhere_is_followed_by_the_same_sync(office: Office
     assert [key.epoch for key in south.keys.of(board.uuid)] == [1]
     assert office.database.sql("select count(*) from registry.parcel") == [["0"]]
     assert office.database.sql("select count(*) = max(n) from registry.page group by station") == [["t"], ["t"]]
+
+
+def test_the_doors_that_a_restore_opens_are_seen_by_every_member(office: Office) -> None:
+    post = office.post(office.north)
+    post.registry()
+    assert post.open_doors() == []
+    office.database.sql(f"grant temp on database {office.database.name} to public")  # as pg_restore does
+    assert post.open_doors() == ["TEMP for PUBLIC"]
+    office.database.sql(registry_sql(office.database.registry))
+    assert post.open_doors() == []
+    post.close()
+
+
+def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(office: Office) -> None:
+    south = office.member("south", "base")
+    office.sync(office.north, south)
+    shutil.copytree(south.home, office.plant.folder / "copy")
+    copy = Station.open(office.plant.folder / "copy", ask=ask)
+    for n, station in enumerate((copy, south), 1):
+        station.pins.put(WhitelistEntry(bytes([n] * 10), "ab" * 32, assurance="tap"))
+    office.sync(copy)
+    with pytest.raises(Fork, match="a copy of it is at work"):
+        office.sync(south)
+    assert office.database.sql("select count(*) from registry.page where n > 1") == [["0"]]
+    post = office.post(south)
+    assert resume(south, post) == 1
+    post.close()
+    office.sync(south)
+    with pytest.raises(Fork):
+        office.sync(copy)
+    office.sync(office.north)
+    assert [alarm.code for alarm in office.north.plant.tables.alarms()] == []
+    events = [one.event for one in plant_room.status.log(office.north, of=south.fingerprint)]
+    said = {one["uuid"] for one in events if one["act"] == "pinned"}
+    assert said == {bytes([n] * 10).hex() for n in (1, 2)}
+    copy.close()
