@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import files
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyRefused, StoreFailure
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
@@ -162,6 +162,45 @@ def test_a_line_that_is_killed_at_any_step_carries_on(tmp_path: Path, monkeypatc
 @pytest.mark.soak
 def test_an_office_that_is_killed_at_any_step_carries_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cut_office(tmp_path, range(100), monkeypatch) >= 8
+
+
+def pages_of(station: Station, most: int | None = None) -> int:
+    """How many pages the store has; it may have ``most`` from now on."""
+    database = station._store._database
+    if most is not None:
+        database.execute(f"PRAGMA max_page_count = {most}")
+    return int(database.execute("PRAGMA page_count")[0][0])
+
+
+@pytest.mark.parametrize("home", ["line", "office"])
+def test_a_disk_that_is_full_loses_no_unit_and_gives_none_twice(tmp_path: Path, home: str) -> None:
+    """The store has room for so many pages more, up to where all fits; then somebody makes room."""
+    plant = Plant(tmp_path)
+    west, north = plant.member("west", "line"), plant.north
+    north.unlock()
+    west.unlock()
+    own = {"stations": {west.identity.fingerprint: 50}, "sign": north.identity.fingerprint, "count": 50}
+    document = job_of(north, registry=plant.roster.registry, **own)
+    take_job(north, document)
+    line = LineRun(west, take_job(west, document), office=AtHand(north))
+    full = west if home == "line" else north
+    failed = 0
+    for number, room in enumerate((0, 1, 2, 3, 5, 8), 1):
+        one = board(number)
+        pages_of(full, pages_of(full) + room)
+        try:
+            build(line, one)
+        except StoreFailure:
+            failed += 1
+        pages_of(full, 1 << 20)
+        assert build(line, one).verified.verdict == "authentic", room
+        rows = list(west.plant.line.evidence(uuid=one.uuid))
+        assert rows[-1].verdict == codec.PASSED, room
+        assert all(codec.faults(codec.read(row.document), west.identity.ca) == [] for row in rows), room
+        assert [unit for unit, _, _ in units(line)] == list(range(1, number + 1)), room
+    assert failed, "at first nothing fits"
+    assert len(north.plant.line.units(line.job.id if line.job else "")) == 6
+    plant.close()
 
 
 def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_since(tmp_path: Path) -> None:
