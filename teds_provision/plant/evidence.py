@@ -21,11 +21,13 @@ from teds_provision.teds.codec import security
 TOOL = f"teds-provision {__version__}"
 
 
-def sign_evidence(node: Conversation, credentials: Credentials, claim: Claim, *, operator: str | None = None) -> bytes:
+def sign_evidence(
+    node: Conversation, credentials: Credentials, claim: Claim, *, operator: str | None = None, finished: str = ""
+) -> bytes:
     """Have the board sign the facts of ``claim``, and return the envelope that the station signed over both.
 
     A board that passed must answer: raises NotAuthentic where its signature does not verify, LinkFailure. One whose
-    attempt failed may be gone; then the envelope holds the station's word alone.
+    attempt failed may be gone; then the envelope holds the station's word alone. ``finished``: now, unless it is named.
     """
     nonce = os.urandom(NONCE_OCTETS)
     proof = b""
@@ -40,7 +42,7 @@ def sign_evidence(node: Conversation, credentials: Credentials, claim: Claim, *,
         claim,
         nonce=nonce if proof else b"",
         proof=proof,
-        finished=utc_now(),
+        finished=finished or utc_now(),
         operator=operator,
     )
 

@@ -19,7 +19,7 @@ from teds_provision.plant.jobs import digest_of_file, profile_file, require_adop
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.plant.evidence import Claim, Facts, blocks_of, read
+from teds_provision.protocol.plant.evidence import FAILED, PASSED, Claim, Facts, blocks_of
 from teds_provision.protocol.plant.job import WORTH, Job
 from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.station import Station
@@ -60,6 +60,7 @@ class LineRun:
     scans: Scans | None = None
     _turn: threading.Lock = field(default_factory=threading.Lock)
     _digests: dict[bytes, str] = field(default_factory=dict)
+    _common: dict[str | None, Prepared] = field(default_factory=dict)
     _told: dict[bytes, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -133,17 +134,28 @@ class LineRun:
                 )
         path = None if self.only_verify else self._calibration_of(who.uuid)
         if path is None:
-            return prepare(self.station, self.order_of_all, who.uuid)
+            return self._prepared(None, self.order_of_all)
         digest = digest_of_file(path)
         wanted = job.calibration.wants(who.uuid)
         if wanted is not None and digest != wanted:
             raise PolicyRefused(f"The calibration {path} is not the one that the job names for {who.uuid.hex()}.")
-        prepared = prepare(self.station, replace(self.order_of_all, calibration=path, drop_calibration=False), who.uuid)
+        order = replace(self.order_of_all, calibration=path, drop_calibration=False)
+        if job.calibration.rule == "one":
+            prepared = self._prepared(digest, order)
+        else:
+            prepared = prepare(self.station, order, who.uuid)
         if job.calibration.rule == "any":
             self._require_fresh(path, prepared)
         with self._turn:
             self._digests[who.uuid] = digest
         return prepared
+
+    def _prepared(self, calibration: str | None, order: BuildOrder) -> Prepared:
+        """What all boards get alike, read and guarded once a run; ``calibration`` is the SHA-256 of its file."""
+        with self._turn:
+            if calibration not in self._common:
+                self._common[calibration] = prepare(self.station, order)
+            return self._common[calibration]
 
     def _calibration_of(self, uuid: bytes) -> Path | None:
         assert self.job is not None
@@ -234,29 +246,22 @@ class LineRun:
             )
         return UnitRow(job.id, uuid, greatest + 1, utc_now())
 
-    def keep(self, document: bytes, unit: LineUnit, *, passed: bool) -> None:
-        """Keep evidence, whole, and that the unit passed."""
-        evidence, digest = read(document), hashlib.sha256(document).hexdigest()
-        facts, tables = evidence.facts, self.station.plant.line
-        row = EvidenceRow(
-            digest,
-            evidence.uuid,
-            facts.job,
-            facts.unit,
-            facts.attempt,
-            evidence.verdict,
-            evidence.finished,
-            document,
-        )
+    def keep(self, document: bytes, claim: Claim, finished: str, unit: LineUnit) -> None:
+        """Keep the evidence of a claim, whole, and whether the unit passed."""
+        digest, uuid, facts = hashlib.sha256(document).hexdigest(), claim.uuid, claim.facts
+        passed, tables = facts.failure is None, self.station.plant.line
+        verdict = PASSED if passed else FAILED
+        row = EvidenceRow(digest, uuid, facts.job, facts.unit, facts.attempt, verdict, finished, document)
         with self.station.durable("evidence"):
             tables.add_evidence(row)
-            self.note(evidence.uuid, unit, passed=passed)
-            self.station.audit("evidence", evidence.uuid, evidence.verdict, sha256=digest, attempt=facts.attempt)
-            verdict = evidence.verdict if facts.failure is None else f"{evidence.verdict}: {facts.failure}"
-            told = {"sha256": digest, "job": facts.job, "unit": facts.unit, "verdict": verdict}
-            self.station.plant.tell("evidence", evidence.uuid, **told)
+            self.note(uuid, unit, passed=passed)
+            self.station.audit("evidence", uuid, verdict, sha256=digest, attempt=facts.attempt)
+            told = {"sha256": digest, "job": facts.job, "unit": facts.unit}
+            self.station.plant.tell(
+                "evidence", uuid, **told, verdict=verdict if passed else f"{verdict}: {facts.failure}"
+            )
         with self._turn:
-            self._told.setdefault(evidence.uuid, {})["evidence"] = digest
+            self._told.setdefault(uuid, {})["evidence"] = digest
 
     def passed_board(self, uuid: bytes) -> None:
         """Print its label, and wait for the next scan."""
@@ -412,8 +417,9 @@ class LineUnit:
             begun=self.begun,
             heads=heads_digest(station) if station.plant.joined is not None else None,
         )
-        document = sign_evidence(node, credentials, Claim(uuid, teds, facts), operator=self.run.operator)
-        self.run.keep(document, self, passed=facts.failure is None)
+        claim, finished = Claim(uuid, teds, facts), utc_now()
+        document = sign_evidence(node, credentials, claim, operator=self.run.operator, finished=finished)
+        self.run.keep(document, claim, finished, self)
 
 
 def _told(steps: Sequence[StepResult]) -> tuple[tuple[str, str, int], ...]:
