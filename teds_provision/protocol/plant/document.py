@@ -136,6 +136,14 @@ def is_form(kind: str, value: object) -> bool:
     return isinstance(value, str) and _PATTERNS[kind][0].fullmatch(value) is not None
 
 
+def is_time(value: object) -> bool:
+    """Whether a value is a time of that form that there is: the 31st of February is none."""
+    try:
+        return is_form("time", value) and datetime.fromisoformat(str(value)) is not None
+    except ValueError:
+        return False
+
+
 def is_number(value: object) -> bool:
     """Whether a value is a whole number of 0 to 2^32 - 1 (true is none)."""
     return type(value) is int and 0 <= value <= LAST_NUMBER

@@ -14,7 +14,16 @@ from typing import Any, Final
 from teds_provision.errors import BadData
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint
-from teds_provision.protocol.plant.document import PAGE, Fields, is_form, is_number, open_document, payload, seal
+from teds_provision.protocol.plant.document import (
+    PAGE,
+    Fields,
+    is_form,
+    is_number,
+    is_time,
+    open_document,
+    payload,
+    seal,
+)
 
 MOST_EVENTS: Final = 1000
 MOST_PAYLOAD: Final = 700_000
@@ -66,7 +75,7 @@ def open_page(octets: bytes, registry: str, find_key: Callable[[str], bytes | No
         document.hash,
         str(previous),
         str(home) if is_form("digits", home) else "",
-        str(created) if is_form("time", created) else "",
+        str(created) if is_time(created) else "",
         _heads(fields.members.get("heads")),
         events,
         octets,
