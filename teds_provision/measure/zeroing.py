@@ -158,7 +158,10 @@ class _Zeroing:
             at = (channel.number, int(AccessCode.CALIBRATION))
             octets = with_zero_offset(image.blocks[at], offset, datetime.now(UTC).replace(microsecond=0))
             wanted_image = Image(node.uuid, {**image.unsigned_blocks(), at: octets})
-            told = guard(station, wanted_image, image, self.order.accept_calibration, record=not self.dry_run)
+            record = not self.dry_run
+            told = guard(
+                station, wanted_image, image, self.order.accept_calibration, record=record, expected=("changed",)
+            )
             changes = tuple(one.text for one in diff_blocks(image.unsigned_blocks(), wanted_image.unsigned_blocks()))
             found = replace(found, changes=changes, warnings=(*found.warnings, *told))
             step.detail = f"zero offset {channel.show(found.offset, difference=True)}"

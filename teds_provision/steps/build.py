@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -321,10 +321,12 @@ def guard(
     profile: Profile | None = None,
     *,
     record: bool = True,
+    expected: Collection[str] = (),
 ) -> tuple[str, ...]:
     """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings.
 
-    That reason goes into the audit log, unless ``record`` is False (dry run).
+    That reason goes into the audit log, unless ``record`` is False (dry run). ``expected`` are codes of warnings that
+    say what was asked for, and so are not given.
     """
     if not _is_calibrated(image, has):
         return ()
@@ -339,7 +341,7 @@ def guard(
         )
     if errors and record:
         station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
-    return merged(tuple(map(_said, findings)))
+    return merged(tuple(_said(one) for one in findings if one.severity == "error" or one.code not in expected))
 
 
 def _is_calibrated(*images: Image | None) -> bool:

@@ -73,6 +73,7 @@ def test_this_is_0_now_in_one_step(hall: Hall, angle: Shaft) -> None:
     before, had = reads(hall), angle.calibration()
     done = hall.ask("calibrate", "zero", "angle", 1)
     assert done["written"]
+    assert done["warnings"] == [], "that it reads otherwise than before is what was asked for"
     assert done["before"] == pytest.approx(before)
     assert min(done["after"], TURN - done["after"]) < 1e-6
     assert done["offset"] == pytest.approx(-6000 / 65536 * TURN, abs=1e-6)
