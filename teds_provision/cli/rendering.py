@@ -54,7 +54,7 @@ def local_time(text: str) -> str:
     """A moment of the store (UTC) in local time with its offset; anything else as it is."""
     try:
         return datetime.fromisoformat(text).astimezone().isoformat(sep=" ", timespec="seconds")
-    except ValueError:
+    except (ValueError, OverflowError):  # a moment that a stranger wrote: the last day of 9999, east of Greenwich
         return text
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from teds_provision import plant
+from teds_provision.cli.rendering import local_time
 from teds_provision.plant.files import FilesPost
 from teds_provision.protocol.plant.document import PAGE, hash_of, seal
 from teds_provision.station.station import Station
@@ -107,3 +109,20 @@ def test_no_page_of_a_liar_stops_a_reader_or_takes_anything(plants: Plant, name:
     assert (entry.fingerprint, entry.assurance) == (KEY, "tap")
     assert north.pins.entry(OTHER) is None
     assert north.policy.denied(NODE, None) is None
+
+
+@pytest.fixture
+def east(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", "JST-9")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("east")
+@pytest.mark.parametrize("day", ["9999-12-31T23:59:59Z", ""])
+def test_the_pages_of_a_thief_are_listed_whatever_day_he_wrote(day: str) -> None:
+    """`registry remove --stolen` lists them for a person to choose the last one from."""
+    assert local_time(day) == day
+    assert local_time("2026-03-01T12:00:00Z") == "2026-03-01 21:00:00+09:00"
