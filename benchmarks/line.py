@@ -140,10 +140,11 @@ def boards(folder: Path, count: int) -> tuple[float, float]:
     alike = prepare(plain, BuildOrder(ANGLE))  # once a run, as `provision --watch` does
     spent = [0.0, 0.0]
     for number in range(count):
-        for place, (station, order, hook) in enumerate(((plain, alike, None), (line, run.order, run))):
+        for place, hook in enumerate((None, run)):
             board = Board(uuid=(1 + number).to_bytes(10, "big"))
             used = time.process_time()
             with talk(board) as node:
+                station, order = (plain, alike) if hook is None else (line, hook.order)
                 provision(station, node, order, accept=lambda who: None, reporter=Silent(), line=hook)
             spent[place] += time.process_time() - used
     plain.close()
