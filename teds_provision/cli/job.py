@@ -264,7 +264,8 @@ def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
         app.closing(post.close)
         plant.asking.send_job(station, post, found)
     names = [roster.name_of(one) for one in to]
-    app.emit({"id": found.id, "to": to}, f"{'Would send' if dry_run else 'Sent'} {found.id[:8]} to {', '.join(names)}.")
+    sent = f"{'Would send' if dry_run else 'Sent'} {found.id[:8]} to {', '.join(names)}."
+    app.emit({"id": found.id, "to": to}, sent if to else f"{found.id[:8]} is for this station alone: nothing to send.")
 
 
 @command("teds-provision job close 0b5f", name="close")
