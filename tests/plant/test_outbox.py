@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import agree
+from teds_provision.steps.identify import identify
+from teds_provision.store import WhitelistEntry
+from teds_provision.store.connection import Connection
 from teds_provision.store.tables.plant import PlantRecord
-from tests.bench import make_station
+from tests.bench import Board, make_station, talk
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 REGISTRY = "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"
@@ -51,3 +57,30 @@ def test_who_left_tells_nothing_any_more(station: Station) -> None:
     station.plant.tables.put_plant(PlantRecord(REGISTRY, left="2026-01-31T12:00:00Z"))
     station.plant.tell("named", UUID, name="grip")
     assert station.plant.tables.unsent() == 0
+
+
+def test_a_registry_costs_no_further_commit(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each commit waits for the disk: what is told goes with the act that tells it."""
+    seen: list[str] = []
+    execute = Connection.execute
+
+    def counted(self: Connection, statement: str, values: Any = ()) -> Any:
+        if statement == "COMMIT":
+            seen.append(statement)
+        return execute(self, statement, values)
+
+    monkeypatch.setattr(Connection, "execute", counted)
+
+    def commits() -> int:
+        seen.clear()
+        board = Board(os.urandom(10))
+        with talk(board) as node:
+            who = identify(station, node)
+            agree(station, node, who, newcomer=WhitelistEntry(node.uuid, who.fingerprint, assurance="tap"))
+        station.pins.put(WhitelistEntry(os.urandom(10), "ab" * 32, assurance="tap"))
+        return len(seen)
+
+    alone = commits()
+    station.plant.tables.put_plant(PlantRecord(REGISTRY))
+    assert commits() == alone > 0
+    assert station.plant.tables.unsent() >= 3, "pinned, agreed, pinned"
