@@ -85,7 +85,7 @@ def finished(process: subprocess.Popen[str]) -> str:
     """Wait for a command that has to succeed; returns what it printed."""
     out, error = process.communicate(timeout=_WAIT)
     if process.returncode != 0:
-        raise SystemExit(f"{process.args}\nexit {process.returncode}: {error}")
+        raise SystemExit(f"{process.args!r}\nexit {process.returncode}: {error}")
     return out
 
 

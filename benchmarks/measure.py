@@ -22,7 +22,7 @@ from collections.abc import Callable
 import numpy as np
 
 from teds_provision.measure.blocks import Block
-from teds_provision.measure.clock import ClockMap, Exchange, Monotone, Wall
+from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.protocol.operation.can_frames import Assembly
@@ -62,7 +62,7 @@ class Stream:
         self.base = time.monotonic_ns() - 100 * SECOND
         clock.exchange(Exchange(self.base, self.base + 2000, 500, 1500, 1, 20))
         self.blocks: list[Block] = []
-        interpreter = StreamInterpreter(known, self.plan, 1, clock, Wall.now(), Monotone())
+        interpreter = StreamInterpreter(known, self.plan, 1, clock, HostClock(), Monotone())
         receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
         assembly = Assembly(self.plan.length, fd=True)
         self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)

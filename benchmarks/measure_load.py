@@ -31,7 +31,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.ports import free_port
 from teds_provision.measure.blocks import Block, StationFacts
-from teds_provision.measure.clock import ClockMap, Exchange, Monotone, Wall
+from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.hearing import CanHearing, HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
@@ -183,7 +183,7 @@ class Machine:
         self.load, self._sinks = load, sinks
         self.heard: dict[tuple[int, int], HeardStream] = {}
         self._for_grid: deque[Block] = deque()
-        self._wall = Wall.now()
+        self._host = HostClock()
         self._since = {}
         facts = []
         for node in range(nodes):
@@ -206,7 +206,7 @@ class Machine:
     def _stream(self, sheet: Sheet, stream: int, clock: ClockMap) -> HeardStream:
         plan = plan_of(stream)
         receiver = Receiver(plan, Subscribed(1, plan.length, SECOND), KEY)
-        interpreter = StreamInterpreter(sheet, plan, 1, clock, self._wall, Monotone())
+        interpreter = StreamInterpreter(sheet, plan, 1, clock, self._host, Monotone())
         return HeardStream(receiver, Assembly(plan.length, fd=True), interpreter, clock, threading.Lock(), self._block)
 
     def _block(self, block: Block) -> None:
@@ -244,8 +244,10 @@ def run(nodes: int, seconds: float, folder: Path, targets: Sequence[str] = TARGE
     words += ["--messages", str(messages), "--nodes", str(nodes)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as feeder:
         _watch(machine, feeder, began)
-    for part in (*hearings, *ports):
-        part.close()
+    for hearing in hearings:
+        hearing.close()
+    for port in ports:
+        port.close()
     machine.beat()
     for sink in sinks:
         sink.close()

@@ -66,7 +66,8 @@ def provisioned(station: Station, folder: Path, name: str) -> bytes:
 
 def serve(can: str, folders: Sequence[str]) -> None:
     """The nodes' process: prints, for each, the host's time at which its clock stood at 0."""
-    pulse, server, boards = Pulse(), CanServer(can), {}
+    pulse, server = Pulse(), CanServer(can)
+    boards: dict[str, Board] = {}
     for folder in folders:
         node = VirtualNode(
             Path(folder),
@@ -77,8 +78,10 @@ def serve(can: str, folders: Sequence[str]) -> None:
         node.streams_over(_sender(server, node))
         assert node.board is not None
         boards[node.tim.flash.uuid.hex()] = node.board
-    for part in (pulse, *boards.values(), server):
-        part.start()
+    pulse.start()
+    for board in boards.values():
+        board.start()
+    server.start()
     print(json.dumps({uuid: board.clock._since for uuid, board in boards.items()}), flush=True)
     threading.Event().wait()
 
@@ -128,7 +131,7 @@ class Bench:
             while job.measurement is None or not job.measurement.keepers:
                 time.sleep(0.01)
             time.sleep(1.5)  # it asked, nobody answered: it waits
-            wall = job.measurement._wall
+            offset = job.measurement._host.present[1]
             began, nodes = time.monotonic(), self._power(uuids)
             stack.callback(nodes.wait)
             stack.callback(nodes.kill)
@@ -141,7 +144,7 @@ class Bench:
             stop.set()
             measuring.join(30)
         assert job.ended is not None
-        return _found(count, came, since, wall, job.ended.apart, first)
+        return _found(count, came, since, offset, job.ended.apart, first)
 
     def _power(self, uuids: Sequence[bytes]) -> subprocess.Popen[str]:
         words = ["node", self.can, *(str(self.nodes[uuid]) for uuid in uuids)]
@@ -159,7 +162,7 @@ def _first_row(file: Path) -> float:
 
 
 def _found(
-    count: int, came: list[tuple[int, Block]], since: dict[str, int], wall: object, apart: float, first: float
+    count: int, came: list[tuple[int, Block]], since: dict[str, int], offset: float, apart: float, first: float
 ) -> Found:
     stamps, lags = [], []
     began = min(at for at, _ in came)
@@ -167,7 +170,7 @@ def _found(
         if at - began < SETTLING * 1e9:
             continue
         true = (block.tick.astype(np.float64) + since[block.uuid]) / 1e9
-        stamps.append(block.time - wall.unix(true))  # type: ignore[attr-defined]
+        stamps.append(block.time - (true + offset))
         lags.append(at / 1e9 - true)
     return Found(count, np.abs(np.concatenate(stamps)), np.concatenate(lags), apart, first)
 

@@ -141,7 +141,7 @@ def main(words: list[str] | None = None) -> None:
         taken = until(lambda: sum(bool(node["verified"]) for node in here.nodes()) >= options.nodes)
         rows.tell(f"{options.nodes} nodes found and verified after the start", taken, "s")
         made = here.request("POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "sine:2"})
-        until(lambda: here.node(made["uuid"])["verdict"] == "authentic")
+        until(lambda: (verdict := here.node(made["uuid"])["verdict"]) is not None and verdict["verdict"] == "authentic")
         here.measure(made["uuid"], rate=RATE)
         until(lambda: here.node(made["uuid"])["channels"][1]["last"])
         token = json.loads(finished(started(home, "ncap", "token", "add", "load")))["token"]

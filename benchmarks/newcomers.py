@@ -185,10 +185,11 @@ class Topics:
 
     def __init__(self, port: int) -> None:
         import paho.mqtt.client as paho
+        from paho.mqtt.enums import CallbackAPIVersion
 
         self.first: dict[str, float] = {}
-        self._client = paho.Client(paho.CallbackAPIVersion.VERSION2)
-        self._client.on_connect = lambda *_: self._client.subscribe("bench/#")
+        self._client = paho.Client(CallbackAPIVersion.VERSION2)
+        self._client.on_connect = self._subscribe
         self._client.on_message = self._came
         until(lambda: self._connects(port))
         self._client.loop_start()
@@ -199,6 +200,9 @@ class Topics:
         except OSError:
             return False
         return True
+
+    def _subscribe(self, *_: Any) -> None:
+        self._client.subscribe("bench/#")
 
     def _came(self, _client: Any, _data: Any, message: Any) -> None:
         parts = message.topic.split("/")
@@ -390,7 +394,12 @@ def many(on: Scene, count: int, seconds: float, kind: str) -> None:
     time.sleep(5.0)  # that it runs is told after its first values, where all begin at once
     states = [one["state"] for one in on.here.measurements()[0]["nodes"]]
     on.rows.tell(f"  measured of {count}", states.count("running"), "", aim=count, least=True)
-    until(lambda: all(on.here.node(uuid.hex())["verdict"]["from"] == "session" for uuid in on.uuids.values()), 900)
+
+    def read_whole(uuid: bytes) -> bool:
+        verdict = on.here.node(uuid.hex())["verdict"]
+        return verdict is not None and verdict["from"] == "session"
+
+    until(lambda: all(map(read_whole, on.uuids.values())), 900)
     on.rows.tell("  read whole behind the measurement after", time.monotonic() - announced, "s")
     before, since = on.lost_until_now(names), time.monotonic()
     time.sleep(seconds)

@@ -169,7 +169,11 @@ def _pushed(posts: list[postgres.Registry], chains: list[Pages], size: argparse.
         return work
 
     def empty(post: postgres.Registry) -> Callable[[], None]:
-        return lambda: [post.parcel(REGISTRY) for _ in range(size.pages)] and None
+        def ask() -> None:
+            for _ in range(size.pages):
+                post.parcel(REGISTRY)
+
+        return ask
 
     floor = at_once([empty(post) for post in posts])
     seconds = at_once([push(post, pages) for post, pages in zip(posts, chains, strict=True)])

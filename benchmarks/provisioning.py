@@ -26,6 +26,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ from benchmarks.machine import line as machine
 from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, open_port
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.announce import default_can_address
+from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
@@ -119,7 +121,7 @@ class Disk:
                 self.commits += 1
                 self.waited += not self.hurried
 
-        Database.execute = execute  # type: ignore[method-assign]
+        Database.execute = execute  # type: ignore[method-assign, assignment]
 
     def taken(self) -> tuple[float, int, int]:
         """What came together (seconds, commits, those waited for), and begin anew."""
@@ -273,9 +275,7 @@ def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
                 disk.taken()
                 began = time.perf_counter()
                 address = default_can_address(uuid) if line.named else None
-                contact = port.find(
-                    lambda identity, uuid=uuid: identity.uuid == uuid, seconds=20, notice=_quiet, address=address
-                )
+                contact = port.find(partial(_has_uuid, uuid), seconds=20, notice=_quiet, address=address)
                 found = time.perf_counter()
                 timed = Timed(contact.link)
                 known = Contact(contact.identity, timed, contact.tag_uid, contact.address)
@@ -295,6 +295,10 @@ def _least(line: Line, sizes: limits.Sizes) -> tuple[float, float, float]:
     if line.limit is None:
         return 0.0, 0.0, 0.0
     return line.limit.octets(sizes), line.limit.waits(len(sizes)), line.limit.exchanges(sizes)
+
+
+def _has_uuid(uuid: bytes, identity: Identity) -> bool:
+    return identity.uuid == uuid
 
 
 def _quiet(notice: Notice) -> None:

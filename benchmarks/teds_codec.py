@@ -19,7 +19,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from fractions import Fraction
 from pathlib import Path
 from statistics import median
 
@@ -39,13 +40,19 @@ def example_set(seed: int = 1) -> Set:
     channel = {
         "CalKey": "TIM_CAL_SUPPLIED",
         "ChanType": "sensor",
-        "PhyUnits": teds.Units(meters=1, kilograms=1, seconds=-2),
+        "PhyUnits": teds.Units(meters=Fraction(1), kilograms=Fraction(1), seconds=Fraction(-2)),
         "LowLimit": -200.0,
         "HiLimit": 200.0,
         "OError": 0.2,
         "SelfTest": 1,
         "Sample": sample,
-        "DataSet": {"Repeats": 9, "SOrigin": 0.0, "StepSize": 0.01, "SUnits": teds.Units(seconds=1), "PreTrigg": 0},
+        "DataSet": {
+            "Repeats": 9,
+            "SOrigin": 0.0,
+            "StepSize": 0.01,
+            "SUnits": teds.Units(seconds=Fraction(1)),
+            "PreTrigg": 0,
+        },
         "UpdateT": 0.1,
         "RSetupT": 25e-6,
         "SPeriod": 0.1,
@@ -105,8 +112,10 @@ def struct_only(octets: bytes) -> list[tuple[int, object]]:
     return _tuples(octets, 10, len(octets) - 2, _VALUES[access_code], _NESTED.get(access_code, ()))
 
 
-def _tuples(octets: bytes, at: int, end: int, values: dict[int, struct.Struct], nested: object) -> list:
-    out = []
+def _tuples(
+    octets: bytes, at: int, end: int, values: dict[int, struct.Struct], nested: Collection[int]
+) -> list[tuple[int, object]]:
+    out: list[tuple[int, object]] = []
     while at < end:
         kind, size = _TUPLE.unpack_from(octets, at)
         at += 2
