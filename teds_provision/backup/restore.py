@@ -147,7 +147,9 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
     No path of a module ever comes from a backup: for keys in a token the URI has to be given (UsageFailure). Raises
     PolicyRefused where the keys cannot be put there.
     """
-    wanted = asked or _kept_keystore(content)
+    # The backup's own keystore where any machine can have it; None for what this machine has.
+    kept = None if content.in_token or content.keystore in ("keyring", "pkcs11") else content.keystore
+    wanted = asked or kept
     into_token = wanted is not None and wanted.startswith("pkcs11:")
     if wanted not in (None, "keyring", "file") and not into_token:
         raise UsageFailure("There is no such keystore.", hint="Give --keystore keyring, file or pkcs11:URI.")
@@ -166,11 +168,6 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
             "The keys of this backup cannot be put into a token.", hint="Restore with --keystore keyring or file."
         )
     return wanted
-
-
-def _kept_keystore(content: Content) -> str | None:
-    """The keystore that the backup was made of, where it can be made anywhere; None for what this machine has."""
-    return None if content.in_token or content.keystore in ("keyring", "pkcs11") else content.keystore
 
 
 def bring_vault(

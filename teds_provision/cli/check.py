@@ -76,7 +76,10 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
     error: TedsProvisionError | None = report.lost
     if broken:
         count = "a rule" if len(broken) == 1 else f"{len(broken)} rules"
-        error = NotAuthentic(f"The node breaks {count}: {', '.join(broken)}.", hint=_silent(report))
+        error = NotAuthentic(
+            f"The node breaks {count}: {', '.join(broken)}.",
+            hint="" if report.lost is None else f"{report.lost.message} The remaining rules were not tried.",
+        )
     app.conclude(
         {"uuid": report.uuid.hex(), "checks": checks, **counts, **explained},
         lambda console: _table(console, report),
@@ -121,10 +124,6 @@ _EXPLAINED: Final = {
     "sig_n_received": "sigN, received",
     "tag_s": "tagS",
 }
-
-
-def _silent(report: Report) -> str:
-    return "" if report.lost is None else f"{report.lost.message} The remaining rules were not tried."
 
 
 def _table(console: Console, report: Report) -> None:

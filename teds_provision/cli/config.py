@@ -72,7 +72,11 @@ def show(app: App, ctx: click.Context) -> None:
     home = "--home" if root.get_parameter_source("home") == click.core.ParameterSource.COMMANDLINE else "default"
     source = f"environment ({_PREFIX}HOME)" if os.environ.get(f"{_PREFIX}HOME") and home == "default" else home
     settings = [{"name": "home", "value": str(app.home), "source": source}]
-    settings += [_from_environment(name, app) for name in sorted(os.environ) if _is_ours(name)]
+    settings += [
+        _from_environment(name, app)
+        for name in sorted(os.environ)
+        if name.startswith(_PREFIX) and name != f"{_PREFIX}HOME"
+    ]
     settings += [{"name": name, "value": value, "source": str(place)} for name, value in _flat(values)]
     app.emit({"settings": settings}, lambda console: _table(console, settings))
 
@@ -81,10 +85,6 @@ def check_values(root: click.Context, values: Mapping[str, Any], place: Path) ->
     """Have click read every value of config.toml as its command would; raises BadData for the first that is bad."""
     for name, value in _flat(anchored(dict(values), place.parent)):
         _check_value(root, name, value, place)
-
-
-def _is_ours(name: str) -> bool:
-    return name.startswith(_PREFIX) and name != f"{_PREFIX}HOME"
 
 
 def _from_environment(name: str, app: App) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threadi
     """Who watches: lines of JSON, a table, or lines on stderr."""
     if app.json:
         lines = JsonLines(stop)
-        lines.open((), _no_station(station.name))
+        lines.open((), measure_room.blocks.StationFacts(station.name))
         try:
             yield Watcher(lines.write, lines.describe, lines.report_change, lines.sink, app.warn)
         finally:
@@ -45,10 +45,6 @@ def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threadi
     else:
         plain = PlainLines(app)
         yield Watcher(report=plain.report, sink=plain.sink, note=app.warn)
-
-
-def _no_station(name: str) -> StationFacts:
-    return measure_room.blocks.StationFacts(name)
 
 
 class JsonLines(ThreadedSink):

@@ -308,7 +308,7 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
             raise
     if node.contact.address is not None:
         node.forget()  # a link is one pair of addresses: this session ended with the old one
-    elif node.sealed and _address_of(node) != address:
+    elif node.sealed and read_identity(node).can_address != address:
         raise Garbled("The node took the new CAN address and still shows the old one.")
     with station.durable("address"):
         station.nodes.remember(node.uuid, can_address=address)
@@ -321,10 +321,6 @@ def _is_at(node: Conversation, address: int) -> bool:
     link = node.contact.link
     there = link.there(address) if isinstance(link, OnABus) else None
     return there is not None and there.uuid == node.uuid
-
-
-def _address_of(node: Conversation) -> int:
-    return read_identity(node).can_address
 
 
 # -- read, reset, verify, write ----------------------------------------------------------------------------------------

@@ -251,7 +251,8 @@ def _field_name(name: str) -> str:
 def _close_element(element: _Element, parent: _Element | None, reading: _Reading) -> None:
     text = "".join(element.text).strip()
     leaf = not element.uuids and not element.entries
-    if parent is not None and leaf and _is_field(element, text):
+    if parent is not None and leaf and text and not element.fields and element.tag in FIELDS:
+        # <fingerprint>…</fingerprint>: a text under a field's name belongs to the element around it
         parent.take_field(element.line, element.tag, text)
         return
     entries = element.entries + _entry_of(element, text, leaf, parent is None, reading)
@@ -259,11 +260,6 @@ def _close_element(element: _Element, parent: _Element | None, reading: _Reading
         parent.entries += entries
     elif entries == 0 and element.tag != "whitelist" and not reading.mistakes:
         reading.wrong(element.line, element.tag, "there is no UUID in this document")
-
-
-def _is_field(element: _Element, text: str) -> bool:
-    """``<fingerprint>…</fingerprint>``: a text under a field's name, which belongs to the element around it."""
-    return bool(text) and not element.fields and element.tag in FIELDS
 
 
 def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _Reading) -> int:
@@ -427,7 +423,7 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
         pinned = station.pins.among(station.nodes.of_page(uuids).values(), present.values())
         for entry in page:
             known, pin = present.get(entry.uuid), pinned.get(entry.uuid)
-            if pin is not None and _names_another_key(entry, pin):
+            if pin is not None and entry.fingerprint is not None and not same_key(pin, entry.fingerprint):
                 conflicts.append((entry, pin))
                 continue
             wanted = _merged(known, entry)
@@ -436,10 +432,6 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
                 new += known is None
     _refuse_conflicts(conflicts)
     return Plan(tuple(write), new, len(listed) - len(write))
-
-
-def _names_another_key(entry: Listed, pin: str) -> bool:
-    return entry.fingerprint is not None and not same_key(pin, entry.fingerprint)
 
 
 def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:

@@ -79,7 +79,7 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
             return _list(numbers)
         case _ if kind == "key":
             return key(field)
-        case _ if _is_signed_block(field, kind):
+        case _ if kind == "block id" and len(field.raw) == 35:
             return signed_block(field.raw, context.beside)
         case str(text):
             return text
@@ -91,10 +91,6 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
 
 def _moment(value: TimeInstance, kind: str) -> str:
     return span(value) if kind == "duration" else instant(value)
-
-
-def _is_signed_block(field: Field, kind: str) -> bool:
-    return kind == "block id" and len(field.raw) == 35
 
 
 def _list(numbers: tuple[int, ...] | tuple[float, ...]) -> str:

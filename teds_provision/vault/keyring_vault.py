@@ -105,7 +105,8 @@ class KeyringVault(SoftwareVault):
         _set(self._name(), self._backend, self._entry, material.encode())
 
     def _name(self) -> str:
-        return _name_of(type(self._backend))
+        backend = type(self._backend)
+        return f"{backend.__module__}.{backend.__qualname__}"
 
 
 def inspect() -> str:
@@ -120,10 +121,6 @@ def inspect() -> str:
 
 def _entry(store_id: str) -> str:
     return f"station/{store_id}"
-
-
-def _name_of(backend: type) -> str:
-    return f"{backend.__module__}.{backend.__qualname__}"
 
 
 def _viable() -> Iterator[tuple[str, KeyringBackend]]:
