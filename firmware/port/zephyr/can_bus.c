@@ -24,7 +24,8 @@ static const struct device *const bus = DEVICE_DT_GET(DT_CHOSEN(zephyr_canbus));
 static void on_frame(const struct device *device, struct can_frame *frame, void *user)
 {
     arrived one;
-    const uint8_t length = can_dlc_to_bytes(frame->dlc);
+    const bool fd = (frame->flags & CAN_FRAME_FDF) != 0;
+    const uint8_t length = !fd && frame->dlc > 8 ? 8 : can_dlc_to_bytes(frame->dlc); /* classic: 9 to 15 mean 8 too */
     (void)device;
     (void)user;
     if ((frame->flags & (CAN_FRAME_IDE | CAN_FRAME_RTR)) != CAN_FRAME_IDE || length > sizeof one.frame.data) {
@@ -33,7 +34,7 @@ static void on_frame(const struct device *device, struct can_frame *frame, void 
     one.tick = teds_zephyr_now();
     one.frame.identifier = frame->id;
     one.frame.length = length;
-    one.frame.fd = (frame->flags & CAN_FRAME_FDF) != 0;
+    one.frame.fd = fd;
     memcpy(one.frame.data, frame->data, length);
     if (k_msgq_put(&teds_arrivals, &one, K_NO_WAIT) != 0) {
         (void)atomic_inc(&dropped);
