@@ -90,9 +90,11 @@ def nodes(
 
 
 def _with_conflicts(station: Station, described: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Each node with what the stations of the plant do not agree on; the same nodes where none was joined."""
+    """Each node with what the stations of the plant do not agree on; the nodes as they are where none was joined."""
+    if station.plant.joined is None:
+        return iter(described)
     found: dict[str, list[dict[str, str]]] = {}
-    for uuid, name, why in station.plant.tables.conflicts() if station.plant.joined is not None else ():
+    for uuid, name, why in station.plant.tables.conflicts():
         found.setdefault(uuid.hex(), []).append({"name": name, "why": why})
     return ({**node, "conflicts": found.get(node["uuid"], [])} for node in described)
 
@@ -245,7 +247,7 @@ _LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
     ("groups", lambda node: ", ".join(node["groups"])),
     ("link key", _link_keys),
     ("rotation", lambda node: node["rotation_due"] or ""),
-    ("conflict", lambda node: [f"{one['name']}: {one['why']}" for one in node["conflicts"]]),
+    ("conflict", lambda node: [f"{one['name']}: {one['why']}" for one in node.get("conflicts", ())]),
     ("remarks", _remarks),
 )
 
