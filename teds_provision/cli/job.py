@@ -81,7 +81,9 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
         drafted = plant.jobs.take_job(station, octets)
         if output is not None:
             write_file(output, octets.decode())
-    app.emit(_told(station, drafted), f"{'Would make' if dry_run else 'Made'} job {drafted.id}: {_sentence(drafted)}")
+    app.emit(
+        _to_json(station, drafted), f"{'Would make' if dry_run else 'Made'} job {drafted.id}: {_sentence(drafted)}"
+    )
 
 
 def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
@@ -170,7 +172,7 @@ def _block(text: str) -> tuple[int, int]:
     return int(channel), int(code)
 
 
-def _told(station: Station, found: Job) -> dict[str, Any]:
+def _to_json(station: Station, found: Job) -> dict[str, Any]:
     """A job with what became of it here; its own members as they were signed."""
     row = station.plant.line.job(found.id)
     given, passed, _ = station.plant.line.count_units(found.id)
@@ -197,7 +199,7 @@ def list_jobs(app: App) -> None:
     plant.jobs.take_received(station)
     rows = station.plant.line.jobs()
     found = [plant.jobs.kept_job(station, row) for row in rows]
-    told = [_told(station, one) for one in found]
+    told = [_to_json(station, one) for one in found]
 
     def table(console: Console) -> None:
         from rich.table import Table
@@ -220,7 +222,7 @@ def show(app: App, which: str) -> None:
     station = app.station()
     found = plant.jobs.find_job(station, which)
     roster = plant.jobs.roster_of(station)
-    said = _told(station, found)
+    said = _to_json(station, found)
     who = ", ".join(f"{roster.name_of(key)} {number}" for key, number in found.stations.items())
     lines = [
         f"job          {found.id}",
@@ -278,7 +280,7 @@ def close(app: App, which: str, dry_run: bool) -> None:
     found = plant.jobs.find_job(station, which)
     if not dry_run:
         plant.jobs.close_job(station, found)
-    app.emit(_told(station, found), f"{'Would close' if dry_run else 'Closed'} {_sentence(found)}")
+    app.emit(_to_json(station, found), f"{'Would close' if dry_run else 'Closed'} {_sentence(found)}")
 
 
 @command(
@@ -303,7 +305,7 @@ def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None)
     parts = plant.yields.yields(station, found, attempts)
     if csv_file is not None:
         write_file(csv_file, plant.yields.to_csv(station, attempts))
-    told = {**_told(station, found), "stations": [part.to_json() for part in parts]}
+    told = {**_to_json(station, found), "stations": [part.to_json() for part in parts]}
     app.emit(told, lambda console: _table(console, found, parts))
 
 

@@ -202,7 +202,7 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
 
 def _of_line(boards: Boards, uuid: bytes) -> dict[str, Any]:
     """Job, unit, attempt and evidence of a board, nothing outside a line."""
-    return boards.line.told(uuid) if boards.line is not None else {}
+    return boards.line.unit_to_json(uuid) if boards.line is not None else {}
 
 
 def _many(app: App, boards: Boards, questions: Questions, screen: Screen, *, totals: bool) -> None:

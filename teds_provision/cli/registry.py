@@ -93,7 +93,7 @@ def _emit_change(
         if file is not None and not dry_run:
             write_new(file, plant.owner.write_draft(draft), mode=SHARED)
         told = f"Draft: {file}" if file is not None and not dry_run else "Plan only; nothing was changed."
-        app.emit({**_told(draft), "plan": dry_run, "draft": str(file) if file else None}, f"{said}\n{told}")
+        app.emit({**_to_json(draft), "plan": dry_run, "draft": str(file) if file else None}, f"{said}\n{told}")
         return
     app.note(said)
     app.confirm("Sign this roster?", yes=yes)
@@ -105,10 +105,10 @@ def _emit_change(
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
         plant.folding.put_roster(station, signed)
-    app.emit(_told(signed), f"Roster {signed.version} counts here. To tell the others: teds-provision registry sync")
+    app.emit(_to_json(signed), f"Roster {signed.version} counts here. To tell the others: teds-provision registry sync")
 
 
-def _told(one: Roster) -> dict[str, Any]:
+def _to_json(one: Roster) -> dict[str, Any]:
     return {
         "registry": one.registry,
         "name": one.name,
@@ -156,7 +156,7 @@ def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_r
     past = list(plant.past.past(station))
     said = "\n".join([*plant.owner.changes(None, draft), _past(past)])
     if dry_run:
-        app.emit({**_told(draft), "roster": None, "events": len(past), "plan": True}, f"Plan:\n{said}")
+        app.emit({**_to_json(draft), "roster": None, "events": len(past), "plan": True}, f"Plan:\n{said}")
         return
     app.note(said)
     app.confirm("Create this registry?", yes=yes)
@@ -167,7 +167,7 @@ def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_r
             write_new(output, signed.octets + b"\n", mode=SHARED)
         events = plant.owner.join(station, signed, url=None, told=list(plant.past.past(station)))
     text = f"Registry {signed.registry} of {name} was created. Next: registry connect --files DIR"
-    app.emit({**_told(signed), "roster": signed.octets.decode(), "events": events}, text)
+    app.emit({**_to_json(signed), "roster": signed.octets.decode(), "events": events}, text)
 
 
 def _past(past: Sequence[Any]) -> str:
@@ -332,7 +332,7 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     same = before is not None and before.registry == draft.registry
     said = "\n".join(plant.owner.changes(before if same else None, draft))
     if dry_run:
-        app.emit({**_told(draft), "plan": True}, f"Plan:\n{said}")
+        app.emit({**_to_json(draft), "plan": True}, f"Plan:\n{said}")
         return
     app.note(said)
     app.confirm("Sign this roster?", yes=yes)
@@ -342,7 +342,9 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     if same:
         with station.lock("registry sign", app.note):
             plant.folding.take_rosters(station, [signed.octets])
-    app.emit(_told(signed), f"Signed: {output}. Bring it: registry sync --files DIR, or connect --roster {output.name}")
+    app.emit(
+        _to_json(signed), f"Signed: {output}. Bring it: registry sync --files DIR, or connect --roster {output.name}"
+    )
 
 
 # -- belonging ---------------------------------------------------------------------------------------------------------

@@ -157,7 +157,7 @@ def _build(demo: Demo, line: LineRun, uuid: bytes) -> int:
             line.station, node, line.order, accept=lambda who: None, reporter=Silent(), line=line
         )
     require_authentic(done.verified)
-    return int(line.told(uuid)["unit"])
+    return int(line.unit_to_json(uuid)["unit"])
 
 
 def _tamper(folder: Path) -> None:

@@ -61,7 +61,7 @@ class LineRun:
     _turn: threading.Lock = field(default_factory=threading.Lock)
     _digests: dict[bytes, str] = field(default_factory=dict)
     _common: dict[str | None, Prepared] = field(default_factory=dict)
-    _told: dict[bytes, dict[str, Any]] = field(default_factory=dict)
+    _units_as_json: dict[bytes, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.job is None:
@@ -101,9 +101,9 @@ class LineRun:
         """How many units have passed here, over all runs."""
         return self.station.plant.line.count_units(self.job.id)[1] if self.job is not None else 0
 
-    def told(self, uuid: bytes) -> dict[str, Any]:
+    def unit_to_json(self, uuid: bytes) -> dict[str, Any]:
         """What is told of a board beside its steps: job, unit, of how many, attempt, SHA-256 of its evidence."""
-        return self._told.get(uuid, {})
+        return self._units_as_json.get(uuid, {})
 
     def is_listed(self, uuid: bytes) -> bool:
         """Whether the job names this UUID."""
@@ -211,7 +211,7 @@ class LineRun:
             tables = self.station.plant.line
             mine = sum(1 for _ in tables.evidence(uuid=who.uuid, job=job.id))
             with self._turn:
-                self._told[who.uuid] = {"job": job.id, "attempt": mine + 1}
+                self._units_as_json[who.uuid] = {"job": job.id, "attempt": mine + 1}
             return LineUnit(self, prepared, tables.unit(job.id, who.uuid), mine + 1, assurance, begun)
         if WORTH.get(assurance, 0) < WORTH[job.assurance]:
             raise PolicyRefused(
@@ -224,7 +224,7 @@ class LineRun:
             self.station.audit("unit", who.uuid, "taken", job=job.id, unit=row.unit, attempt=row.attempts)
         told = {"job": job.id, "unit": row.unit, "of": job.total, "attempt": row.attempts}
         with self._turn:
-            self._told[who.uuid] = told
+            self._units_as_json[who.uuid] = told
         name = job.name_for(who.uuid, row.unit)
         named = prepared if name is None else replace(prepared, order=replace(prepared.order, name=name))
         return LineUnit(self, named, row, row.attempts, assurance, begun)
@@ -261,7 +261,7 @@ class LineRun:
                 "evidence", uuid, **told, verdict=verdict if passed else f"{verdict}: {facts.failure}"
             )
         with self._turn:
-            self._told.setdefault(uuid, {})["evidence"] = digest
+            self._units_as_json.setdefault(uuid, {})["evidence"] = digest
 
     def passed_board(self, uuid: bytes) -> None:
         """Print its label, and wait for the next scan."""
@@ -272,7 +272,7 @@ class LineRun:
             path = self.label_to.with_name(f"{uuid.hex()}{self.label_to.suffix}")
             write_label(label_of(self.station, uuid), path)
             with self._turn:
-                self._told.setdefault(uuid, {})["label"] = str(path)
+                self._units_as_json.setdefault(uuid, {})["label"] = str(path)
 
     def note(self, uuid: bytes, unit: LineUnit, *, passed: bool) -> None:
         """Note the attempt at which the unit passed first; in the caller's transaction."""
@@ -375,7 +375,7 @@ class LineUnit:
         teds = done.image.security
         assert teds is not None, "what was verified has a Security TEDS"
         if self._wanted:
-            steps = _told(done.steps)
+            steps = _step_facts(done.steps)
             if failure is not None:
                 steps = (*steps, ("verdict", failure.code, 0))
             self._keep(node, done.who.uuid, teds, steps)
@@ -390,7 +390,7 @@ class LineUnit:
     ) -> None:
         """Leave evidence of the failure, with the board's signature where it still answers."""
         if self._wanted:
-            self._keep(node, who.uuid, who.security_teds, (*_told(steps), (step, error.code, 0)))
+            self._keep(node, who.uuid, who.security_teds, (*_step_facts(steps), (step, error.code, 0)))
 
     @property
     def _wanted(self) -> bool:
@@ -422,5 +422,5 @@ class LineUnit:
         self.run.keep(document, claim, finished, self)
 
 
-def _told(steps: Sequence[StepResult]) -> tuple[tuple[str, str, int], ...]:
+def _step_facts(steps: Sequence[StepResult]) -> tuple[tuple[str, str, int], ...]:
     return tuple((step.name, step.result, round(step.seconds * 1000)) for step in steps)

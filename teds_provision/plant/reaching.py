@@ -28,7 +28,7 @@ def database(station: Station, url: str) -> postgres.PostgresPost:
 
     Raises UsageFailure (the URL, the driver), NotMember (no request was ever made).
     """
-    return postgres.PostgresPost(postgres.Registry(_told(station, url)), postgres.where_of(url), station.fingerprint)
+    return postgres.PostgresPost(postgres.Registry(_login(station, url)), postgres.where_of(url), station.fingerprint)
 
 
 def listener(station: Station) -> postgres.Registry | None:
@@ -36,7 +36,7 @@ def listener(station: Station) -> postgres.Registry | None:
     record = station.plant.joined
     if record is None or record.url is None or record.url.startswith(FILES):
         return None
-    return postgres.Registry(_told(station, record.url))
+    return postgres.Registry(_login(station, record.url))
 
 
 def absolute(url: str) -> str:
@@ -56,7 +56,7 @@ def require_registry(post: Post, registry: str) -> None:
         raise PolicyRefused(f"{post.where} is of another registry ({there}) than the roster ({registry}).")
 
 
-def _told(station: Station, url: str) -> dict[str, object]:
+def _login(station: Station, url: str) -> dict[str, object]:
     kept = station.plant.login()
     if kept is None:
         raise NotMember(

@@ -154,7 +154,7 @@ class Line(Protocol):
     def only_verify(self) -> bool:
         """Whether boards are tested alone, and nothing is written."""
 
-    def told(self, uuid: bytes) -> dict[str, Any]:
+    def unit_to_json(self, uuid: bytes) -> dict[str, Any]:
         """What is told of a board beside its steps."""
 
     def lists(self, who: Identified) -> bool:

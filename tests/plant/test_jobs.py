@@ -275,7 +275,7 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
         with talk(one) as node:
             done = inspect(tester, node, tests, Silent())
         assert done.verified.verdict == "authentic"
-        assert tests.told(one.uuid)["attempt"] == attempt
+        assert tests.unit_to_json(one.uuid)["attempt"] == attempt
     assert one.state == before
     assert units(tests) == []
     rows = list(tester.plant.line.evidence(uuid=one.uuid))
@@ -311,7 +311,7 @@ def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> No
     build(line, one)
     label = tmp_path / "labels" / f"{one.uuid.hex()}.svg"
     assert one.uuid.hex() in label.read_text()
-    assert line.told(one.uuid)["label"] == str(label)
+    assert line.unit_to_json(one.uuid)["label"] == str(label)
     with pytest.raises(PolicyRefused, match="Scan the label"):
         build(line, one)
     line.scans.take(one.uuid.hex())
