@@ -66,7 +66,7 @@ def main() -> None:
     config = FOLDER / "bus.conf"
     config.write_text(CONFIG.format(path=BUS))
     bench = Bench()
-    nodes = [FOLDER / "left", FOLDER / "right"]
+    nodes = [FOLDER / "left", FOLDER / "right", FOLDER / "in-c"]
     station = Station.open(bench.home, ask=lambda _prompt, _confirm: PASSPHRASE)
     for node in nodes:
         tapped_once(station, node)
@@ -78,14 +78,16 @@ def main() -> None:
         process(sys.executable, "-m", "tests.links.ble.air") as running,
     ):
         air = Air(running)
-        addresses = air.say({"nodes": [str(node) for node in nodes], "vhci": True})["nodes"]
+        wanted = {"nodes": [str(node) for node in nodes], "in_c": [str(nodes[2])], "vhci": True}
+        addresses = air.say(wanted)["nodes"]
         with process("/usr/libexec/bluetooth/bluetoothd", "-n"):
             look("power", power_on)
             look("first", lambda: provision(bench, "--ble", f"hci0?address={addresses[0]}"))
             look("again", lambda: provision(bench, "--name", "left", uuids[0], "--ble", "auto"))
             air.say(["cut", 1, 20])
             look("reconnect", lambda: provision(bench, "--name", "right", "--ble", f"hci0?address={addresses[1]}"))
-            look("both", lambda: identify(bench, uuids))
+            look("in-c", lambda: provision(bench, "--name", "in C", "--ble", f"hci0?address={addresses[2]}"))
+            look("all", lambda: identify(bench, uuids))
             look("uuids", lambda: {"uuids": uuids})
 
 

@@ -96,7 +96,8 @@ class Everything:
         self.pulse.start()
         self.stranger_seconds = config.get("stranger_seconds", 10.0)
         for number, folder in enumerate(config.get("nodes", [])):
-            await (self.add_in_c if config.get("in_c") else self.add)(number, Path(folder))
+            in_c = config.get("in_c", False)
+            await (self.add_in_c if in_c is True or (in_c and folder in in_c) else self.add)(number, Path(folder))
         for port in config.get("hci", []):
             transport = await open_transport(f"tcp-server:127.0.0.1:{port}")
             self.keep.append((transport, self.controller(f"H{port}", transport)))
