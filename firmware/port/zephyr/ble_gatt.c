@@ -16,103 +16,107 @@ static const struct bt_uuid_128 service_uuid = BT_UUID_INIT_128(OF_PROFILE(0xd85
 static const struct bt_uuid_128 write_uuid = BT_UUID_INIT_128(OF_PROFILE(0xd8570002));
 static const struct bt_uuid_128 notify_uuid = BT_UUID_INIT_128(OF_PROFILE(0xd8570003));
 
-enum { CONNECTED, MTU, DISCONNECTED, WRITTEN };
+/* What the host's thread says of a connection, in flags: a queue that is full would hold up that thread while the node's
+ * waits for a buffer of it. Only what was written is queued; where there is no room its writer is told. */
+typedef struct line {
+    struct bt_conn *connection; /* set by the host's thread while it is NULL, given back by the node's thread */
+    atomic_t begun, ended, mtu, subscribed;
+    bool known; /* the node knows of it */
+} line;
 
 typedef struct said {
-    uint8_t event, connection;
-    uint16_t length; /* of what was written, or the MTU */
+    uint8_t place;
+    uint16_t length;
     uint8_t octets[512];
 } said;
 
 K_MSGQ_DEFINE(teds_ble_said, sizeof(said), 3, 4);
-static struct bt_conn *connections[TEDS_BLE_CONNECTIONS];
-static atomic_t subscribed = ATOMIC_INIT(0);
+static line lines[TEDS_BLE_CONNECTIONS];
+static atomic_t stopped = ATOMIC_INIT(0);
 static bool advertises;
 
-static int place_of(const struct bt_conn *connection)
+static line *line_of(const struct bt_conn *connection)
 {
-    for (int i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
-        if (connections[i] == connection) {
-            return i;
+    for (size_t i = 0; i < ARRAY_SIZE(lines); i++) {
+        if (lines[i].connection == connection && (connection == NULL || atomic_get(&lines[i].ended) == 0)) {
+            return &lines[i];
         }
     }
-    return -1;
-}
-
-static int tell(uint8_t event, int place, uint16_t length, const void *octets)
-{
-    static said one; /* the Bluetooth host calls back from one thread */
-    int failed;
-    one.event = event;
-    one.connection = (uint8_t)place;
-    one.length = length;
-    if (octets != NULL) {
-        memcpy(one.octets, octets, length);
-    }
-    failed = k_msgq_put(&teds_ble_said, &one, octets != NULL ? K_NO_WAIT : K_FOREVER);
-    teds_zephyr_wake();
-    return failed;
+    return NULL;
 }
 
 static ssize_t on_write(struct bt_conn *connection, const struct bt_gatt_attr *attribute, const void *octets,
                         uint16_t length, uint16_t offset, uint8_t flags)
 {
-    const int place = place_of(connection);
+    static said one; /* the host calls back from one thread */
+    const line *own = line_of(connection);
     (void)attribute;
     if ((flags & BT_GATT_WRITE_FLAG_PREPARE) != 0) {
         return 0;
     }
-    if (offset != 0 || length > sizeof(((said *)NULL)->octets)) {
+    if (offset != 0 || length > sizeof one.octets) {
         return BT_GATT_ERR(BT_ATT_ERR_INVALID_ATTRIBUTE_LEN);
     }
-    if (place < 0 || tell(WRITTEN, place, length, octets) != 0) {
+    one.place = own != NULL ? (uint8_t)(own - lines) : 0;
+    one.length = length;
+    memcpy(one.octets, octets, length);
+    if (own == NULL || k_msgq_put(&teds_ble_said, &one, K_NO_WAIT) != 0) {
         return BT_GATT_ERR(BT_ATT_ERR_INSUFFICIENT_RESOURCES);
     }
+    teds_zephyr_wake();
     return (ssize_t)length;
 }
 
-static void on_subscribe(const struct bt_gatt_attr *attribute, uint16_t value)
+static ssize_t on_subscribe(struct bt_conn *connection, const struct bt_gatt_attr *attribute, uint16_t value)
 {
+    line *own = line_of(connection);
     (void)attribute;
-    atomic_set(&subscribed, value == BT_GATT_CCC_NOTIFY);
+    if (own != NULL) {
+        atomic_set(&own->subscribed, value == BT_GATT_CCC_NOTIFY);
+    }
     teds_zephyr_wake();
+    return sizeof value;
 }
+
+static struct bt_gatt_ccc_managed_user_data subscriptions = BT_GATT_CCC_MANAGED_USER_DATA_INIT(NULL, on_subscribe, NULL);
 
 BT_GATT_SERVICE_DEFINE(teds_service, BT_GATT_PRIMARY_SERVICE(&service_uuid),
                        BT_GATT_CHARACTERISTIC(&write_uuid.uuid, BT_GATT_CHRC_WRITE, BT_GATT_PERM_WRITE, NULL, on_write,
                                               NULL),
                        BT_GATT_CHARACTERISTIC(&notify_uuid.uuid, BT_GATT_CHRC_NOTIFY, BT_GATT_PERM_NONE, NULL, NULL,
                                               NULL),
-                       BT_GATT_CCC(on_subscribe, BT_GATT_PERM_READ | BT_GATT_PERM_WRITE));
+                       BT_GATT_CCC_MANAGED(&subscriptions, BT_GATT_PERM_READ | BT_GATT_PERM_WRITE));
 
 static void on_connected(struct bt_conn *connection, uint8_t error)
 {
-    const int place = place_of(NULL);
-    advertises = false; /* the host stops it with a connection */
-    if (error != 0 || place < 0) {
-        return;
+    line *own = line_of(NULL);
+    atomic_set(&stopped, 1); /* the host stops advertising with a connection */
+    if (error == 0 && own != NULL) {
+        atomic_set(&own->mtu, bt_gatt_get_mtu(connection));
+        atomic_set(&own->subscribed, 0);
+        own->connection = bt_conn_ref(connection);
+        atomic_set(&own->begun, 1);
     }
-    connections[place] = bt_conn_ref(connection);
-    (void)tell(CONNECTED, place, bt_gatt_get_mtu(connection), NULL);
+    teds_zephyr_wake();
 }
 
 static void on_disconnected(struct bt_conn *connection, uint8_t reason)
 {
-    const int place = place_of(connection);
+    line *own = line_of(connection);
     (void)reason;
-    if (place >= 0) {
-        (void)tell(DISCONNECTED, place, 0, NULL);
-        connections[place] = NULL;
-        bt_conn_unref(connection);
+    if (own != NULL) {
+        atomic_set(&own->ended, 1);
     }
+    teds_zephyr_wake();
 }
 
 static void on_mtu(struct bt_conn *connection, uint16_t tx, uint16_t rx)
 {
-    const int place = place_of(connection);
-    if (place >= 0) {
-        (void)tell(MTU, place, tx < rx ? tx : rx, NULL);
+    line *own = line_of(connection);
+    if (own != NULL) {
+        atomic_set(&own->mtu, tx < rx ? tx : rx);
     }
+    teds_zephyr_wake();
 }
 
 BT_CONN_CB_DEFINE(teds_connections) = {.connected = on_connected, .disconnected = on_disconnected};
@@ -144,6 +148,9 @@ static void advertise(const teds_node *node)
     static const struct bt_data data[] = {BT_DATA(BT_DATA_FLAGS, flags, sizeof flags),
                                           BT_DATA(BT_DATA_UUID128_ALL, uuid, sizeof uuid)};
     const bool wanted = teds_ble_advertises(node);
+    if (atomic_cas(&stopped, 1, 0)) {
+        advertises = false;
+    }
     if (wanted && !advertises) {
         advertises = bt_le_adv_start(BT_LE_ADV_CONN_FAST_2, data, ARRAY_SIZE(data), NULL, 0) == 0;
     } else if (!wanted && advertises) {
@@ -152,38 +159,66 @@ static void advertise(const teds_node *node)
     }
 }
 
+/* Give back a connection that has ended: nobody but this thread uses it, so nobody holds it any more. */
+static void end(teds_node *node, uint8_t place)
+{
+    line *own = &lines[place];
+    if (own->known) {
+        teds_ble_disconnected(node, place);
+        own->known = false;
+    }
+    bt_conn_unref(own->connection);
+    atomic_set(&own->begun, 0);
+    own->connection = NULL;
+    atomic_set(&own->ended, 0); /* last: from now on the place is free */
+}
+
+static bool serve(teds_node *node, uint8_t place)
+{
+    static uint8_t out[512];
+    line *own = &lines[place];
+    bool moved = false;
+    size_t length;
+    if (own->connection == NULL) {
+        return false;
+    }
+    if (atomic_get(&own->ended) != 0) {
+        end(node, place);
+        return true;
+    }
+    if (atomic_get(&own->begun) == 0) {
+        return false;
+    }
+    if (!own->known) {
+        teds_ble_connected(node, place, (uint16_t)atomic_get(&own->mtu));
+        own->known = true;
+    }
+    teds_ble_mtu(node, place, (uint16_t)atomic_get(&own->mtu));
+    if (teds_ble_drops(node, place)) {
+        (void)bt_conn_disconnect(own->connection, BT_HCI_ERR_REMOTE_USER_TERM_CONN);
+        return false;
+    }
+    /* bt_gatt_notify waits for a buffer on this thread: no notification is lost, and no other is reordered. */
+    while (atomic_get(&own->subscribed) != 0 && (length = teds_ble_notify(node, place, out)) > 0) {
+        (void)bt_gatt_notify(own->connection, &teds_service.attrs[4], out, (uint16_t)length);
+        moved = true;
+    }
+    return moved;
+}
+
 bool teds_zephyr_ble_work(teds_node *node)
 {
     static said one;
-    static uint8_t out[512];
     bool moved = false;
-    while (k_msgq_get(&teds_ble_said, &one, K_NO_WAIT) == 0) {
-        moved = true;
-        if (one.event == CONNECTED) {
-            teds_ble_connected(node, one.connection, one.length);
-        } else if (one.event == MTU) {
-            teds_ble_mtu(node, one.connection, one.length);
-        } else if (one.event == DISCONNECTED) {
-            teds_ble_disconnected(node, one.connection);
-        } else {
-            teds_ble_written(node, one.connection, one.octets, one.length);
-        }
+    for (uint8_t i = 0; i < ARRAY_SIZE(lines); i++) {
+        moved = serve(node, i) || moved;
     }
-    for (uint8_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
-        struct bt_conn *connection = connections[i];
-        size_t length;
-        if (connection == NULL) {
-            continue;
+    while (k_msgq_get(&teds_ble_said, &one, K_NO_WAIT) == 0) {
+        if (lines[one.place].known) {
+            teds_ble_written(node, one.place, one.octets, one.length);
         }
-        if (teds_ble_drops(node, i)) {
-            (void)bt_conn_disconnect(connection, BT_HCI_ERR_REMOTE_USER_TERM_CONN);
-            continue;
-        }
-        /* bt_gatt_notify waits for a buffer on this thread: no notification is lost, and no other is reordered. */
-        while (atomic_get(&subscribed) != 0 && (length = teds_ble_notify(node, i, out)) > 0) {
-            (void)bt_gatt_notify(connection, &teds_service.attrs[4], out, (uint16_t)length);
-            moved = true;
-        }
+        (void)serve(node, one.place);
+        moved = true;
     }
     advertise(node);
     return moved;

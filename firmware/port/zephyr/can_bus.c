@@ -18,7 +18,7 @@ typedef struct arrived {
 
 K_MSGQ_DEFINE(teds_arrivals, sizeof(arrived), WAITING, 8);
 static K_SEM_DEFINE(controller, 1, 1);
-static atomic_t lost_bus = ATOMIC_INIT(0), back = ATOMIC_INIT(1), dropped = ATOMIC_INIT(0);
+static atomic_t off = ATOMIC_INIT(0), lost_bus = ATOMIC_INIT(0), back = ATOMIC_INIT(1), dropped = ATOMIC_INIT(0);
 static const struct device *const bus = DEVICE_DT_GET(DT_CHOSEN(zephyr_canbus));
 
 static void on_frame(const struct device *device, struct can_frame *frame, void *user)
@@ -57,8 +57,9 @@ static void on_state(const struct device *device, enum can_state state, struct c
     (void)count;
     (void)user;
     if (state == CAN_STATE_BUS_OFF) {
+        atomic_set(&off, 1);
         atomic_set(&lost_bus, 1);
-    } else if (state == CAN_STATE_ERROR_ACTIVE) {
+    } else if (state == CAN_STATE_ERROR_ACTIVE && atomic_cas(&off, 1, 0)) { /* from a warning, too, it comes back here */
         atomic_set(&back, 1);
     }
     teds_zephyr_wake();

@@ -18,25 +18,30 @@ static uint8_t response[TEDS_T4T_OCTETS]; /* the library reads it until the read
 
 static void on_nfc(void *context, nfc_t4t_event_t event, const uint8_t *data, size_t length, uint32_t flags)
 {
-    static said whole; /* an APDU may come in parts: flags says that more follows */
+    static said whole;    /* an APDU may come in parts: flags says that more follows */
+    static bool too_long; /* longer than any that this tag's files allow: all of its parts are passed over */
+    const bool more = (flags & NFC_T4T_DI_FLAG_MORE) != 0;
     (void)context;
     if (event == NFC_T4T_EVENT_FIELD_ON || event == NFC_T4T_EVENT_FIELD_OFF) {
         whole.event = event == NFC_T4T_EVENT_FIELD_ON;
         whole.length = 0;
+        too_long = false;
         (void)k_msgq_put(&teds_said, &whole, K_NO_WAIT);
     } else if (event == NFC_T4T_EVENT_DATA_IND) {
-        if (length > sizeof whole.octets - whole.length) {
-            whole.length = 0;
-            return; /* longer than any that this tag's files allow */
+        too_long = too_long || length > sizeof whole.octets - whole.length;
+        if (!too_long) {
+            memcpy(whole.octets + whole.length, data, length);
+            whole.length = (uint16_t)(whole.length + length);
         }
-        memcpy(whole.octets + whole.length, data, length);
-        whole.length = (uint16_t)(whole.length + length);
-        if ((flags & NFC_T4T_DI_FLAG_MORE) != 0) {
+        if (more) {
             return;
         }
-        whole.event = 2;
-        (void)k_msgq_put(&teds_said, &whole, K_NO_WAIT);
+        if (!too_long) {
+            whole.event = 2;
+            (void)k_msgq_put(&teds_said, &whole, K_NO_WAIT);
+        }
         whole.length = 0;
+        too_long = false;
     }
     teds_zephyr_wake();
 }

@@ -12,8 +12,14 @@ typedef ssize_t (*bt_gatt_attr_write_func_t)(struct bt_conn *conn, const struct 
 struct bt_gatt_attr {
     const struct bt_uuid *uuid;
     bt_gatt_attr_write_func_t write;
-    void (*changed)(const struct bt_gatt_attr *attr, uint16_t value);
+    void *user_data;
 };
+struct bt_gatt_ccc_managed_user_data {
+    void (*cfg_changed)(const struct bt_gatt_attr *attr, uint16_t value);
+    ssize_t (*cfg_write)(struct bt_conn *conn, const struct bt_gatt_attr *attr, uint16_t value);
+    bool (*cfg_match)(struct bt_conn *conn, const struct bt_gatt_attr *attr);
+};
+#define BT_GATT_CCC_MANAGED_USER_DATA_INIT(_changed, _write, _match) {_changed, _write, _match}
 struct bt_gatt_service_static {
     const struct bt_gatt_attr *attrs;
     size_t attr_count;
@@ -24,7 +30,7 @@ struct bt_gatt_cb {
 /* Attribute by attribute as Zephyr lays them out: the service; declaration and value of each characteristic; CCC. */
 #define BT_GATT_PRIMARY_SERVICE(_service) {&(_service)->uuid, NULL, NULL}
 #define BT_GATT_CHARACTERISTIC(_uuid, _props, _perm, _read, _write, _user) {_uuid, NULL, NULL}, {_uuid, _write, NULL}
-#define BT_GATT_CCC(_changed, _perm) {NULL, NULL, _changed}
+#define BT_GATT_CCC_MANAGED(_ccc, _perm) {NULL, NULL, _ccc}
 #define BT_GATT_SERVICE_DEFINE(_name, ...)                        \
     static const struct bt_gatt_attr attr_##_name[] = {__VA_ARGS__}; \
     static const struct bt_gatt_service_static _name = {attr_##_name, ARRAY_SIZE(attr_##_name)}
