@@ -480,6 +480,22 @@ class Plant(TypedDict):
     alarms: list[PlantAlarm]
 
 
+class PlantClaims(TypedDict):
+    """What the stations of the plant say of one node; ``holders`` by key id."""
+
+    uuid: Uuid
+    name: str | None
+    says: dict[str, Any]
+    conflicts: list[dict[str, Any]]
+
+
+class PlantNodes(TypedDict):
+    """Nodes whose UUID begins so, or whose name holds the text; ``more``: there are others."""
+
+    nodes: list[PlantClaims]
+    more: bool
+
+
 class Job(TypedDict):
     """What a keeper lets a line build; ``units`` and ``passed`` are those of this station."""
 

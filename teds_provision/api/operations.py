@@ -51,6 +51,8 @@ OPERATIONS: Final = (
     Operation("PUT", "/detection", "Set the detection mode, and look at every link again.", answers.DetectionMode,
               bodies.Detection),
     Operation("GET", "/plant", "Get the plant that this station belongs to; 404 where it joined none.", answers.Plant),
+    Operation("GET", "/plant/nodes", "Find who holds a node, by what the plant's stations say.", answers.PlantNodes,
+              query={"text": _TEXT}),
     Operation("GET", "/jobs", "List the jobs of the line.", answers.Jobs),
     Operation("GET", "/jobs/{id}", "Get how a job goes, by its id or its first digits.", answers.JobStatus),
     Operation("POST", "/discover", "Ask every link now.", answers.Found, bodies.Nothing),

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import islice
 from typing import Any, Final
 
 from teds_provision import plant
@@ -30,6 +31,8 @@ from teds_provision.station.station import Station
 
 EVERY: Final = 60.0
 """Seconds between two syncs where nobody wakes us."""
+MOST_SHOWN: Final = 20
+"""Nodes in one answer to who holds a node."""
 _SOON: Final = 1.0
 """Seconds to wait after a failure of the connection that listens, and at most for the end of this."""
 _BUSY: Final = 2.0
@@ -103,6 +106,12 @@ class PlantWatch:
                 for one in found.alarms
             ],
         }  # fmt: skip
+
+    def nodes(self, text: str) -> dict[str, Any]:
+        """api.md, `/plant/nodes`; raises PolicyRefused where no registry was joined."""
+        found = plant.status.nodes(self._station, plant.folding.require_roster(self._station), text)
+        first = list(islice(found, MOST_SHOWN + 1))
+        return {"nodes": first[:MOST_SHOWN], "more": len(first) > MOST_SHOWN}
 
     def jobs(self) -> list[dict[str, Any]]:
         """api.md, `/jobs`."""

@@ -37,6 +37,8 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         plant.owner.join(south, signed, url=None, told=[])
         south.pins.put(WhitelistEntry(NODE, "cd" * 32, assurance="tap"))
         north.pins.put(WhitelistEntry(NODE, "ab" * 32, assurance="tap"))
+        with north.transaction():
+            north.plant.tell("agreed", NODE, fingerprint="ab" * 32, epoch=2, key_id="0123456789abcdef")
         for station in (south, north):
             plant.sync.sync(station, FilesPost(stick))
         plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", told=[])
@@ -53,3 +55,9 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         for words in ("bench", "here", "south", "heard", "keeper base, page 1", "two keys", "rolled-back",
                       "page 3 was there", "1 node", "Unsent"):  # fmt: skip
             assert words in shown, (words, shown)
+        panel.get_by_role("searchbox", name="Who holds a node").fill("8d4d9d")
+        found = panel.get_by_role("list", name="Who holds a node")
+        found.get_by_text("held by bench (epoch 2)").wait_for()
+        assert "two keys" in found.inner_text()
+        panel.get_by_role("searchbox", name="Who holds a node").fill("nothing like it")
+        found.get_by_text("No station says anything of such a node.").wait_for()

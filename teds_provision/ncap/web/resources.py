@@ -52,6 +52,7 @@ class Resources:
             Route("/status", self.status),
             Route("/detection", self.detection, methods=["GET", "PUT"]),
             Route("/plant", self.plant),
+            Route("/plant/nodes", self.plant_nodes),
             Route("/jobs", self.jobs),
             Route("/jobs/{id}", self.job),
             Route("/discover", self.discover, methods=["POST"]),
@@ -103,6 +104,13 @@ class Resources:
         if found is None:
             raise NotFound("This station has joined no registry.", hint="Join one: teds-provision registry connect")
         return _shown(request, found)
+
+    async def plant_nodes(self, request: Request) -> Response:
+        """GET /plant/nodes."""
+        text = request.query_params.get("text", "")
+        if len(text) > LONGEST_TEXT:
+            raise UsageFailure(f"text may have at most {LONGEST_TEXT} characters.")
+        return _shown(request, await reading(self._daemon.plant.nodes, text))
 
     async def jobs(self, request: Request) -> Response:
         """GET /jobs."""

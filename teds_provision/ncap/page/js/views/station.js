@@ -16,7 +16,9 @@ export function stationView(main) {
   const noSink = h("div", {});
   const plantFacts = h("dl", { class: "facts-list" });
   const plant = h("ul", { class: "lines" });
-  const plantPanel = h("section", { class: "panel", "aria-label": "Plant", hidden: true }, h("h3", {}, "Plant"), plantFacts, plant);
+  const holders = h("ul", { class: "lines", "aria-label": "Who holds a node" });
+  const whose = h("input", { type: "search", placeholder: "UUID or name", "aria-label": "Who holds a node", oninput: () => (clearTimeout(whose.soon), (whose.soon = setTimeout(askHolders, 300))) });
+  const plantPanel = h("section", { class: "panel", "aria-label": "Plant", hidden: true }, h("h3", {}, "Plant"), plantFacts, plant, h("div", { class: "panel-head" }, h("h4", {}, "Who holds a node"), whose), holders);
   const line = linePanel();
   const facts = h("dl", { class: "facts-list" });
   const names = h("tbody", {});
@@ -107,6 +109,20 @@ export function stationView(main) {
     }
     paintPlant();
   }
+  async function askHolders() {
+    const words = whose.value.trim();
+    let found = { nodes: [], more: false };
+    try {
+      if (words) found = await get(`plant/nodes?text=${encodeURIComponent(words)}`);
+    } catch (error) {
+      fill(holders, h("li", { class: "hint" }, error.message));
+      return;
+    }
+    if (words !== whose.value.trim()) return; // a later question is under way
+    const lines = found.nodes.map((one) => h("li", {}, h("span", { class: "grow" }, h("strong", {}, one.name || short8(one.uuid)), h("span", { class: "hint" }, ` ${one.uuid}: ${heldBy(one.says)}`)), one.says.revoked.length ? chip("bad", "warn", "revoked") : one.conflicts.length ? chip("warn", "warn", one.conflicts[0].name) : null));
+    fill(holders, words && !lines.length ? h("li", { class: "hint" }, "No station says anything of such a node.") : lines, found.more ? h("li", { class: "hint" }, "There are more: type more of its UUID or name.") : null);
+  }
+
   const asking = setInterval(askPlant, PLANT_EVERY);
   askPlant();
 
@@ -124,6 +140,15 @@ export function stationView(main) {
 
 const PLANT_EVERY = 10000; // ms
 const TONES = { here: "good", heard: "good", retired: "plain", lost: "plain", stolen: "plain" };
+
+const short8 = (uuid) => `node ${uuid.slice(0, 8)}`;
+
+/** "held by north, south (epoch 3), datasheet 7 by north". */
+function heldBy(says) {
+  const who = Object.values(says.holders).flat();
+  const held = who.length ? `held by ${who.join(", ")} (epoch ${says.epoch})` : "held by nobody";
+  return says.written_by ? `${held}, datasheet ${says.sequence} by ${says.written_by}` : held;
+}
 
 function ago(seconds) {
   for (const [unit, length] of [["days", 86400], ["h", 3600], ["min", 60]]) if (seconds >= 2 * length) return `${Math.floor(seconds / length)} ${unit}`;
