@@ -28,6 +28,7 @@ from teds_provision.measure.sightings import Sighting
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import is_listed
 from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 
 LOOK: Final = 0.1  # seconds between looks at who has gone
@@ -121,11 +122,19 @@ class Newcomers:
         with self._guard:
             known = uuid in self._members or uuid in self._arrived
             waits = self._waits.get(uuid)
-        if known or (waits is not None and waits.room is not None):
+        if known or (waits is not None and (waits.room is not None or self._says_factory(uuid))):
             return
         if self._why_not(uuid) or self._elsewhere(uuid):
             return
         self._arrive(uuid)
+
+    def _says_factory(self, uuid: str) -> bool:
+        """Whether it says that it has no key: one that was refused here a moment ago is left to whoever adopts it.
+
+        That is a hint, as anyone may send it: it costs the half minute until a refused node is tried again anyway.
+        """
+        sighting = self._buses.sightings.seen_at(bytes.fromhex(uuid))
+        return sighting is not None and sighting.identity.state == NodeState.FACTORY
 
     def _why_not(self, uuid: str) -> str:
         octets = bytes.fromhex(uuid)

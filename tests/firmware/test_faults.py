@@ -107,7 +107,7 @@ def of_the_gate() -> Iterator[Any]:
         rules.add(rule)
 
 
-@pytest.mark.parametrize("name", of_the_gate())
+@pytest.mark.parametrize("name", list(of_the_gate()))
 def test_a_faulty_node_in_c_is_found_by_its_rule(
     tmp_path: Path, station: Station, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

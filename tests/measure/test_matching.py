@@ -62,7 +62,8 @@ def test_those_that_come_together_share_and_those_that_run_keep_what_they_have()
 
 
 def test_a_node_costs_the_topics_its_values_and_two_messages_for_each_row() -> None:
-    assert Load(0.1, channels=3, rate=50.0).messages(10.0) == 3 * 10 + 2 * 50
-    assert Load(0.1, channels=1, rate=5.0).messages(10.0) == 5 + 10
+    assert Load(0.1, channels=3, rate=50.0).messages(10.0, rows=True) == 3 * 10 + 2 * 50
+    assert Load(0.1, channels=1, rate=5.0).messages(10.0, rows=True) == 5 + 10
+    assert Load(0.1, channels=3, rate=50.0).messages(10.0, rows=False) == 3 * 10, "MQTT carries no rows"
     assert issubclass(NoRoom, Exception)
     assert NoRoom("x").exit_code == 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -188,7 +189,8 @@ def test_one_that_is_reset_while_it_is_measured_is_taken_up_again(desk: Desk) ->
         until(lambda: known(service, node) and asked.node(node.uuid)["measurement"] == "unverified")
         node.press()
         asked.discover()
-        until(lambda: asked.node(node.uuid)["epoch"] == 2)
+        seen = functools.partial(events, service, "node", node.uuid)
+        until(lambda: asked.node(node.uuid)["epoch"] == 2, lambda: (seen(), service.process and service.process.err))
         until(lambda: asked.node(node.uuid)["measurement"] == "unverified")
         until(lambda: flowing(asked.node(node.uuid)))
     service.end()
