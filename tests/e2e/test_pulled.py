@@ -136,6 +136,8 @@ def test_pulled_above_a_pn532_on_a_serial_line(
     assert watch.end().code == 0
 
 
+# Four processes play the chip, which gives a tag its time-outs of a tenth of a second: one late is a tag lifted.
+@pytest.mark.realtime
 def test_a_pn532_needs_few_host_commands_and_one_lost_answer_is_not_told(
     station: Station, field: Field, boards: list[tuple[str, str]], serial: tuple[str, subprocess.Popen[str]]
 ) -> None:
