@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import signal
 import sys
-import threading
 
 import click
 
 from teds_provision import demo as demo_room
+from teds_provision import talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.rendering import reporter_for
@@ -81,9 +81,9 @@ def _plant(app: App) -> None:
 
 
 def _page(app: App, http: str | None) -> None:
-    over = threading.Event()
+    over = talk.meeting.Patience(None)
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: over.set())
+        signal.signal(number, lambda *_: over.ask())
     with demo_room.page.page_demo(app.note, http) as shown:
         told = f"""Open {shown.url}
   (valid once, for five minutes; for another: teds-provision --home {shown.home} ncap open)

@@ -6,7 +6,6 @@ import json
 import shutil
 import signal
 import sys
-import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from textwrap import wrap
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import store
+from teds_provision import store, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import local_time, moment, shown
@@ -123,8 +122,8 @@ def _tell_lines(app: App, entries: _Counted, verdict: AuditVerdict, after: int, 
 
 def _follow(app: App, station: Station, choice: Choice, verdict: AuditVerdict, after: int) -> None:
     """Give entries as they come, until SIGTERM (exit 0) or Ctrl-C (exit 130)."""
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    stop = talk.meeting.Patience(None)
+    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     _require_intact(verdict)
     while True:
         for entry in station.audit_log.chosen(choice, after):

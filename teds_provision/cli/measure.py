@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -14,7 +13,7 @@ from click.core import ParameterSource
 
 from teds_provision import links as links_room
 from teds_provision import measure as measure_room
-from teds_provision import teds
+from teds_provision import talk, teds
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import Channel, FileToRead, Number, WholeNumber, command, link_options
@@ -197,7 +196,7 @@ def _carried_on(app: App, station: Station, asked: Measurement) -> Measurement:
 
 
 def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], duration: float | None) -> Ended:
-    station, stop = job.station, threading.Event()
+    station, stop = job.station, talk.meeting.Patience(None)
     group = job.kept.group or ""
     nodes = [uuid.hex() for uuid in uuids]
     kinds = (can.port.CanPort, ble.port.BlePort)

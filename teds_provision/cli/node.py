@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision import node as node_room
-from teds_provision import protocol, teds
+from teds_provision import protocol, talk, teds
 from teds_provision import teds as teds_room
 from teds_provision.cli.check import check
 from teds_provision.cli.context import App, pass_app
@@ -227,9 +227,9 @@ def run(
         node_room.virtual.VirtualNode(folder, delays=delays, exclusive=True, board=make, pulse=pulse)
         for folder in folders
     ]
-    stop = threading.Event()
+    stop = talk.meeting.Patience(None)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda *_: stop.ask())
     signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes,)).start())
     running: list[Any] = []
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import signal
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from teds_provision.protocol.operation.commands import Operation, Power
     from teds_provision.station.station import Station
     from teds_provision.talk.conversation import Conversation
+    from teds_provision.talk.meeting import Patience
     from teds_provision.teds.sheet import Channel as SheetChannel
 
 
@@ -211,7 +211,7 @@ def set_value(
     station = app.station()
     uuid = station.nodes.resolve(node)
     measure.trusting.require_whitelisted(station, uuid)
-    stop = threading.Event()
+    stop = talk.meeting.Patience(None)
     links = where_met(station, over_the_bus(links), [uuid])
     with (
         measure.sources.beside(station, links, f"set {uuid.hex()}") as own,
@@ -253,13 +253,13 @@ def _require_unit(app: App, channel: SheetChannel, value: float, unit: str | Non
 
 
 @contextmanager
-def ending(stop: threading.Event) -> Iterator[None]:
+def ending(stop: Patience) -> Iterator[None]:
     """The first Ctrl-C or SIGTERM ends in order, a second one at once with 130."""
 
     def end(*_: object) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
-        stop.set()
+        stop.ask()
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import plant, protocol
+from teds_provision import plant, protocol, talk
 from teds_provision.cli.build import read_file, write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Seconds, command, examples
@@ -56,8 +56,8 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station.unlock()
     post = plant.asking.post_of(station, files)
     app.closing(post.close)
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    stop = talk.meeting.Patience(None)
+    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     if seconds is not None:
         threading.Timer(seconds, stop.set).start()
     app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")

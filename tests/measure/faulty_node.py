@@ -29,6 +29,7 @@ from teds_provision.protocol.operation.commands import EITHER, OPERATE_FUNCTION
 from teds_provision.protocol.operation.hardware import Reading
 from teds_provision.protocol.operation.stream_commands import Clock, Subscribed
 from teds_provision.protocol.operation.streams import DataFrame, Stream
+from teds_provision.talk.meeting import Patience
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
 
@@ -279,8 +280,8 @@ def main() -> None:
         server.add(node, measuring=node)
         node.streams_over(_sender(server, node, FAULTS[fault] if FAULTS[fault] in BENDING else None))
         boards.append(node.board)
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    stop = Patience(None)
+    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     for part in (pulse, *boards, server):
         part.start()  # type: ignore[union-attr]
     print(json.dumps({"ready": True}, separators=(", ", ": ")), flush=True)

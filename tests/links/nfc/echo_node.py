@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import signal
 import sys
-import threading
 import time
 from typing import Any
 
 from teds_provision.node.nfc.server import NfcServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.talk.meeting import Patience
 
 
 class Echo:
@@ -71,8 +71,8 @@ def main() -> None:
         queue=True,
     )
     spoil(server, options)
-    done = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: done.set())
+    done = Patience(None)
+    signal.signal(signal.SIGTERM, lambda *_: done.ask())
     server.start()
     print("ready", flush=True)
     done.wait()

@@ -1,0 +1,40 @@
+"""A signal may come at any instant of a command, also while it holds the lock of what it waits for."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+
+from tests.test_architecture import MODULES
+
+INTERRUPTED = """
+import signal, sys
+from teds_provision.cli.sample import ending
+from teds_provision.talk.meeting import Patience
+stop = Patience(None)
+with ending(stop):
+    with stop._cond:  # as for some microseconds in each wait
+        signal.raise_signal(signal.SIGTERM)
+    print(stop.wait(5), stop.is_set(), stop.ran_out)
+"""
+
+
+def test_a_command_that_is_about_to_wait_hears_its_signal() -> None:
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout) == (0, "True True False\n"), done.stderr
+
+
+def test_no_signal_handler_takes_a_lock() -> None:
+    """``Event.set`` in a handler waits for ever for the lock that the interrupted thread holds: ``Patience.ask``."""
+    found = []
+    for module in MODULES:
+        tree = ast.parse(module.read_text())
+        functions = {one.name: one for one in ast.walk(tree) if isinstance(one, ast.FunctionDef)}
+        for call in ast.walk(tree):
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == "signal.signal":
+                handler = call.args[1]
+                body = functions.get(handler.id, handler) if isinstance(handler, ast.Name) else handler
+                taken = {ast.unparse(one.func) for one in ast.walk(body) if isinstance(one, ast.Call)}
+                found += [f"{module.name}:{call.lineno}: {name}" for name in taken if name.endswith(".set")]
+    assert found == []
