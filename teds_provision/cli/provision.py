@@ -152,8 +152,8 @@ def provision(
             threading.Thread(target=line.scans.listen, name="scanner", daemon=True).start()
         if found is not None and found.office not in (None, base.identity.fingerprint):
             post = plant.asking.post_of(base, files)
-            app.closing(post.close)
-            line.office = plant.asking.PostOffice(base, post, links.timeout)
+            line.office = office = plant.asking.PostOffice(base, post, links.timeout)
+            app.closing(office.close)
     elif any((calibrations, operator and report is None, files, only, label_to, scan)):
         raise UsageFailure(
             "--calibrations, --operator, --files, --only, --label-to and --scan belong to a job.",

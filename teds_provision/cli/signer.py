@@ -14,6 +14,7 @@ from teds_provision.cli.build import read_file, write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Seconds, command, examples
 from teds_provision.errors import NotAuthentic
+from teds_provision.protocol.plant.document import SIGN_REQUEST
 from teds_provision.teds.image import SECURITY
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from teds_provision.station.station import Station
 
 _LOOK_SECONDS = 0.2
+_MOST_WAIT_SECONDS = 1.0
 
 
 @click.group(
@@ -56,16 +58,19 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station.unlock()
     post = plant.asking.post_of(station, files)
     app.closing(post.close)
+    inbox = plant.asking.Inbox(station, post, SIGN_REQUEST)
+    app.closing(inbox.close)
     stop = talk.meeting.Patience(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     if seconds is not None:
         threading.Timer(seconds, stop.set).start()
     app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")
     while True:
-        for one in plant.office.answer_all(station, post, ids, stop=stop.is_set):
+        for one in plant.office.answer_all(station, post, inbox, ids, stop=stop.is_set):
             _tell(app, station, one)
-        if stop.wait(_LOOK_SECONDS):
+        if stop.is_set():
             return
+        inbox.wait(_MOST_WAIT_SECONDS, _LOOK_SECONDS)
 
 
 @command(

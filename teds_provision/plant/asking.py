@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 import time
 import uuid as uuids
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from teds_provision.errors import (
     BadData,
+    LinkFailure,
     NotAuthentic,
     NotFound,
     PolicyRefused,
@@ -24,7 +27,7 @@ from teds_provision.errors import (
 )
 from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.links import LinkSettings
-from teds_provision.plant import parcels, reaching
+from teds_provision.plant import parcels, postgres, reaching
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import find_job, roster_of
 from teds_provision.plant.post import Parcel, Post
@@ -110,28 +113,77 @@ class Came:
     drop: Callable[[], object]
 
 
-def received(station: Station, post: Post, kind: Kind) -> list[Came]:
-    """The documents of one kind for this station: those that a sync kept here, and those that lie there.
+class Inbox:
+    """The documents of one kind that come for this station: those that a sync kept here, and those that lie there.
 
-    Anything else is left where it is.
+    Each is given once until it is dropped, and nothing is read twice; anything else is left where it is. ``take`` and
+    ``wait`` are for one thread at a time.
     """
-    key, own, tables = station.credentials().key, station.identity.fingerprint, station.plant.parcels
-    found = [
-        Came(document, partial(tables.drop_parcel, row.id, "in"))
-        for row, document in parcels.received(station, _KINDS[kind.typ])
-    ]
-    post.registry()  # looks anew
-    for parcel in post.parcels(own):
-        if not parcel.octets.startswith(b"{") or len(parcel.octets) > _SMALL:
-            continue
+
+    def __init__(self, station: Station, post: Post, kind: Kind) -> None:
+        self._station, self._post, self._kind = station, post, kind
+        self._known: set[str] = set()
+        self._listener: postgres.Registry | None = None
+        self._hears = isinstance(post, postgres.PostgresPost)
+
+    def take(self) -> list[Came]:
+        """What came since; raises LinkFailure."""
+        station, own = self._station, self._station.identity.fingerprint
+        tables = station.plant.parcels
+        found = []
+        for row, document in parcels.received(station, _KINDS[self._kind.typ]):
+            if row.id not in self._known:
+                self._known.add(row.id)
+                found.append(Came(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
+        self._post.registry()  # looks anew
+        for parcel in self._post.parcels(own, self._known):
+            self._known.add(parcel.id)
+            opened = self._opened(parcel.octets)
+            if opened is not None:
+                found.append(Came(opened, partial(self._drop, parcel.id, self._post.drop, own)))
+        return found
+
+    def _drop(self, parcel: str, drop: Callable[[str, Any], object], of: str) -> None:
+        drop(parcel, of)
+        self._known.discard(parcel)  # the same request, asked again, is the same parcel
+
+    def wait(self, seconds: float, pause: float) -> None:
+        """Wait until a database says that a parcel came, ``seconds`` at most; ``pause`` where nobody says it."""
+        if self._hears:
+            try:
+                if self._listener is None:  # what came before it listens, nobody says: look at once
+                    self._listener = reaching.listener(self._station)
+                    if self._listener is not None:
+                        self._listener.listen()
+                        return
+                else:
+                    self._listener.wait(seconds, parcel_to=self._station.identity.fingerprint)
+                    return
+            except LinkFailure:  # the station has no connection left, or the server goes: looking tells
+                self.close()
+            self._hears = False
+        time.sleep(min(seconds, pause))
+
+    def interrupt(self) -> None:
+        """End what another thread waits for here."""
+        if self._listener is not None:
+            self._listener.interrupt()
+
+    def close(self) -> None:
+        """Let go of the connection that listens."""
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+    def _opened(self, octets: bytes) -> bytes | None:
+        if not octets.startswith(b"{") or len(octets) > _SMALL:
+            return None
         try:
-            document = jose.decrypt(parcel.octets, key, cty=CONTENT_TYPE, max_octets=_SMALL)
+            document = jose.decrypt(octets, self._station.credentials().key, cty=CONTENT_TYPE, max_octets=_SMALL)
             header = load_object(decode_base64url(document.partition(b".")[0], "The header"), "The header")
         except (BadData, NotAuthentic, PolicyRefused):
-            continue
-        if header.get("typ") == kind.typ:
-            found.append(Came(document, partial(post.drop, parcel.id, own)))
-    return found
+            return None
+        return document if header.get("typ") == self._kind.typ else None
 
 
 def name_of(hash: str) -> str:
@@ -161,36 +213,59 @@ class Office(Protocol):
         """The answer to a request, None where none came in time; asked again it is the same request."""
 
 
-@dataclass
 class PostOffice:
-    """An office behind a registry or a folder; waits ``timeout`` seconds."""
+    """An office behind a registry or a folder; waits ``timeout`` seconds.
 
-    station: Station
-    post: Post
-    timeout: float
+    Boards on several readers ask at once: one of them looks for all, and lays down what came for the others.
+    """
+
+    def __init__(self, station: Station, post: Post, timeout: float) -> None:
+        self.station, self.post, self.timeout = station, post, timeout
+        self._inbox = Inbox(station, post, SIGNED)
+        self._news = threading.Condition()
+        self._came: dict[str, Came] = {}
+        self._looking = False
 
     def ask(self, request: SignRequest) -> bytes | None:
-        """Send the request and look for its answer."""
+        """Send the request and wait for its answer."""
         send(self.station, self.post, request.to, request.octets, name_of(request.hash))
         until, pause = time.monotonic() + self.timeout, _LOOK_SECONDS
         while True:
-            for come in received(self.station, self.post, SIGNED):
-                if _is_of(come.document, request.hash):
-                    come.drop()
-                    return come.document
-            if time.monotonic() >= until:
+            with self._news:
+                while self._looking and request.hash not in self._came:
+                    self._news.wait(max(0.0, until - time.monotonic()) + _LOOK_SECONDS)
+                come = self._came.pop(request.hash, None)
+                self._looking = come is None
+            if come is not None:
+                come.drop()
+                return come.document
+            found: list[Came] = []
+            try:
+                found = self._inbox.take()
+                if not found:
+                    self._inbox.wait(max(0.0, min(_MOST_LOOK_SECONDS, until - time.monotonic())), pause)
+                    pause = min(2 * pause, _MOST_LOOK_SECONDS)
+            finally:
+                with self._news:
+                    self._came |= {_of(one.document): one for one in found}
+                    self._looking = False
+                    self._news.notify_all()
+            if not found and time.monotonic() >= until:
                 return None
-            time.sleep(pause)
-            pause = min(2 * pause, _MOST_LOOK_SECONDS)
+
+    def close(self) -> None:
+        """Let go of what carries."""
+        self._inbox.close()
+        self.post.close()
 
 
-def _is_of(document: bytes, hash: str) -> bool:
-    """Whether an answer says that it is to this request; who signed it is looked at later."""
+def _of(document: bytes) -> str:
+    """The H of the request that an answer says it is to, "" for none; who signed it is looked at later."""
     try:
         told = load_object(decode_base64url(document.split(b".")[1], "The answer"), "The answer")
     except (BadData, IndexError):
-        return False
-    return told.get("of") == hash
+        return ""
+    return str(told.get("of"))
 
 
 @dataclass
@@ -287,10 +362,13 @@ def sign_by_office(station: Station, links: LinkSettings, order: SignBy, reporte
     draft = station.nodes.draft(uuid)
     if draft is None:
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
-    post = None if order.output is not None else post_of(station, order.files)
-    try:
-        office: Office | None = PostOffice(station, post, links.timeout) if post is not None else None
-        office = office or FileOffice(order.output or Path())
+    with ExitStack() as stack:
+        office: Office
+        if order.output is not None:
+            office = FileOffice(order.output)
+        else:
+            office = PostOffice(station, post_of(station, order.files), links.timeout)
+            stack.callback(office.close)
         with at_node(station, links, uuid, reporter, unlock="always") as visit:
             visit.session()
             identity, image = read_identity(visit.node), Image(uuid, draft.image.unsigned_blocks())
@@ -299,9 +377,6 @@ def sign_by_office(station: Station, links: LinkSettings, order: SignBy, reporte
             name = own_name(station, image, draft.profile)
             wanted = Wanted(job.id, job.office, image, name, octets, identity.epoch, identity.sequence)
             signed = by_office(station, office, visit.node, keys, wanted, None)
-    finally:
-        if post is not None:
-            post.close()
     with station.durable("sign"):
         station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
     return signed

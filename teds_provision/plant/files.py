@@ -7,7 +7,7 @@ is there with other content gets a second file beside it, named by the first 16 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -68,10 +68,12 @@ class FilesPost:
         """Put a page there."""
         self._put(self._folder / station, n, hash, octets)
 
-    def parcels(self, to: str) -> Iterator[Parcel]:
+    def parcels(self, to: str, known: Container[str] = ()) -> Iterator[Parcel]:
         """What lies there for a station; when it is thrown away stands in what is sealed."""
         for path in sorted(self._listed(self._folder / "to" / to)):
-            if _PARCEL.fullmatch(path.name) and (octets := self._read(path, LARGEST_PARCEL)) is not None:
+            if path.name in known or not _PARCEL.fullmatch(path.name):
+                continue
+            if (octets := self._read(path, LARGEST_PARCEL)) is not None:
                 yield Parcel(path.name, to, octets, "")
 
     def send(self, parcel: Parcel) -> None:

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProvisionError
-from teds_provision.plant.asking import name_of, received, send
+from teds_provision.plant.asking import Inbox, name_of, send
 from teds_provision.plant.jobs import now_of, profile_file, read_job, require_adopted, require_open, roster_of
 from teds_provision.plant.post import Post
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint, node_key_good, prove_message, verify
-from teds_provision.protocol.plant.document import SIGN_REQUEST, hash_of
+from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.job import Job
 from teds_provision.protocol.plant.roster import MOST_AHEAD
 from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answer, open_request, seal_answer
@@ -85,10 +85,15 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
 
 
 def answer_all(
-    station: Station, post: Post, jobs: Collection[str] | None = None, *, stop: Callable[[], bool] = lambda: False
+    station: Station,
+    post: Post,
+    inbox: Inbox,
+    jobs: Collection[str] | None = None,
+    *,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Answered]:
-    """Answer every request that lies there, one after the other; each answer is on its way before its parcel goes."""
-    for come in received(station, post, SIGN_REQUEST):
+    """Answer every request that came, one after the other; each answer is on its way before its parcel goes."""
+    for come in inbox.take():
         if stop():
             return
         sealed = answer(station, come.document, jobs)

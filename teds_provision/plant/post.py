@@ -7,7 +7,7 @@ PolicyRefused where it lets nobody in.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -62,8 +62,8 @@ class Post(Protocol):
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
         """Put a page there; the same again changes nothing. Raises Fork where another one has its place for good."""
 
-    def parcels(self, to: str) -> Iterator[Parcel]:
-        """What lies there for a station."""
+    def parcels(self, to: str, known: Container[str] = ()) -> Iterator[Parcel]:
+        """What lies there for a station, but for the ids that it knows."""
 
     def send(self, parcel: Parcel) -> None:
         """Put a parcel there; the same id again changes nothing. Raises PolicyRefused where no more is taken."""

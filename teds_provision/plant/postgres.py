@@ -14,7 +14,8 @@ from __future__ import annotations
 import os
 import socket
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -163,13 +164,15 @@ def require_driver() -> None:
 class Registry:
     """One login at the database, connected at its first use and again after a failure.
 
-    Every method raises RegistryFailure (5: not reached, login refused, no answer), NotMember (6), PolicyRefused (6:
-    full), Fork (4), StoreFailure (7: schema, gap).
+    Several threads may use it (the readers of a line do): one at a time, as a login has four connections for all that
+    its station runs. Every method raises RegistryFailure (5: not reached, login refused, no answer), NotMember (6),
+    PolicyRefused (6: full), Fork (4), StoreFailure (7: schema, gap).
     """
 
     def __init__(self, told: Mapping[str, Any], patience: float = STATEMENT + _GRACE) -> None:
         self._told, self._patience = told, patience
         self._connection: psycopg.Connection[tuple[Any, ...]] | None = None
+        self._turn = threading.RLock()
 
     def close(self) -> None:
         """End the connection; a later use makes another one."""
@@ -255,10 +258,15 @@ class Registry:
         """Be told from now on of what others do; on a connection that does nothing else."""
         self._rows(f"listen {_CHANNEL}", ())
 
-    def wait(self, seconds: float) -> bool:
-        """Wait until somebody did something; False where nothing came in ``seconds``."""
+    def wait(self, seconds: float, *, parcel_to: str = "") -> bool:
+        """Wait until somebody did something, or left a parcel for a station; False where not in ``seconds``."""
+        until = time.monotonic() + seconds
         with self._connected(seconds) as connection:
-            return any(True for _ in connection.notifies(timeout=seconds, stop_after=1))
+            while (left := until - time.monotonic()) > 0:
+                for told in connection.notifies(timeout=left, stop_after=1):
+                    if not parcel_to or told.payload == f"parcel {parcel_to}":
+                        return True
+        return False
 
     def _rows(self, statement: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
         with self._connected() as connection:
@@ -270,15 +278,16 @@ class Registry:
         """The connection, for what takes at most a statement's time and ``more``; failures are of ours."""
         require_driver()
         ended = threading.Event()
-        try:
-            if self._connection is None or self._connection.closed:
-                self._connection = psycopg.connect(**self._told, autocommit=True)
-            with _cut_after(self._connection, self._patience + more, ended):
-                yield self._connection
-        except psycopg.Error as error:
-            if self._connection is not None and (self._connection.broken or ended.is_set()):
-                self.close()
-            raise _failure(error, late=ended.is_set()) from error
+        with self._turn:
+            try:
+                if self._connection is None or self._connection.closed:
+                    self._connection = psycopg.connect(**self._told, autocommit=True)
+                with _cut_after(self._connection, self._patience + more, ended):
+                    yield self._connection
+            except psycopg.Error as error:
+                if self._connection is not None and (self._connection.broken or ended.is_set()):
+                    self.close()
+                raise _failure(error, late=ended.is_set()) from error
 
 
 class PostgresPost:
@@ -329,10 +338,11 @@ class PostgresPost:
         """Push a page of one's own."""
         self._registry.append([(n, previous, octets)])
 
-    def parcels(self, to: str) -> Iterator[Parcel]:
-        """What lies there for this station."""
+    def parcels(self, to: str, known: Container[str] = ()) -> Iterator[Parcel]:
+        """What lies there for this station; those that it knows are not asked for."""
         for waiting in self._look.parcels:
-            octets = self._registry.parcel(waiting.id) if waiting.to == to else None
+            wanted = waiting.to == to and waiting.id not in known
+            octets = self._registry.parcel(waiting.id) if wanted else None
             if octets is not None:
                 yield Parcel(waiting.id, to, octets, waiting.expires.astimezone(UTC).isoformat(), waiting.sender)
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import TedsProvisionError
-from teds_provision.plant.asking import PostOffice, send_job
+from teds_provision.plant.asking import Inbox, PostOffice, send_job
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer_all
+from teds_provision.protocol.plant.document import SIGN_REQUEST
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 
@@ -31,35 +33,41 @@ def plant(tmp_path: Path, cluster: Cluster) -> Iterator[Office]:
     made.plant.close()
 
 
-def test_an_office_signs_through_the_registry(plant: Office) -> None:
+def test_an_office_signs_through_the_registry_for_all_readers_of_a_line(plant: Office) -> None:
+    """Eight readers ask at once over one login, which has four connections; the office answers in its own order."""
     north, west = plant.north, plant.member("west", "line")
     north.unlock()
     west.unlock()
-    told = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 3}}
-    job = take_job(north, job_of(north, **told))
+    told = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 8}}
+    job = take_job(north, job_of(north, **told, count=8))
     at_office, at_line = plant.post(north), plant.post(west)
     send_job(north, at_office, job)
     plant.sync(north, west)
     over, failed = threading.Event(), []
 
     def signer() -> None:
+        inbox = Inbox(north, at_office, SIGN_REQUEST)
         try:
-            while not over.wait(0.05):
-                list(answer_all(north, at_office, [job.id]))
+            while not over.is_set():
+                list(answer_all(north, at_office, inbox, [job.id]))
+                inbox.wait(1.0, 0.05)
         except TedsProvisionError as error:
             failed.append(error)
 
     office = threading.Thread(target=signer)
     office.start()
+    asks = PostOffice(west, at_line, 60)
+    line = LineRun(west, find_job(west, job.id), office=asks)
     try:
-        line = LineRun(west, find_job(west, job.id), office=PostOffice(west, at_line, 60))
-        for number in (1, 2):
-            done = build(line, board(number))
-            assert done.verified.verdict == "authentic"
-            assert security.decode(done.image.blocks[SECURITY]).station_key == north.point
+        with ThreadPoolExecutor(8) as readers:
+            built = list(readers.map(lambda number: build(line, board(number)), range(1, 9)))
     finally:
         over.set()
         office.join()
         at_office.close()
-        at_line.close()
+        asks.close()
     assert failed == []
+    assert {done.verified.verdict for done in built} == {"authentic"}
+    assert {security.decode(done.image.blocks[SECURITY]).station_key for done in built} == {north.point}
+    units = [west.plant.line.unit(job.id, done.who.uuid) for done in built]
+    assert sorted(row.unit for row in units if row is not None) == list(range(1, 9))
