@@ -9,7 +9,7 @@ import time
 import uuid as uuids
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from teds_provision.links import LinkSettings
 from teds_provision.plant import parcels, postgres, reaching
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import find_job, roster_of
-from teds_provision.plant.post import Parcel, Post
+from teds_provision.plant.post import SMALL, Parcel, Post
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.handover import jose
@@ -65,7 +65,6 @@ from teds_provision.teds.image import SECURITY, Image
 DAYS: Final = 7
 _LOOK_SECONDS: Final = 0.05
 _MOST_LOOK_SECONDS: Final = 1.0
-_SMALL: Final = 8 << 20
 _KINDS: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
 
 
@@ -135,8 +134,7 @@ class Inbox:
             if row.id not in self._known:
                 self._known.add(row.id)
                 found.append(Came(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
-        self._post.registry()  # looks anew
-        for parcel in self._post.parcels(own, self._known):
+        for parcel in self._post.new_parcels(own, self._known):
             self._known.add(parcel.id)
             opened = self._opened(parcel.octets)
             if opened is not None:
@@ -176,10 +174,10 @@ class Inbox:
             self._listener = None
 
     def _opened(self, octets: bytes) -> bytes | None:
-        if not octets.startswith(b"{") or len(octets) > _SMALL:
+        if not octets.startswith(b"{"):
             return None
         try:
-            document = jose.decrypt(octets, self._station.credentials().key, cty=CONTENT_TYPE, max_octets=_SMALL)
+            document = jose.decrypt(octets, self._station.credentials().key, cty=CONTENT_TYPE, max_octets=SMALL)
             header = load_object(decode_base64url(document.partition(b".")[0], "The header"), "The header")
         except (BadData, NotAuthentic, PolicyRefused):
             return None
@@ -418,11 +416,12 @@ def _asked(station: Station, node: Conversation, keys: NodeKeys, wanted: Wanted)
         proof,
     )
     octets = seal_request(unsigned, key)
+    request = replace(unsigned, hash=hash_of(octets), signer=fingerprint(key.point), line=key.point, octets=octets)
     with station.durable("sign"):
         station.plant.line.put_sign_request(
-            SignRequestRow(hash_of(octets), "out", wanted.job, keys.uuid, wanted.office, octets)
+            SignRequestRow(request.hash, "out", wanted.job, keys.uuid, wanted.office, octets)
         )
-    return open_request(octets, lambda kid: station.point)
+    return request
 
 
 def _taken(station: Station, roster: Roster, keys: NodeKeys, wanted: Wanted, request: bytes, octets: bytes) -> Signed:

@@ -7,13 +7,14 @@ is there with other content gets a second file beside it, named by the first 16 
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData, LinkFailure, NotFound, TedsProvisionError
 from teds_provision.files import SHARED, read_limited, write_new
-from teds_provision.plant.post import Carried, Parcel
+from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Parcel
 from teds_provision.protocol.plant.document import PAGE, ROSTER, hash_of
 
 _STATION: Final = re.compile("[0-9a-f]{64}")
@@ -68,12 +69,19 @@ class FilesPost:
         """Put a page there."""
         self._put(self._folder / station, n, hash, octets)
 
-    def parcels(self, to: str, known: Container[str] = ()) -> Iterator[Parcel]:
+    def parcels(self, to: str) -> Iterator[Parcel]:
         """What lies there for a station; when it is thrown away stands in what is sealed."""
+        return self._parcels(to, (), LARGEST_PARCEL)
+
+    def new_parcels(self, to: str, known: Collection[str]) -> Iterator[Parcel]:
+        """What lies there for a station that it does not know."""
+        return islice(self._parcels(to, known, SMALL), AT_ONCE)
+
+    def _parcels(self, to: str, known: Collection[str], most: int) -> Iterator[Parcel]:
         for path in sorted(self._listed(self._folder / "to" / to)):
             if path.name in known or not _PARCEL.fullmatch(path.name):
                 continue
-            if (octets := self._read(path, LARGEST_PARCEL)) is not None:
+            if (octets := self._read(path, most)) is not None:
                 yield Parcel(path.name, to, octets, "")
 
     def send(self, parcel: Parcel) -> None:

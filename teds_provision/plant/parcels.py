@@ -18,7 +18,7 @@ from typing import Final
 
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, TedsProvisionError
 from teds_provision.handover import incoming, outgoing, pending
-from teds_provision.plant.post import Parcel, Post
+from teds_provision.plant.post import SMALL, Parcel, Post
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, time_text
@@ -37,8 +37,6 @@ NODES: Final = 10_000
 """So many nodes go into one copy."""
 DAYS: Final = 7
 _COMMAND: Final = "registry sync"
-_SMALL: Final = 8 << 20
-"""Documents of a line are smaller, sealed; a larger parcel is a bundle."""
 _KEPT: Final = 64
 """So many parcels of one sender wait here for a person; the others stay where they are."""
 _OF_A_LINE: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
@@ -238,9 +236,9 @@ class _Reader:
 
 def _inner(octets: bytes, station: Station) -> tuple[str, bytes]:
     """``typ`` and octets of what is sealed in a small parcel; "" for bundles and what is not sealed."""
-    if not octets.startswith(b"{") or len(octets) > _SMALL:
+    if not octets.startswith(b"{") or len(octets) > SMALL:
         return "", b""
-    inner = jose.decrypt(octets, station.vault.identity(), cty=CONTENT_TYPE, max_octets=_SMALL)
+    inner = jose.decrypt(octets, station.vault.identity(), cty=CONTENT_TYPE, max_octets=SMALL)
     header = load_object(decode_base64url(inner.partition(b".")[0], "The JWS header"), "The JWS header")
     typ = header.get("typ")
     return (typ, inner) if isinstance(typ, str) and typ in _OF_A_LINE else ("", b"")

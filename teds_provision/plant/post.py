@@ -7,9 +7,13 @@ PolicyRefused where it lets nobody in.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Final, Protocol
+
+SMALL: Final = 8 << 20
+"""Documents of a line are smaller, sealed; a larger parcel is a bundle."""
+AT_ONCE: Final = 16
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,14 @@ class Post(Protocol):
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
         """Put a page there; the same again changes nothing. Raises Fork where another one has its place for good."""
 
-    def parcels(self, to: str, known: Container[str] = ()) -> Iterator[Parcel]:
-        """What lies there for a station, but for the ids that it knows."""
+    def parcels(self, to: str) -> Iterator[Parcel]:
+        """What lies there for a station."""
+
+    def new_parcels(self, to: str, known: Collection[str]) -> Iterator[Parcel]:
+        """What lies there now for a station, but for the ids that it knows and what is larger than ``SMALL``.
+
+        Looks anew; at most ``AT_ONCE``, the others at the next call.
+        """
 
     def send(self, parcel: Parcel) -> None:
         """Put a parcel there; the same id again changes nothing. Raises PolicyRefused where no more is taken."""

@@ -15,7 +15,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -33,7 +33,7 @@ from teds_provision.errors import (
 )
 from teds_provision.lazy import how_to_install, late
 from teds_provision.plant import schema, scram
-from teds_provision.plant.post import Carried, Parcel
+from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Parcel
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
@@ -90,6 +90,11 @@ union all select 'parcel', sender, octet_length(document), id::text, recipient, 
 union all select 'page', p.station, p.n, p.jws, null, null from registry.page p
   join registry.member m on (m.station, m.n) = (p.station, p.n)
   where p.station = registry.me() and octet_length(p.jws) <= 65536"""
+
+_SMALL_PARCELS: Final = """\
+select id::text, document, expires, sender from registry.parcel
+  where recipient = registry.me() and octet_length(document) <= %s and id <> all(%s::uuid[])
+  order by received limit %s"""
 
 # What a login of a member may do in a database where the schema was not run by a superuser, or pg_restore undid it.
 _OPEN_DOORS: Final = """\
@@ -246,6 +251,11 @@ class Registry:
         rows = self._rows("select document from registry.parcel where id = %s", (parcel,))
         return bytes(rows[0][0]) if rows else None
 
+    def small_parcels(self, to: str, known: Collection[str]) -> list[Parcel]:
+        """The oldest parcels for this station (``to``) of which it knows no id."""
+        rows = self._rows(_SMALL_PARCELS, (SMALL, list(known), AT_ONCE))
+        return [Parcel(id, to, octets, until.astimezone(UTC).isoformat(), by.hex()) for id, octets, until, by in rows]
+
     def remove(self, parcels: Sequence[str]) -> None:
         """Take parcels away that came here or were sent from here."""
         self._rows("delete from registry.parcel where id = any(%s::uuid[])", (list(parcels),))
@@ -338,13 +348,16 @@ class PostgresPost:
         """Push a page of one's own."""
         self._registry.append([(n, previous, octets)])
 
-    def parcels(self, to: str, known: Container[str] = ()) -> Iterator[Parcel]:
-        """What lies there for this station; those that it knows are not asked for."""
+    def parcels(self, to: str) -> Iterator[Parcel]:
+        """What lies there for this station."""
         for waiting in self._look.parcels:
-            wanted = waiting.to == to and waiting.id not in known
-            octets = self._registry.parcel(waiting.id) if wanted else None
+            octets = self._registry.parcel(waiting.id) if waiting.to == to else None
             if octets is not None:
                 yield Parcel(waiting.id, to, octets, waiting.expires.astimezone(UTC).isoformat(), waiting.sender)
+
+    def new_parcels(self, to: str, known: Collection[str]) -> Iterator[Parcel]:
+        """What lies there for this station that it does not know, the oldest first, in one round trip."""
+        yield from self._registry.small_parcels(to, known)
 
     def send(self, parcel: Parcel) -> None:
         """Leave a parcel."""
