@@ -14,7 +14,6 @@ from teds_provision.cli.build import read_file, write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Seconds, command, examples
 from teds_provision.errors import NotAuthentic
-from teds_provision.protocol.plant.document import SIGN_REQUEST
 from teds_provision.teds.image import SECURITY
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station.unlock()
     post = plant.asking.post_of(station, files)
     app.closing(post.close)
-    inbox = plant.asking.Inbox(station, post, SIGN_REQUEST)
+    inbox = plant.asking.Inbox(station, post, protocol.plant.document.SIGN_REQUEST)
     app.closing(inbox.close)
     stop = talk.meeting.Patience(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
