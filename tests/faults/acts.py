@@ -35,6 +35,8 @@ class Act:
 
 
 NO_SHEET = (0, 4)
+_JOB = ("job", "new", "--title", "one", "--profile", ANGLE, "--station", "bench", "--count", "1")
+_JOB += ("--ends", "2099-01-01", "--output", "{FILES}/job.jws")
 TAKEN_UP = '"verified"'
 ACTS = (
     Act("whitelist add", "new", ("whitelist", "add", "{UUID}"), node=False, proof=""),
@@ -96,6 +98,11 @@ ACTS = (
         ("trust", "ca", "sign", "{FILES}/lab.request", "--output", "{FILES}/lab.cert", "--yes"),
         node=False,
     ),
+    Act("registry create", "provisioned", ("registry", "create", "--name", "plant", "--yes"), node=False, ends=(0, 6)),
+    Act("registry sync", "founded", ("registry", "sync", "--files", "{FILES}/stick"), node=False),
+    Act("job new", "founded", _JOB, node=False),
+    Act("provision --job", "ordered", ("provision", "--job", "{FILES}/job.jws", "--yes", "TAP")),
+    Act("evidence export", "proven", ("evidence", "export", "{FILES}/proof"), node=False),
     Act("measure", "measured", ("measure", "hand", "--duration", "0.5", "--to", "{FILES}/run.csv", "LINK")),
     Act("zero", "calibrated", ("calibrate", "zero", "{UUID}", "1", "--value", "0.5", "LINK")),
     Act("ncap run", "measured", ("ncap", "run", "--record", "{FILES}/runs", "BUS"), until=TAKEN_UP, cuts_node=False),
@@ -155,6 +162,10 @@ NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
     "built": ("keyed", (("home", ("build", "{UUID}", "--profile", ANGLE)),)),
     "signed": ("built", (("home", ("sign", "{UUID}")),)),
     "provisioned": ("new", (("home", ("provision", "--profile", ANGLE, "--yes", "TAP")),)),
+    "founded": ("provisioned", (("home", ("registry", "create", "--name", "plant", "--yes")),)),
+    "plant": ("new", (("home", ("registry", "create", "--name", "plant", "--yes")),)),
+    "ordered": ("plant", (("home", _JOB),)),
+    "proven": ("ordered", (("home", ("provision", "--job", "{FILES}/job.jws", "--yes", "TAP")),)),
     "strangers": ("provisioned", (("other", ("trust", "add", "bench", "{FILES}/bench.pem", "--yes")),)),
     "pair": ("strangers", (("home", ("trust", "add", "crane", "{FILES}/crane.pem", "--yes")),)),
     "bundled": (

@@ -197,7 +197,7 @@ class States:
 
     def _new(self, folder: Path, *hardware: str) -> None:
         folder.mkdir()
-        (folder / "files").mkdir()
+        (folder / "files" / "stick").mkdir(parents=True)
         (folder / "files" / "sheet.csv").write_text(f"uuid,profile\n{UUID},{ANGLE}\n")
         if hardware:
             (folder / "files" / "still.csv").write_text("t,angle\n0,90\n100000,90\n")
