@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -13,7 +14,8 @@ from teds_provision.protocol.keys import to_pem
 from teds_provision.station.station import Station as InMemory
 from teds_provision.station.station import initialise
 from tests.bench import PASSPHRASE
-from tests.e2e.desk import Desk, Station
+from tests.e2e.desk import PROGRAM, Desk, Links, Station
+from tests.places import free_reader
 from tests.vault.softhsm import PIN, loaded, unload
 
 from .owner import ALL, ANGLE, alone, join, member, roster_of
@@ -90,6 +92,66 @@ def test_a_bench_goes_on_until_it_is_told_to_stop(desk: Desk, owner: Station) ->
     running.end()
     assert [line.get("unit") for line in lines] == [1, 2, None]
     assert lines[2]["error"]["code"] == "refused"
+
+
+def test_a_bus_of_boards_gets_as_many_units_as_the_job_has(desk: Desk, owner: Station) -> None:
+    """Three boards at once, two units: nobody gets the third."""
+    job = new_job(owner, "--count", 2, "--assurance", "uuid")
+    boards = [desk.node(f"node{number}").start(nfc=False, can=True) for number in (1, 2, 3)]
+    for board in boards:
+        owner.ask("whitelist", "add", board.uuid)
+    words = ["--json", "provision", "--all", "--yes", "--job", job["id"], *desk.links.over("can")]
+    done = owner.run(*words)
+    assert done.code == 6, done
+    lines = [line for line in map(json.loads, done.out.splitlines()) if "uuid" in line]
+    assert sorted(line.get("unit", 0) for line in lines) == [0, 1, 2]
+    (refused,) = [line for line in lines if "unit" not in line]
+    assert "one too many" in refused["error"]["message"]
+    assert [board.flash["key"] is None for board in boards].count(True) == 1
+    (part,) = owner.ask("job", "status", job["id"])["stations"]
+    assert (part["units"], part["passed"]) == (2, 2)
+
+
+def test_two_readers_share_the_units_of_a_job(desk: Desk, owner: Station) -> None:
+    job = new_job(owner, "--count", 1)
+    readers = [desk.links.nfc, free_reader()]
+    named = [word for reader in readers for word in ("--nfc", reader)]
+    running = owner.start("--json", "provision", "--job", job["id"], "--watch", "--yes", *named)
+    for number, reader in enumerate(readers):
+        desk.links = Links(nfc=reader, can=desk.links.can)
+        desk.node(f"node{number}").start()
+    lines = running.wait_for_lines(2)
+    running.signal(15)
+    assert running.end().code == 6
+    assert sorted(line.get("unit", 0) for line in lines) == [0, 1]
+    assert [line["error"]["code"] for line in lines if "error" in line] == ["refused"]
+    assert owner.log_is_whole()
+
+
+@pytest.mark.system
+def test_evidence_on_a_full_disk_is_whole_or_absent(desk: Desk, owner: Station, tmp_path: Path) -> None:
+    """There is room for one file; then for all, and the same command carries on."""
+    for number in (1, 2):
+        node = desk.node(f"node{number}").start()
+        owner.provision("nfc", "--evidence", "--profile", ANGLE)
+        node.stop()
+    proof = tmp_path / "proof"
+    proof.mkdir()
+    mounted = (
+        'mount -t tmpfs -o size=8192,mode=755 tmpfs "$0" && { "$@"; ended=$?; cat "$0"/*; ls -A "$0"; exit $ended; }'
+    )
+    small = ("unshare", "--mount", "--map-root-user", "sh", "-c", mounted, str(proof))
+    if subprocess.run([*small, "true"], capture_output=True, check=False).returncode not in (0, 1, 2):
+        pytest.skip("a small file system cannot be mounted here")
+    done = owner.run("--json", "evidence", "export", proof, program=(*small, *PROGRAM))
+    assert done.code == 7, done
+    error, *files = done.out.splitlines()
+    assert json.loads(error)["error"]["code"] == "store"
+    assert len(files) == 1, "one whole document, and its name behind it"
+    document, _, name = files[0].rpartition("}")
+    assert json.loads(document + "}").keys() == {"payload", "payloadType", "signatures"}
+    assert name.endswith(".1.json")
+    assert owner.ask("evidence", "export", proof)["written"] == 2
 
 
 def test_a_job_and_what_it_says_are_not_both_named(owner: Station) -> None:
