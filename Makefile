@@ -60,6 +60,8 @@ bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.radio
 	$(BIN)/python -m benchmarks.plant
+	$(BIN)/python -m benchmarks.line
+	$(BIN)/python -m benchmarks.line_readers --pace
 
 bench-teds: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.teds_codec

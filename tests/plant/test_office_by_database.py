@@ -10,17 +10,21 @@ from pathlib import Path
 import pytest
 
 from teds_provision.demo.cluster import Cluster
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import RegistryFailure, TedsProvisionError
 from teds_provision.plant.asking import Inbox, PostOffice, send_job
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer_all
+from teds_provision.plant.sync import sync
+from teds_provision.plant.yields import attempts_of
 from teds_provision.protocol.plant.document import SIGN_REQUEST
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
+from tests.places import free_tcp_port
 
 from .owner import job_of
 from .test_jobs import board, build
+from .test_office import AtHand
 from .test_synced_by_database import Office
 
 pytestmark = pytest.mark.system
@@ -71,3 +75,33 @@ def test_an_office_signs_through_the_registry_for_all_readers_of_a_line(plant: O
     assert {security.decode(done.image.blocks[SECURITY]).station_key for done in built} == {north.point}
     units = [west.plant.line.unit(job.id, done.who.uuid) for done in built]
     assert sorted(row.unit for row in units if row is not None) == list(range(1, 9))
+
+
+def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
+    """Its office answers by hand meanwhile; no unit is lost, none given twice, and no attempt told twice."""
+    north, west = plant.north, plant.member("west", "line")
+    north.unlock()
+    west.unlock()
+    told = {"registry": plant.plant.roster.registry, "sign": north.fingerprint, "stations": {west.fingerprint: 3}}
+    job = take_job(north, job_of(north, **told))
+    send_job(north, plant.post(north), job)
+    plant.sync(north, west)
+    away = PostOffice(west, plant.post(west, port=free_tcp_port()), 1)
+    line = LineRun(west, find_job(west, job.id), office=away)
+    first, second = board(1), board(2)
+    with pytest.raises(RegistryFailure):
+        build(line, first)
+    line.office = AtHand(north)
+    assert build(line, first).verified.verdict == build(line, second).verified.verdict == "authentic"
+    with pytest.raises(RegistryFailure):
+        sync(west, away.post)
+    for _ in range(2):
+        plant.sync(west, north)
+    attempts = attempts_of(north, job.id)
+    assert [(one.uuid, one.unit, one.attempt, one.code) for one in attempts] == [
+        (first.uuid, 1, 1, "registry"),
+        (first.uuid, 1, 2, None),
+        (second.uuid, 2, 1, None),
+    ]
+    assert west.plant.tables.unsent() == 0
+    away.close()
