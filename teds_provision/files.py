@@ -15,8 +15,9 @@ import re
 import secrets
 import stat
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
@@ -37,6 +38,7 @@ _STALE_SECONDS: Final = 60.0  # between making the file and locking it a living 
 _LONGEST_SOCKET: Final = 100
 """Octets: Linux takes 107 for the name of a Unix socket."""
 _PIECE: Final = 1 << 16
+_JSON: Final = ".json"
 _NO_FOLDER_SYNC: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EROFS, errno.EACCES})
 _NO_HARD_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EXDEV, errno.EACCES})
 
@@ -229,6 +231,52 @@ def _read(descriptor: int, most: int) -> bytes:
     finally:
         os.close(descriptor)
     return b"".join(parts)
+
+
+def json_files(paths: Sequence[Path], what: str) -> list[str]:
+    """Files that are named, and every ``*.json`` below folders that are named, by name; each once.
+
+    As text: paths are made of them where they are read, by several processes. Raises NotFound, which says ``what`` is
+    missing, for a folder without one; a file that is not there is left to whoever reads it.
+    """
+    found: list[str] = []
+    for path in paths:
+        if path.is_dir():
+            inside = list(_below(str(path)))
+            if not inside:
+                raise NotFound(f"There is no {what} (*{_JSON}) in the folder {path}.")
+            found += inside
+        else:
+            found.append(str(path))
+    return list(dict.fromkeys(found))
+
+
+def _below(folder: str) -> Iterator[str]:
+    """The JSON files in a folder and its folders, by name; neither links to folders nor what cannot be looked into."""
+    here: list[os.DirEntry[str]] = []
+    with suppress(OSError), os.scandir(folder) as entries:
+        here = sorted(entries, key=attrgetter("name"))
+    for entry in here:
+        if _is_folder(entry):
+            yield from _below(entry.path)
+        elif entry.name.endswith(_JSON) and _is_file(entry):
+            yield entry.path
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Whether it is a folder itself; its own folder knew that already, so that most need no look at the disk."""
+    try:
+        return entry.is_dir(follow_symlinks=False)
+    except OSError:
+        return False
+
+
+def _is_file(entry: os.DirEntry[str]) -> bool:
+    """Whether it is a file, or a link to one."""
+    try:
+        return entry.is_file()
+    except OSError:
+        return False
 
 
 def holds(path: Path, octets: bytes) -> bool:

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from teds_provision import plant, protocol, steps
+from teds_provision import plant, protocol
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, command, dry_run_option, examples
 from teds_provision.cli.rendering import local_time, print_table
+from teds_provision.files import json_files
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
     that cannot be read.
     """
     grounds = plant.verify_evidence.Grounds.of(protocol.keys.from_pem(read_file(ca)), pins, roster)
-    names = steps.verify_files.image_files([Path(file) for file in files])
+    names = json_files([Path(file) for file in files], "evidence")
     totals = plant.verify_evidence.Totals()
     for lines, counted in plant.verify_evidence.verify_evidence(grounds, names, _json if app.json else _line):
         totals.join(counted)

@@ -16,6 +16,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, WholeNumber, command, dry_run_option, examples
 from teds_provision.cli.rendering import local_time, moment, print_table
 from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.files import json_files
 from teds_provision.teds.profile.load import default_folders, find_profile
 
 if TYPE_CHECKING:
@@ -300,7 +301,7 @@ def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None)
     """
     station = app.station()
     found = plant.jobs.find_job(station, which)
-    names = steps.verify_files.image_files([Path(file) for file in evidence]) if evidence else []
+    names = json_files([Path(file) for file in evidence], "evidence")
     attempts = plant.yields.attempts_of(station, found.id, (read_file(Path(name)) for name in names))
     parts = plant.yields.yields(station, found, attempts)
     if csv_file is not None:

@@ -13,6 +13,7 @@ from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import UsageFailure
+from teds_provision.files import json_files
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import printable
 
@@ -88,7 +89,7 @@ def are_files(what: Sequence[str]) -> bool:
 
 def verify_many(app: App, what: Sequence[str]) -> None:
     """Judge every file by itself; one that fails stops no other."""
-    files = steps.verify_files.image_files([Path(word) for word in what])
+    files = json_files([Path(word) for word in what], "image")
     totals = steps.verify_files.Totals()
     for lines, counted in steps.verify_files.verify_files(app.station(), files, _json if app.json else _line):
         totals.join(counted)

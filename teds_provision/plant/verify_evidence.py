@@ -8,18 +8,23 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData, NotAuthentic, TedsProvisionError
 from teds_provision.files import read_limited
+from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.document import ROSTER
 from teds_provision.protocol.plant.evidence import Evidence, Ready, Signatures
 from teds_provision.protocol.plant.roster import Roster, open_roster
-from teds_provision.steps.whitelist import read_whitelist
 from teds_provision.teds.codec import security
+
+if TYPE_CHECKING:
+    from teds_provision.steps import whitelist
+else:  # it brings the store along, which nothing else here needs
+    whitelist = late("teds_provision.steps.whitelist")
 
 _FEW: Final = 50
 """So many are judged sooner than another process is ready."""
@@ -37,7 +42,7 @@ class Grounds:
     @classmethod
     def of(cls, ca: bytes, pins: Path | None = None, roster: Path | None = None) -> Grounds:
         """Read ``pins``, a whitelist file, and a roster that this CA signed; raises NotFound, NotAuthentic, BadData."""
-        listed = None if pins is None else {one.uuid: one.fingerprint or "" for one in read_whitelist(pins)}
+        listed = None if pins is None else {one.uuid: one.fingerprint or "" for one in whitelist.read_whitelist(pins)}
         named = None if roster is None else open_roster(read_limited(roster, ROSTER.most, "roster"), ca)
         return cls(ca, listed, named)
 

@@ -6,14 +6,12 @@ import gc
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
-from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
 from teds_provision import teds
-from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadData, PolicyRefused, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
@@ -22,7 +20,6 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 
-ENDING: Final = ".json"
 _FEW: Final = 50
 """So many are judged sooner than another process is ready."""
 _CHUNK: Final = 64
@@ -86,52 +83,6 @@ Tell = Callable[[FileVerdict], str]
 
 # From good to bad: a harmful calibration, a file that is not there or holds no image, one that is not authentic.
 _WORST: Final = (0, 6, 7, 3, 8, 1, 4)
-
-
-def image_files(paths: Sequence[Path]) -> list[str]:
-    """Files that are named, and every ``*.json`` below folders that are named, by name; each once.
-
-    As text: paths are made of them where they are read, by several processes. Raises NotFound for a folder without one;
-    a file that is not there is told with the others' verdicts.
-    """
-    found: list[str] = []
-    for path in paths:
-        if path.is_dir():
-            inside = list(_below(str(path)))
-            if not inside:
-                raise NotFound(f"There is no image (*{ENDING}) in the folder {path}.")
-            found += inside
-        else:
-            found.append(str(path))
-    return list(dict.fromkeys(found))
-
-
-def _below(folder: str) -> Iterator[str]:
-    """The images in a folder and its folders, by name; neither links to folders nor what cannot be looked into."""
-    here: list[os.DirEntry[str]] = []
-    with suppress(OSError), os.scandir(folder) as entries:
-        here = sorted(entries, key=attrgetter("name"))
-    for entry in here:
-        if _is_folder(entry):
-            yield from _below(entry.path)
-        elif entry.name.endswith(ENDING) and _is_file(entry):
-            yield entry.path
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    """Whether it is a folder itself; its own folder knew that already, so that most need no look at the disk."""
-    try:
-        return entry.is_dir(follow_symlinks=False)
-    except OSError:
-        return False
-
-
-def _is_file(entry: os.DirEntry[str]) -> bool:
-    """Whether it is a file, or a link to one."""
-    try:
-        return entry.is_file()
-    except OSError:
-        return False
 
 
 def verify_files(

@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFound
+from teds_provision.files import json_files
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, station_key_message, to_pem
 from teds_provision.steps import verify_files as many
-from teds_provision.steps.verify_files import FileVerdict, Totals, image_files
+from teds_provision.steps.verify_files import FileVerdict, Totals
 from teds_provision.teds.calibration import Calibration, CalibrationInput
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
@@ -190,9 +191,9 @@ def test_images_without_a_calibration_load_no_guard(home: Path, tmp_path: Path) 
 
 def test_a_folder_without_images_is_said_and_doubles_count_once(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="no image"):
-        image_files([tmp_path])
+        json_files([tmp_path], "image")
     one = write(tmp_path, "1.json", signed(1))
-    assert image_files([one, tmp_path, one]) == [str(one)]
+    assert json_files([one, tmp_path, one], "image") == [str(one)]
 
 
 def test_images_of_a_folder_come_by_name_folders_in_their_place_links_to_files_too(tmp_path: Path) -> None:
@@ -205,7 +206,7 @@ def test_images_of_a_folder_come_by_name_folders_in_their_place_links_to_files_t
     (tmp_path / "images" / "nowhere.json").symlink_to(tmp_path / "gone")
     (tmp_path / "images" / "round").symlink_to(tmp_path / "images")
     (tmp_path / "images" / "notes.txt").touch()
-    found = [Path(file).relative_to(tmp_path / "images") for file in image_files([tmp_path / "images"])]
+    found = [Path(file).relative_to(tmp_path / "images") for file in json_files([tmp_path / "images"], "image")]
     assert found == sorted(map(Path, (*names, "link.json")))
 
 
