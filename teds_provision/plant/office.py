@@ -143,6 +143,7 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
             epoch=request.epoch,
             node_sequence=request.sequence,
             profile=job.profile,
+            unit=(job.id, row.unit),
         )
         made = Answer(request.hash, signed.sequence, signed.image.blocks[SECURITY])
         sealed = seal_answer(made, station.credentials().key)
@@ -201,10 +202,12 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
         if given >= job.total:
             raise _Refused("full", f"all {job.total} units of the job are given")
         return UnitRow(job.id, request.uuid, greatest + 1, utc_now())
-    answered = [row for row in tables.sign_requests(job.id, request.uuid, "in") if row.sequence is not None]
-    if len(answered) >= MOST_ANSWERS:
+    answers = sum(row.sequence is not None for row in tables.sign_requests(job.id, request.uuid, "in"))
+    if station.identity.fingerprint not in job.stations:
+        answers = max(answers, kept.attempts)  # pages told a home that a backup rebuilt; it has no requests of since
+    if answers >= MOST_ANSWERS:
         raise _Refused("full", f"the unit has {MOST_ANSWERS} answers already")
-    return replace(kept, attempts=len(answered) + 1)
+    return replace(kept, attempts=answers + 1)
 
 
 def _built(station: Station, job: Job, request: SignRequest) -> Image:

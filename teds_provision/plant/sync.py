@@ -201,31 +201,39 @@ def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
 def _know_again(station: Station, page: Page) -> None:
     """Epochs, sequences and units that this station gave before it was put back: none of them is given out twice."""
     reached: dict[bytes, tuple[int, int]] = {}
+    signed: set[bytes] = set()
     for one in map(event.read, page.events):
-        if isinstance(one, event.Event) and one.act == "evidence" and one.uuid is not None and one.members["unit"]:
-            _know_unit(station, one.uuid, one)
+        if isinstance(one, event.Event) and one.uuid is not None and (unit := event.unit_of(one)) is not None:
+            _know_unit(station, one.uuid, one, *unit)
         if isinstance(one, event.Event) and one.act in ("agreed", "signed", "written") and one.uuid is not None:
             epoch, sequence = reached.get(one.uuid, (0, 0))
             reached[one.uuid] = max(epoch, one.members["epoch"]), max(sequence, one.members.get("sequence", 0))
+        if isinstance(one, event.Event) and one.act == "signed" and one.uuid is not None:
+            signed.add(one.uuid)
     for uuid, (epoch, sequence) in reached.items():
         node = station.nodes.get(uuid)
         if node is not None:
             station.nodes.remember(uuid, epoch=max(node.epoch, epoch), sequence=max(node.sequence, sequence))
+        elif uuid in signed:  # no sequence says two things, be the board unknown here
+            station.nodes.remember(uuid, sequence=sequence)
 
 
-def _know_unit(station: Station, uuid: bytes, said: event.Event) -> None:
-    """The unit that an attempt was about, and one attempt more; passed over where another board has it by now."""
-    job, unit, tables = said.members["job"], said.members["unit"], station.plant.line
-    if job is None:
-        return
+def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit: int) -> None:
+    """The unit that an attempt or an office's signature was about, and one attempt more.
+
+    Where another board has that unit by now, this one has the next: an office counts what it gave, not its numbers.
+    """
+    tables = station.plant.line
     kept = tables.unit(job, uuid)
     if kept is None and any(row.unit == unit for row in tables.units(job)):
         station.notice(
             f"Unit {unit} of the job {job} was given twice: also to {uuid.hex()}, before this home was put back."
         )
-        return
+        if said.act == "evidence":
+            return
+        unit = tables.count_units(job)[2] + 1
     row = UnitRow(job, uuid, unit, said.at) if kept is None else replace(kept, attempts=kept.attempts + 1)
-    passed = row.attempts if said.members["verdict"] == PASSED and not row.passed else row.passed
+    passed = row.attempts if said.members.get("verdict") == PASSED and not row.passed else row.passed
     tables.put_unit(replace(row, passed=passed))
 
 

@@ -100,6 +100,7 @@ def sign(
     sequence: int | None = None,
     keep_draft: bool = False,
     profile: str | None = None,
+    unit: tuple[str, int] | None = None,
 ) -> Signed:
     """Sign ``image`` for key epoch ``epoch``.
 
@@ -107,7 +108,8 @@ def sign(
     TEDS and ``earlier`` those that were signed but perhaps never written: where one says exactly the same by the same
     signer, it is given back. ``sequence`` forces one (steps over more than 65536). ``keep_draft``: the signed image is
     kept, with its ``profile``, until it is written. The new sequence is durable in the store before the signature is
-    given to anyone: one that was lost with its process was never seen, and its number may be used again.
+    given to anyone: one that was lost with its process was never seen, and its number may be used again. ``unit``: the
+    job and the unit that an office signs for, which its pages say too.
     """
     _require_whole(image)
     if sequence is None:
@@ -137,7 +139,8 @@ def sign(
         if keep_draft:
             station.nodes.keep_draft(Draft(keys.uuid, made, "signed", profile))
         digest = hashlib.sha256(made.blocks[SECURITY]).hexdigest()
-        station.plant.tell("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest)
+        of_unit = {} if unit is None else dict(zip(("job", "unit"), unit, strict=True))
+        station.plant.tell("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest, **of_unit)
         station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
     return Signed(made, number, reused=False)
 

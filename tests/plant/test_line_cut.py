@@ -19,16 +19,20 @@ from teds_provision.errors import PolicyRefused, StoreFailure
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
-from teds_provision.plant.office import answer
+from teds_provision.plant.office import MOST_ANSWERS, answer
 from teds_provision.plant.sync import sync
+from teds_provision.protocol.keys import node_key_message
 from teds_provision.protocol.plant import evidence as codec
+from teds_provision.protocol.plant.signing import Answer, SignRequest, open_answer, seal_request
 from teds_provision.station.station import Station
 from teds_provision.store.connection import Connection
+from teds_provision.teds.image import Image
+from tests.bench import Board
 
 from .owner import alone, job_of
 from .stations import Plant, ask
 from .test_jobs import board, build, units
-from .test_office import AtHand
+from .test_office import AtHand, proven
 
 Homes = dict[str, Station]
 
@@ -242,3 +246,59 @@ def test_an_office_out_of_an_old_backup_answers_nobody_before_it_knows_its_pages
     plant.sync(plant.north)
     assert answer(plant.north, b"") is None
     plant.north.close()
+
+
+def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gave_since(tmp_path: Path) -> None:
+    """Its own pages name job and unit of what it signed: the job allows no board more, a unit no further answers."""
+    plant = Plant(tmp_path)
+    west, north = plant.member("west", "line"), plant.north
+    north.unlock()
+    west.unlock()
+    own = {"stations": {west.fingerprint: 2}, "count": 2, "sign": north.fingerprint}
+    document = job_of(north, registry=plant.roster.registry, **own)
+    take_job(north, document)
+    job = take_job(west, document)
+    plant.round()
+    north.close()
+    shutil.copytree(tmp_path / "north", tmp_path / "backup")
+    with opened(tmp_path, "north") as homes:
+        hand = AtHand(homes["north"])
+        run = LineRun(west, job, office=hand)
+        one, two = board(1), board(2)
+        build(run, one)
+        build(run, two)
+        first = hand.asked[0]
+        for number in range(MOST_ANSWERS - 2):
+            again = proven(first, west, one, nonce=number.to_bytes(16, "big"))
+            assert answered(homes["north"], west, again).security
+        sync(homes["north"], FilesPost(plant.stick))
+    with opened(tmp_path, "backup") as homes:
+        back = homes["backup"]
+        back.plant.begin_restored()
+        sync(back, FilesPost(plant.stick))
+        rows = back.plant.line.units(job.id)
+        assert [(row.uuid, row.unit, row.attempts) for row in rows] == [
+            (one.uuid, 1, MOST_ANSWERS - 1),
+            (two.uuid, 2, 1),
+        ]
+        assert answered(back, west, a_request_for(board(3), first, west)).refused == "full"
+        twin = Board(uuid=one.uuid)
+        assert answered(back, west, a_request_for(twin, first, west)).refused == "other-key"
+        last = proven(first, west, one, nonce=b"\xfe" * 16)
+        assert answered(back, west, last).sequence == MOST_ANSWERS, "no sequence says two things"
+        assert answered(back, west, proven(first, west, one, nonce=b"\xff" * 16)).refused == "full"
+    west.close()
+
+
+def answered(office: Station, line: Station, request: SignRequest) -> Answer:
+    """What an office says to a request that a line station signs as it stands."""
+    octets = answer(office, seal_request(request, line.credentials().key))
+    assert octets is not None
+    return open_answer(octets, lambda kid: office.point)
+
+
+def a_request_for(other: Board, request: SignRequest, line: Station) -> SignRequest:
+    """The same for another board that lies there too."""
+    signed = other.key.sign(node_key_message(other.uuid, other.key.point))
+    image = Image(other.uuid, request.image.blocks)
+    return proven(request, line, other, image=image, point=other.key.point, key_signature=signed)

@@ -83,6 +83,9 @@ FORMS: Final[dict[str, dict[str, _Form]]] = {
 }  # fmt: skip
 """The members of each act, beside ``act``, ``id``, ``at`` and ``uuid``."""
 
+OF_UNIT: Final[dict[str, _Form]] = {"job": _random_id, "unit": is_number}
+"""What an office adds to a ``signed`` event: the unit that it signed for. Readers of others pass over both."""
+
 WITHOUT_NODE: Final = frozenset({"lifted", "closed", "alarm"})
 """Acts that are about no node."""
 
@@ -102,9 +105,11 @@ def made(act: str, id: str, at: str, uuid: bytes | None, members: Mapping[str, A
     event: dict[str, Any] = {"act": act, "id": id, "at": at}
     if uuid is not None:
         event["uuid"] = uuid.hex()
-    event |= {name: members[name] for name in FORMS[act]}
-    if isinstance(read(event), str) or len(members) != len(FORMS[act]):
-        raise ValueError(f"{act} is not of its form: {read(event)}")
+    named = [*FORMS[act], *(OF_UNIT if act == "signed" and "job" in members else ())]
+    event |= {name: members[name] for name in named}
+    found = read(event)
+    if not isinstance(found, Event) or len(members) != len(named):
+        raise ValueError(f"{act} is not of its form: {found}")
     return event
 
 
@@ -133,6 +138,18 @@ def read(value: object) -> Event | str | None:
         if len(octets) > (MOST_OCTETS_OF_REVOKED if act == "revoked" else MOST_OCTETS):
             return f"{act}: larger than an event may be"
     return Event(act, value["id"], value["at"], node, value)
+
+
+def unit_of(event: Event) -> tuple[str, int] | None:
+    """The job and the unit that an ``evidence`` event, or a ``signed`` one of an office, is about; None for none."""
+    job, unit = event.members.get("job"), event.members.get("unit")
+    if (
+        event.act not in ("evidence", "signed")
+        or not unit
+        or not all(holds(event.members[name]) for name, holds in OF_UNIT.items())
+    ):
+        return None
+    return str(job), int(unit)
 
 
 def statement_of(event: Event, point_of: Callable[[str], bytes | None]) -> Revocation | None:
