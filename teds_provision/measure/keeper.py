@@ -240,10 +240,12 @@ class NodeKeeper:
             self._in_session(self.bus, sighting)
         except NoRoom:
             raise
-        except BaseException:
+        except BaseException as error:
             self._lost_at = time.monotonic()
             self._buses.sightings.let_announce(self.uuid)
-            self._buses.sightings.wrong(sighting)
+            # Under its key it said what it is refused for: it is there, and another measurement may want it now.
+            if not (self._proven and isinstance(error, (NotAuthentic, PolicyRefused, BadData))):
+                self._buses.sightings.wrong(sighting)
             raise
 
     def _in_session(self, bus: Bus, sighting: Sighting) -> None:

@@ -189,7 +189,11 @@ class Daemon:
 
     def serve_node(self, node: Conversation) -> bool:
         """Whether somebody asked for this node, or it is to be taken up; then that was done."""
-        return self.desk.serve(node) or self.adopting.serve(node)
+        before = node.identity.state
+        served = self.desk.serve(node) or self.adopting.serve(node)
+        if served or node.identity.state != before:  # what a measurement refused it for may be gone
+            self.measuring.look_who_is_meant()
+        return served
 
     @property
     def _adopts(self) -> bool:

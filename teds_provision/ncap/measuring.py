@@ -161,7 +161,7 @@ class Measuring:
             newcomers.saw(uuid)
 
     def look_who_is_meant(self) -> None:
-        """What an expression may name was changed by this process: a group, the detection mode."""
+        """Who may be measured, or what an expression names, changed in this process: a group, a key, a datasheet."""
         with self._guard:
             every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
         for newcomers in every:

@@ -309,6 +309,8 @@ class Newcomers:
             self._waits[uuid] = _Waits(now + AGAIN, self._buses.of(sighting).share.room)
         elif isinstance(error, (NotAuthentic, PolicyRefused, BadData)):
             self._waits[uuid] = _Waits(now + AGAIN)
+            if last is not None and last.identity.state == NodeState.FACTORY:  # whoever adopts hears it, now it is free
+                self._askers.submit(self._ask, last)
         elif error is not None and sighting is not None and sighting is not last:  # it was seen elsewhere meanwhile
             self.saw(uuid)
         elif error is not None and last is not None:

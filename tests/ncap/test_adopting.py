@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError
+from teds_provision.ncap.newcomers import AGAIN
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds.image import BlockId
 from tests.e2e.desk import Desk, Node
@@ -175,7 +176,7 @@ def test_one_that_is_adopted_by_a_command_beside_goes_on_as_what_is_trusted(desk
     with service.client() as asked:
         until(lambda: known(service, node) and asked.node(node.uuid)["measurement"] == "unverified")
         service.station.ask("provision", node.uuid, "--adopt", "--yes", *desk.links.over("can"))
-        until(lambda: asked.node(node.uuid)["measurement"] in ("run", "adopted"))
+        until(lambda: asked.node(node.uuid)["measurement"] in ("run", "adopted"), seconds=AGAIN)
         until(lambda: flowing(asked.node(node.uuid)))
     left = [one for one in events(service, "measurement", node.uuid) if one["state"] == "left"]
     assert left[0]["id"] == "unverified"
@@ -190,8 +191,9 @@ def test_one_that_is_reset_while_it_is_measured_is_taken_up_again(desk: Desk) ->
         node.press()
         asked.discover()
         seen = functools.partial(events, service, "node", node.uuid)
-        until(lambda: asked.node(node.uuid)["epoch"] == 2, lambda: (seen(), service.process and service.process.err))
-        until(lambda: asked.node(node.uuid)["measurement"] == "unverified")
+        why = lambda: (seen(), service.process and service.process.err)  # noqa: E731
+        until(lambda: asked.node(node.uuid)["epoch"] == 2, why, seconds=AGAIN)
+        until(lambda: asked.node(node.uuid)["measurement"] == "unverified", why, seconds=AGAIN)
         until(lambda: flowing(asked.node(node.uuid)))
     service.end()
 

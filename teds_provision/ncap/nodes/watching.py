@@ -28,6 +28,7 @@ from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look, read_anew
 from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 
@@ -388,8 +389,10 @@ class Watch:
             with self._turns.of(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
                 if not self._taps.serve_node(node):
                     self._look(node)
-        except Frozen:
-            return  # its measurement verified it, and says how it does
+        except Frozen:  # its measurement verified it, and says how it does
+            if contact.identity.state == NodeState.FACTORY:  # so it may be let go: who adopts looks at it then
+                self._looked_for.add(uuid)
+            return
         except NodeBusy as error:
             self._roster.note(uuid, problem=as_problem(error))
         except SessionLost as lost:
