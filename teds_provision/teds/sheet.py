@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final
 
 from teds_provision.errors import BadData
@@ -141,6 +142,11 @@ def node_name(decoded: Decoded | None) -> str:
     return name if isinstance(name, str) and name.isprintable() else ""
 
 
+_SHORT: Final = 4096
+_decoded = lru_cache(maxsize=32)(decode)
+"""Boards of a type share most of their TEDS, and each one is looked at when it is built, written and read back."""
+
+
 class _Reader:
     """Reads the TEDS of one node, each decoded once."""
 
@@ -156,7 +162,7 @@ class _Reader:
             octets = self.blocks.get(key)
             if octets is None:
                 return None
-            self.seen[key] = decode(octets)
+            self.seen[key] = _decoded(octets) if len(octets) <= _SHORT else decode(octets)
         return self.seen[key]
 
     def name(self, channel: int) -> str:
