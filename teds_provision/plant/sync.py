@@ -28,6 +28,7 @@ from teds_provision.plant.folding import (
 from teds_provision.plant.post import Carried, Post
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import NewerFormat, hash_of
 from teds_provision.protocol.plant.evidence import PASSED
 from teds_provision.protocol.plant.fold import View
@@ -35,7 +36,7 @@ from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Draft,
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant import new_home
 from teds_provision.station.station import Station
-from teds_provision.store import StoreLock, UnitRow, utc_now
+from teds_provision.store import StoreLock, UnitRow, WhitelistEntry, utc_now
 from teds_provision.store.tables.plant import Chain
 
 LOCK_FILE: Final = "registry.lock"
@@ -216,6 +217,15 @@ def _know_again(station: Station, page: Page) -> None:
             station.nodes.remember(uuid, epoch=max(node.epoch, epoch), sequence=max(node.sequence, sequence))
         elif uuid in signed:  # no sequence says two things, be the board unknown here
             station.nodes.remember(uuid, sequence=sequence)
+    _pin_again(station, sorted(signed))
+
+
+def _pin_again(station: Station, uuids: Sequence[bytes]) -> None:
+    """Pin boards that this station signed for under the key that it said itself: no other board gets their units."""
+    for uuid, text in station.plant.tables.claims_of_chain(own_chain(station).chain, uuids).items():
+        pin = Claim.from_json(text).pin
+        if pin is not None and station.pins.entry(uuid) is None:
+            station.pins.put(WhitelistEntry(uuid, pin[0], assurance=pin[1]))  # type: ignore[arg-type]
 
 
 def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit: int) -> None:

@@ -251,18 +251,17 @@ def test_an_office_out_of_an_old_backup_answers_nobody_before_it_knows_its_pages
 def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gave_since(tmp_path: Path) -> None:
     """Its own pages name job and unit of what it signed: the job allows no board more, a unit no further answers."""
     plant = Plant(tmp_path)
-    west, north = plant.member("west", "line"), plant.north
-    north.unlock()
+    west, office = plant.member("west", "line"), plant.member("office", "sign")
     west.unlock()
-    own = {"stations": {west.fingerprint: 2}, "count": 2, "sign": north.fingerprint}
-    document = job_of(north, registry=plant.roster.registry, **own)
-    take_job(north, document)
-    job = take_job(west, document)
+    own = {"stations": {west.fingerprint: 2}, "count": 2, "sign": office.fingerprint}
+    document = job_of(plant.north, registry=plant.roster.registry, **own)
     plant.round()
-    north.close()
-    shutil.copytree(tmp_path / "north", tmp_path / "backup")
-    with opened(tmp_path, "north") as homes:
-        hand = AtHand(homes["north"])
+    take_job(office, document)
+    job = take_job(west, document)
+    office.close()
+    shutil.copytree(tmp_path / "office", tmp_path / "backup")
+    with opened(tmp_path, "office") as homes:
+        hand = AtHand(homes["office"])
         run = LineRun(west, job, office=hand)
         one, two = board(1), board(2)
         build(run, one)
@@ -270,8 +269,8 @@ def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gav
         first = hand.asked[0]
         for number in range(MOST_ANSWERS - 2):
             again = proven(first, west, one, nonce=number.to_bytes(16, "big"))
-            assert answered(homes["north"], west, again).security
-        sync(homes["north"], FilesPost(plant.stick))
+            assert answered(homes["office"], west, again).security
+        sync(homes["office"], FilesPost(plant.stick))
     with opened(tmp_path, "backup") as homes:
         back = homes["backup"]
         back.plant.begin_restored()
@@ -287,7 +286,7 @@ def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gav
         last = proven(first, west, one, nonce=b"\xfe" * 16)
         assert answered(back, west, last).sequence == MOST_ANSWERS, "no sequence says two things"
         assert answered(back, west, proven(first, west, one, nonce=b"\xff" * 16)).refused == "full"
-    west.close()
+    plant.close()
 
 
 def answered(office: Station, line: Station, request: SignRequest) -> Answer:
