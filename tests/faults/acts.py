@@ -37,6 +37,10 @@ class Act:
 NO_SHEET = (0, 4)
 _JOB = ("job", "new", "--title", "one", "--profile", ANGLE, "--station", "bench", "--count", "1")
 _JOB += ("--ends", "2099-01-01", "--output", "{FILES}/job.jws")
+_BY_OFFICE = ("job", "new", "--title", "one", "--profile", ANGLE, "--station", "lab", "--count", "1", "--sign", "bench")
+_BY_OFFICE += ("--ends", "2099-01-01", "--output", "{FILES}/job.jws")
+_STICK = ("--files", "{FILES}/stick")
+_ASKED = ("sign", "{UUID}", "--by", "bench", "--job", "{JOB}", "--output", "{FILES}/request.jws", "TAP")
 TAKEN_UP = '"verified"'
 ACTS = (
     Act("whitelist add", "new", ("whitelist", "add", "{UUID}"), node=False, proof=""),
@@ -102,6 +106,23 @@ ACTS = (
     Act("registry sync", "founded", ("registry", "sync", "--files", "{FILES}/stick"), node=False),
     Act("job new", "founded", _JOB, node=False),
     Act("provision --job", "ordered", ("provision", "--job", "{FILES}/job.jws", "--yes", "TAP")),
+    Act("job send", "line", ("job", "send", "{JOB}", *_STICK), node=False, proof=""),
+    Act("job close", "ordered", ("job", "close", "{JOB}"), node=False, proof=""),
+    Act("sign --by", "at the line", _ASKED, home="lab", proof="lab", verdicts=NO_SHEET),
+    Act(
+        "signer once",
+        "requested",
+        ("signer", "once", "{FILES}/request.jws", "--output", "{FILES}/signed.json"),
+        node=False,
+        proof="",
+    ),
+    Act(
+        "write signed",
+        "answered",
+        ("write", "{UUID}", "--image", "{FILES}/signed.json", "LINK"),
+        home="lab",
+        proof="lab",
+    ),
     Act("evidence export", "proven", ("evidence", "export", "{FILES}/proof"), node=False),
     Act("measure", "measured", ("measure", "hand", "--duration", "0.5", "--to", "{FILES}/run.csv", "LINK")),
     Act("zero", "calibrated", ("calibrate", "zero", "{UUID}", "1", "--value", "0.5", "LINK")),
@@ -166,6 +187,33 @@ NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
     "plant": ("new", (("home", ("registry", "create", "--name", "plant", "--yes")),)),
     "ordered": ("plant", (("home", _JOB),)),
     "proven": ("ordered", (("home", ("provision", "--job", "{FILES}/job.jws", "--yes", "TAP")),)),
+    "line": (
+        "plant",
+        (
+            ("lab", ("init", "--name", "lab", "--keystore", "file", "--request", "{FILES}/lab.request")),
+            ("home", ("trust", "ca", "sign", "{FILES}/lab.request", "--output", "{FILES}/lab.cert", "--yes")),
+            ("lab", ("init", "--certificate", "{FILES}/lab.cert", "--yes")),
+            ("lab", ("registry", "request", "--output", "{FILES}/lab.member")),
+            ("home", ("registry", "add", "{FILES}/lab.member", "--role", "line", "--yes")),
+            ("home", ("registry", "sync", *_STICK)),
+            ("lab", ("registry", "connect", *_STICK, "--yes")),
+            ("home", _BY_OFFICE),
+        ),
+    ),
+    "at the line": (
+        "line",
+        (
+            ("lab", ("job", "show", "{FILES}/job.jws")),
+            ("lab", ("identify", "--add", "TAP")),
+            ("lab", ("agree", "{UUID}", "TAP")),
+            ("lab", ("build", "{UUID}", "--profile", ANGLE)),
+        ),
+    ),
+    "requested": ("at the line", (("lab", _ASKED),)),
+    "answered": (
+        "requested",
+        (("home", ("signer", "once", "{FILES}/request.jws", "--output", "{FILES}/signed.json")),),
+    ),
     "strangers": ("provisioned", (("other", ("trust", "add", "bench", "{FILES}/bench.pem", "--yes")),)),
     "pair": ("strangers", (("home", ("trust", "add", "crane", "{FILES}/crane.pem", "--yes")),)),
     "bundled": (

@@ -74,9 +74,9 @@ class Desk:
     def words(self, words: tuple[str, ...]) -> list[str]:
         """A command line with the places of this desk put in."""
         files = self.folder / "files"
-        bundle = files / "bundle.id"
+        bundle, job = files / "bundle.id", files / "job.id"
         places = {"FILES": str(files), "UUID": UUID, "ID": bundle.read_text() if bundle.exists() else ""}
-        places |= {"FD": str(FIRST_FD + 1), "OTHER": "77" * 10}
+        places |= {"FD": str(FIRST_FD + 1), "OTHER": "77" * 10, "JOB": job.read_text() if job.exists() else ""}
         result: list[str] = []
         for word in words:
             if word == "LINK":
@@ -185,8 +185,9 @@ class States:
             for station, words in steps:
                 done = desk.run(*words, home=station, seconds=900)
                 assert done.returncode == 0, f"{name}: {words}: {done.stdout}{done.stderr}"
-                if words[0] == "export-keys":
-                    (made / "files" / "bundle.id").write_text(json.loads(done.stdout)["id"])
+                for what, kept in (("export-keys", "bundle.id"), ("job new", "job.id")):
+                    if " ".join(words).startswith(what):
+                        (made / "files" / kept).write_text(json.loads(done.stdout)["id"])
         if name == "many":
             fill(made / "home", MANY)
         if name == "many behind":  # what came since is gone again: the store is as it was before the many
