@@ -7,6 +7,7 @@
 #define HEAD 6u
 #define LEAST_MTU 23u
 #define MOST_VALUE 512u
+#define DATA_HEAD 4u /* ATT's three octets, and the stream */
 #define STRANGER_NS (10u * TEDS_SECOND)
 #define TAPPED_NS (60u * TEDS_SECOND)
 
@@ -124,6 +125,46 @@ size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[MOST_VAL
     }
     return HEAD + room;
 }
+
+#if TEDS_OPERATION
+uint16_t teds_ble_longest(const teds_node *node, teds_link link)
+{
+    const size_t connection = link - (size_t)TEDS_LINK_BLE;
+    const teds_ble_line *line;
+    if (connection >= TEDS_BLE_CONNECTIONS) {
+        return 0;
+    }
+    line = &node->ble.lines[connection];
+    return line->used && line->hears ? (uint16_t)(line->mtu - DATA_HEAD) : 0;
+}
+
+void teds_ble_hears(teds_node *node, uint8_t connection, bool hears)
+{
+    teds_ble_line *line = line_of(node, connection);
+    const int8_t session = line != NULL ? teds_session_on(node, link_of(connection)) : -1;
+    if (line != NULL) {
+        line->hears = hears;
+    }
+    if (session >= 0 && !hears) {
+        teds_streams_end(node, session, UINT32_MAX);
+    }
+}
+
+size_t teds_ble_data(teds_node *node, uint8_t *connection, uint8_t out[TEDS_BLE_DATA])
+{
+    teds_link link = TEDS_LINK_BLE;
+    size_t length = teds_data_notify(node, &link, out, teds_now(node));
+    *connection = (uint8_t)(link - TEDS_LINK_BLE);
+    return length;
+}
+
+void teds_ble_driven(teds_node *node, uint8_t connection, const uint8_t *value, size_t length)
+{
+    if (line_of(node, connection) != NULL && length > 0 && value[0] == 0) {
+        teds_drive_message(node, link_of(connection), value + 1, length - 1);
+    }
+}
+#endif
 
 void teds_ble_tapped(teds_node *node)
 {

@@ -118,6 +118,21 @@ static size_t fd_length(size_t octets)
     return frame.length;
 }
 
+void teds_drive_message(teds_node *node, teds_link link, const uint8_t *octets, size_t length)
+{
+    int8_t number = teds_session_on(node, link);
+    teds_session *session;
+    if (number < 0) {
+        return;
+    }
+    (void)teds_operation_poll(node, teds_now(node)); /* a dead-man that ran out before this message is over */
+    session = &node->sessions[number];
+    if (session->drive.used && length == length_of(session)) {
+        memcpy(session->drive.message, octets, length);
+        message(node, session);
+    }
+}
+
 void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, size_t length)
 {
     int8_t number = teds_session_on(node, link);

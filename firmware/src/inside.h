@@ -225,6 +225,8 @@ void teds_nfc_poll(teds_node *node);
 #if TEDS_BLE
 bool teds_ble_sends(const teds_node *node, int8_t place);
 void teds_ble_forget(teds_node *node, int8_t place);
+/* Octets of the longest data message of a connection; 0: its station does not hear them. */
+uint16_t teds_ble_longest(const teds_node *node, teds_link link);
 #endif
 
 /* -- operation.c, stream.c ----------------------------------------------------------------------------------------- */
@@ -251,6 +253,7 @@ int teds_run_key(const teds_node *node, const teds_session *session, const char 
 
 int teds_drive(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
 void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, size_t length);
+void teds_drive_message(teds_node *node, teds_link link, const uint8_t *octets, size_t length);
 void teds_drive_end(teds_node *node, int8_t session, uint32_t places);
 
 int teds_subscribe(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
@@ -263,6 +266,8 @@ void teds_streams_end(teds_node *node, int8_t session, uint32_t places);
 void teds_streams_ready(teds_node *node, int8_t session);
 bool teds_streams_running(const teds_node *node);
 bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now);
+/* A data message over BLE: stream, message; 0: none may leave now. */
+size_t teds_data_notify(teds_node *node, teds_link *link, uint8_t *out, uint64_t now);
 uint64_t teds_data_due(const teds_node *node);
 #endif
 

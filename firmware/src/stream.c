@@ -29,10 +29,11 @@ static uint64_t span(const teds_stream *stream)
     return stream->n * stream->period;
 }
 
-static uint64_t frames(uint32_t length, bool fd)
+/* A message is one notification on BLE. */
+static uint64_t frames(uint32_t length, bool fd, bool ble)
 {
     uint32_t room = fd ? 64 : 8;
-    return (length + room - 1) / room;
+    return ble ? 1 : (length + room - 1) / room;
 }
 
 static uint64_t share(uint64_t count, uint64_t gap, uint64_t instants)
@@ -152,23 +153,28 @@ static int check_period(const teds_node *node, const asked *in)
     return in->period < shortest || in->period > LONGEST_PERIOD ? -TEDS_OUT_OF_RANGE : 0;
 }
 
+static bool on_bus(const teds_stream *stream, bool ble)
+{
+    return stream->used && stream->ble == ble;
+}
+
 /* The node's budget on the bus, with one more stream in place of `old`. */
-static int check_budget(const teds_node *node, const asked *in, uint32_t length, bool fd, const teds_stream *old)
+static int check_budget(const teds_node *node, const asked *in, uint64_t count, bool ble, const teds_stream *old)
 {
     uint64_t gap = in->gap > 0 ? in->gap : 1, sum = 0;
     for (size_t i = 0; i < TEDS_STREAMS; i++) {
         const teds_stream *each = &node->streams[i];
-        if (each->used && each != old && each->gap > gap) {
+        if (on_bus(each, ble) && each != old && each->gap > gap) {
             gap = each->gap;
         }
     }
     for (size_t i = 0; i < TEDS_STREAMS; i++) {
         const teds_stream *each = &node->streams[i];
-        if (each->used && each != old) {
-            sum += share(frames(each->length, each->fd), gap, span(each));
+        if (on_bus(each, ble) && each != old) {
+            sum += share(frames(each->length, each->fd, ble), gap, span(each));
         }
     }
-    sum += share(frames(length, fd), gap, in->n * in->period);
+    sum += share(count, gap, in->n * in->period);
     return sum > MILLION ? -TEDS_DOES_NOT_FIT : 0;
 }
 
@@ -205,21 +211,40 @@ int teds_run_key(const teds_node *node, const teds_session *session, const char 
     return teds_hkdf_expand(node, session->keys.messages, info, 2, out, 16);
 }
 
+/* Octets of the longest message that this link takes; 0: its station has not enabled them. */
+static uint32_t longest(const teds_node *node, const teds_origin *origin)
+{
+#if TEDS_BLE
+    if (origin->arrival->kind == TEDS_AT_BLE) {
+        const uint32_t most = teds_ble_longest(node, origin->link);
+        return most < TEDS_MESSAGE ? most : TEDS_MESSAGE;
+    }
+#else
+    (void)node;
+    (void)origin;
+#endif
+    return TEDS_MESSAGE;
+}
+
 int teds_subscribe(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
 {
     teds_session *session = &node->sessions[origin->session];
-    const bool fd = origin->arrival->fd && TEDS_CAN_FD;
+    const bool fd = origin->arrival->fd && TEDS_CAN_FD, ble = origin->arrival->kind == TEDS_AT_BLE;
     uint64_t now = teds_now(node);
     teds_stream *old, *stream;
     uint8_t key[16];
-    uint32_t length;
+    uint32_t length, most;
     asked in;
     int refused = read_asked(command, &in);
     if (refused) {
         return refused;
     }
-    if (origin->arrival->kind != TEDS_CAN) {
+    if (origin->arrival->kind == TEDS_AT_NFC) {
         return -TEDS_DOES_NOT_FIT;
+    }
+    most = longest(node, origin);
+    if (most == 0) {
+        return -TEDS_WRONG_STATE;
     }
     refused = check_channels(node, command, origin, &in);
     if (!refused) {
@@ -229,11 +254,11 @@ int teds_subscribe(teds_node *node, const teds_command *command, const teds_orig
         return refused;
     }
     length = 13u + (uint32_t)in.n * in.octets + (in.kind == PERIODIC ? 0 : 8);
-    if (length > TEDS_MESSAGE) {
+    if (length > most) {
         return -TEDS_TOO_LARGE;
     }
     old = find(node, origin->session, in.stream);
-    refused = check_budget(node, &in, length, fd, old);
+    refused = check_budget(node, &in, frames(length, fd, ble), ble, old);
     if (!refused) {
         refused = check_start(&in, origin, now);
     }
@@ -262,6 +287,7 @@ int teds_subscribe(teds_node *node, const teds_command *command, const teds_orig
     stream->octets = in.octets;
     stream->gap = in.gap;
     stream->fd = fd;
+    stream->ble = ble;
     stream->run = session->run;
     stream->length = (uint16_t)length;
     stream->period = in.period;
@@ -352,6 +378,19 @@ static uint64_t next_instant(const teds_stream *stream)
     return stream->start + ((uint64_t)stream->counter * stream->n + stream->held) * stream->period;
 }
 
+/* Whether the next data message of a bus may begin. */
+static bool is_free(const teds_node *node, bool ble, uint64_t now)
+{
+#if TEDS_BLE
+    if (ble) {
+        return now >= node->ble.data_free_at;
+    }
+#else
+    (void)ble;
+#endif
+    return node->can.data_stream < 0 && now >= node->can.data_free_at;
+}
+
 static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
 {
     uint64_t due;
@@ -364,8 +403,7 @@ static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
             full(stream);
             continue;
         }
-        if (stream->full && stream->ready && stream->held + 1u == stream->n && node->can.data_stream < 0 &&
-            now >= node->can.data_free_at) {
+        if (stream->full && stream->ready && stream->held + 1u == stream->n && is_free(node, stream->ble, now)) {
             return; /* a late loop, not a slow bus: the one that waits leaves first, and the loop comes back at once */
         }
         if (stream->held == 0 && now - due >= 2 * span(stream) + ASLEEP_NS && stream->counter < UINT32_MAX) {
@@ -456,12 +494,12 @@ uint64_t teds_streams_due(const teds_node *node)
 /* -- data messages ------------------------------------------------------------------------------------------------------------ */
 
 /* Of messages that wait, the one of the smaller n * period goes next; -1: none. */
-static int8_t choice(const teds_node *node)
+static int8_t choice(const teds_node *node, bool ble)
 {
     int8_t chosen = -1;
     for (int8_t i = 0; i < TEDS_STREAMS; i++) {
         const teds_stream *each = &node->streams[i];
-        if (each->used && each->ready && each->full && (chosen < 0 || span(each) < span(&node->streams[chosen]))) {
+        if (on_bus(each, ble) && each->ready && each->full && (chosen < 0 || span(each) < span(&node->streams[chosen]))) {
             chosen = i;
         }
     }
@@ -470,44 +508,72 @@ static int8_t choice(const teds_node *node)
 
 uint64_t teds_data_due(const teds_node *node)
 {
-    return node->can.data_stream >= 0 || choice(node) >= 0 ? node->can.data_free_at : TEDS_NEVER;
+    uint64_t due = node->can.data_stream >= 0 || choice(node, false) >= 0 ? node->can.data_free_at : TEDS_NEVER;
+#if TEDS_BLE
+    if (choice(node, true) >= 0 && node->ble.data_free_at < due) {
+        due = node->ble.data_free_at;
+    }
+#endif
+    return due;
+}
+
+/* Take the message that waits, sealed. */
+static bool seal(const teds_node *node, teds_stream *stream, uint8_t *out)
+{
+    uint8_t nonce[13] = {0};
+    stream->full = false;
+    teds_put32(out, stream->full_counter);
+    teds_put32(nonce + 9, stream->full_counter);
+    out[4] = stream->full_flags;
+    memcpy(out + 5, stream->waiting, stream->length - 13u);
+    if (node->port->ccm_seal(node->port->user, stream->key, nonce, out + 4, stream->length - 12u, out + 4, 8) != 0) {
+        stream->missed++;
+        return false;
+    }
+    return true;
 }
 
 static bool begin(teds_node *node)
 {
     teds_can *can = &node->can;
-    int8_t chosen = choice(node);
-    uint8_t nonce[13] = {0};
-    teds_stream *stream;
-    if (chosen < 0) {
-        return false;
-    }
-    stream = &node->streams[chosen];
-    stream->full = false;
-    teds_put32(can->data, stream->full_counter);
-    teds_put32(nonce + 9, stream->full_counter);
-    can->data[4] = stream->full_flags;
-    memcpy(can->data + 5, stream->waiting, stream->length - 13u);
-    if (node->port->ccm_seal(node->port->user, stream->key, nonce, can->data + 4, stream->length - 12u, can->data + 4,
-                             8) != 0) {
-        stream->missed++;
+    int8_t chosen = choice(node, false);
+    if (chosen < 0 || !seal(node, &node->streams[chosen], can->data)) {
         return false;
     }
     can->data_stream = chosen;
     can->data_at = 0;
-    can->data_length = stream->length;
+    can->data_length = node->streams[chosen].length;
     can->data_segment = 0;
     return true;
 }
 
-static uint64_t gap_of_bus(const teds_node *node)
+static uint64_t gap_of_bus(const teds_node *node, bool ble)
 {
     uint64_t gap = 1;
     for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        gap = node->streams[i].used && node->streams[i].gap > gap ? node->streams[i].gap : gap;
+        gap = on_bus(&node->streams[i], ble) && node->streams[i].gap > gap ? node->streams[i].gap : gap;
     }
     return gap * MICRO;
 }
+
+#if TEDS_BLE
+size_t teds_data_notify(teds_node *node, teds_link *link, uint8_t *out, uint64_t now)
+{
+    const int8_t chosen = choice(node, true);
+    teds_stream *stream;
+    if (chosen < 0 || !is_free(node, true, now)) {
+        return 0;
+    }
+    stream = &node->streams[chosen];
+    if (!seal(node, stream, out + 1)) {
+        return 0;
+    }
+    out[0] = stream->number;
+    *link = node->sessions[stream->session].link;
+    node->ble.data_free_at = now + gap_of_bus(node, true);
+    return 1u + stream->length;
+}
+#endif
 
 bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now)
 {
@@ -529,7 +595,7 @@ bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now)
     if (stream->fd && octets > 8) {
         teds_can_pad(frame, octets);
     }
-    can->data_free_at = now + gap_of_bus(node);
+    can->data_free_at = now + gap_of_bus(node, false);
     can->data_at = (uint16_t)(can->data_at + octets);
     can->data_segment = (uint8_t)(can->data_segment % 7 + 1);
     if (can->data_at == can->data_length) {

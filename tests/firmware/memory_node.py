@@ -31,7 +31,7 @@ def _library(path: Path) -> Any:
     library.memory_dead.restype = library.memory_misused.restype = library.memory_nfc_written.restype = ctypes.c_bool
     library.memory_ble_advertises.restype = library.memory_ble_drops.restype = ctypes.c_bool
     library.memory_in_session.restype = ctypes.c_bool
-    library.memory_ble_notify.restype = ctypes.c_size_t
+    library.memory_ble_notify.restype = library.memory_ble_data.restype = ctypes.c_size_t
     library.memory_nfc_message.restype = library.memory_nfc_frame.restype = ctypes.c_size_t
     return library
 
@@ -262,6 +262,23 @@ class MemoryNode:
             notified.append(out.raw[:length])
         self.poll()
         return notified
+
+    def ble_hears(self, connection: int, hears: bool) -> None:
+        """A station enables data messages, or disables them."""
+        self._now()
+        self._library.memory_ble_hears(self._board, ctypes.c_uint8(connection), ctypes.c_bool(hears))
+
+    def ble_data(self) -> tuple[int, bytes] | None:
+        """The next data message that may leave now: its connection and the notification."""
+        self._now()
+        connection, out = ctypes.c_uint8(), ctypes.create_string_buffer(241)
+        length = self._library.memory_ble_data(self._board, ctypes.byref(connection), out)
+        return (connection.value, out.raw[:length]) if length else None
+
+    def ble_driven(self, connection: int, value: bytes) -> None:
+        """A station writes a Drive message."""
+        self._now()
+        self._library.memory_ble_driven(self._board, ctypes.c_uint8(connection), value, ctypes.c_size_t(len(value)))
 
     def ble_advertises(self) -> bool:
         """Whether it is to be found now."""

@@ -20,7 +20,7 @@ from teds_provision.protocol.messages.frames import Command, Function, decode_re
 from teds_provision.protocol.operation.can_frames import cut
 from teds_provision.protocol.operation.commands import Power
 from teds_provision.protocol.operation.datagram import Layout, Sealer, drive_key
-from teds_provision.protocol.operation.hardware import ChannelHardware, Reading
+from teds_provision.protocol.operation.hardware import ChannelHardware, Port, Reading, port_of
 from teds_provision.protocol.operation.stream_commands import Action, Driven
 from teds_provision.protocol.operation.timing import Token
 from teds_provision.protocol.session import StationSession
@@ -140,7 +140,7 @@ class Twins:
 
     def handle(self, frame: bytes, *, link: str, tapped: bool) -> bytes:
         self.hardware.tick += 7_000  # which of two is older is never a matter of taste
-        mine = self.py.handle(frame, link=link, tapped=tapped)
+        mine = self.py.handle(frame, link=link, tapped=tapped, port=self.port(link))
         theirs = self.c.handle(frame, link=link, tapped=tapped)
         if theirs != mine and frame[3:4] == b"\x04":
             print("C:", self.peek(link, theirs), "Python:", self.peek(link, mine))
@@ -150,6 +150,10 @@ class Twins:
         self.c.reply_left(link)
         self.frames()
         return mine
+
+    def port(self, link: str) -> Port:
+        """What the reference is told of a link."""
+        return port_of(link)
 
     def peek(self, link: str, reply: bytes) -> str:
         """What a sealed reply says, for whoever looks for a difference."""
@@ -209,6 +213,8 @@ class Twins:
 class Station:
     """Sense and nonsense from one seed."""
 
+    drivers: Sequence[str] = ("can:f1", "can:f2")
+
     def __init__(self, twins: Twins, seed: int) -> None:
         self.twins, self.dice = twins, random.Random(seed)
         self.key = b""
@@ -218,18 +224,18 @@ class Station:
         self.desk = Desk.__new__(Desk)
         self.desk.memory = twins.memory
 
-    def begin_measuring(self) -> None:
+    def begin_measuring(self, link: str = "can:f1") -> None:
         """A node that is provisioned, its channels claimed: where most moves are refused otherwise."""
         self.agree("nfc", good=True)
-        self.open("can:f1", good=True)
-        self.write("can:f1", good=True)
-        self.open("can:f1", good=True)
+        self.open(link, good=True)
+        self.write(link, good=True)
+        self.open(link, good=True)
         digest = Operation.digest(self.twins.flash)
-        assert self.sealed(Command(0, 4, 1, digest + b"\x3c"), "can:f1")[0]
+        assert self.sealed(Command(0, 4, 1, digest + b"\x3c"), link)[0]
         for channel in (7, 8):
-            assert self.sealed(Command(channel, 4, 1, digest + b"\x3c" + (5000).to_bytes(2, "big")), "can:f1")[0]
-        self.measure(security_command(Function.DRIVE, b"\x07\x08"), "can:f1")
-        assert "can:f1" in self.driven
+            assert self.sealed(Command(channel, 4, 1, digest + b"\x3c" + (5000).to_bytes(2, "big")), link)[0]
+        self.measure(security_command(Function.DRIVE, b"\x07\x08"), link)
+        assert link in self.driven
 
     # -- moves -----------------------------------------------------------------------------------------------------
 
@@ -392,7 +398,7 @@ class Station:
 
     def drive(self) -> None:
         """Messages in time and not, in order and not, whole and not."""
-        link = self.dice.choice(["can:f1", "can:f2"])
+        link = self.dice.choice(self.drivers)
         if link not in self.driven:
             return
         layout, sealer = self.driven[link]
@@ -403,7 +409,11 @@ class Station:
         message = bytearray(sealer.seal(self.counter, plain))
         if self.dice.random() < 0.1:
             message[-1] ^= 1
-        pieces = [piece.data for piece in cut(bytes(message), fd=False, drive=True)]
+        self.hand_over(link, bytes(message))
+
+    def hand_over(self, link: str, message: bytes) -> None:
+        """A Drive message in its frames."""
+        pieces = [piece.data for piece in cut(message, fd=False, drive=True)]
         if self.dice.random() < 0.2:
             self.dice.shuffle(pieces)
         for piece in pieces:

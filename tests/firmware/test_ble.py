@@ -13,9 +13,12 @@ import pytest
 
 from teds_provision.protocol.messages import ble
 from teds_provision.protocol.messages.frames import Command, Function, security_command
+from teds_provision.protocol.operation.can_frames import ble_frame
+from teds_provision.protocol.operation.hardware import Port, port_of
 from teds_provision.protocol.repetition import Repetition
 from tests.bench import make_station
 from tests.e2e.desk import ANGLE, Desk, Station
+from tests.firmware.test_beside_python import Station as Beside
 from tests.firmware.test_beside_python import Twins
 from tests.links.ble.conftest import air  # noqa: F401 - a fixture
 from tests.links.ble.radio import Radio, needs_dbus
@@ -105,6 +108,150 @@ def test_both_nodes_notify_the_same(mtu: int) -> None:
 
 
 MS_1 = 10**6
+
+
+class InTheAir(Twins):
+    """Both nodes with two connections beside the bus; data messages over either."""
+
+    def __init__(self, seed: int, mtu: int) -> None:
+        self.mtu, self.hears, self.notified = mtu, {"ble:2": False, "ble:3": False}, 0
+        super().__init__(seed)
+
+    def restart(self) -> None:
+        super().restart()
+        for link in self.hears:
+            self.connect(link)
+
+    def connect(self, link: str) -> None:
+        self.hears[link] = False
+        self.c.ble_connected(int(link[4:]) - 2, self.mtu)
+
+    def enable(self, link: str, hears: bool) -> None:
+        """A station enables data messages, or disables them."""
+        self.hears[link] = hears
+        if not hears:
+            self.py.unheard(link)
+        self.c.ble_hears(int(link[4:]) - 2, hears)
+
+    def port(self, link: str) -> Port:
+        return port_of(link)._replace(mtu=self.mtu, hears=self.hears.get(link, True))
+
+    def lost(self, link: str) -> None:
+        if link not in self.hears:
+            super().lost(link)
+            return
+        self.py.link_lost(link)
+        self.c.ble_disconnected(int(link[4:]) - 2)
+        self.connect(link)
+
+    def frames(self) -> None:
+        super().frames()
+        while True:
+            mine, theirs = self.py.next_frame("ble"), self.c.ble_data()
+            assert (None if mine is None else (mine.link_source - 2, mine.data)) == theirs
+            if mine is None:
+                return
+            self.notified += 1
+
+    def drive(self, link: str, data: bytes, *, fd: bool = False) -> None:
+        if link not in self.hears:
+            super().drive(link, data, fd=fd)
+            return
+        self.py.drive(link, data)
+        self.c.ble_driven(int(link[4:]) - 2, ble_frame(0, data))
+        self.hold()
+
+
+class Roamer(Beside):
+    """A station that talks over the air, and over the bus now and then."""
+
+    drivers = ("ble:2", "ble:3", "can:f1")
+    air: InTheAir
+
+    def link(self) -> str:
+        return self.dice.choice(("nfc", "ble:2", "ble:2", "ble:3", "can:f1"))
+
+    def hand_over(self, link: str, message: bytes) -> None:
+        if link not in self.air.hears:
+            super().hand_over(link, message)
+            return
+        if self.dice.random() < 0.2:
+            message = self.dice.choice((message[:-1], message + b"\0", b"", message[:3]))
+        self.air.drive(link, message)
+
+    def disturb(self) -> None:
+        link = self.dice.choice(list(self.air.hears))
+        if self.dice.random() < 0.5:
+            self.air.enable(link, self.dice.random() < 0.8)
+        else:
+            super().disturb()
+
+
+@pytest.mark.parametrize(("seed", "mtu"), [(0, 247), (1, 247), (2, 64), (3, 23)])
+def test_both_nodes_stream_and_are_driven_the_same(seed: int, mtu: int) -> None:
+    twins = InTheAir(seed, mtu)
+    station = Roamer(twins, 2000 + seed)
+    station.air = twins
+    twins.enable("ble:2", True)
+    station.begin_measuring("ble:2")
+    station.measure(subscribe(stream=0, start=0), "ble:2")
+    twins.pass_time(100 * MS_1)
+    for _ in range(150):
+        station.move()
+    assert twins.notified > 20
+    assert not twins.c.misused
+    twins.c.close()
+
+
+def subscribe(*, stream: int, start: int, n: int = 2, gap: int = 100) -> Command:
+    """Subscribe of channel 1, a value each millisecond."""
+    asked = bytes([stream, 0, n]) + gap.to_bytes(2, "big") + MS_1.to_bytes(8, "big") + start.to_bytes(8, "big")
+    return security_command(Function.SUBSCRIBE, asked + b"\x01")
+
+
+def test_data_messages_go_over_the_connection_that_enabled_them() -> None:
+    twins = InTheAir(5, 24)
+    station = Roamer(twins, 5)
+    station.air = twins
+    station.begin_measuring("ble:2")
+    assert station.sealed(subscribe(stream=1, start=0), "ble:2") == (False, b"\x02")  # not enabled
+    twins.enable("ble:2", True)
+    assert station.sealed(subscribe(stream=1, start=0, n=4), "ble:2") == (False, b"\x0a")  # 21 octets, MTU 24
+    assert station.sealed(subscribe(stream=1, start=2**64 - 1), "ble:2") == (False, b"\x15")  # no trigger in the air
+    assert station.sealed(subscribe(stream=1, start=0, gap=2001), "ble:2") == (False, b"\x15")  # one message in 2 ms
+    assert station.sealed(subscribe(stream=1, start=0, gap=2000), "ble:2")[0]
+    twins.pass_time(1000 * MS_1)
+    assert twins.notified == pytest.approx(485, abs=1)
+    assert station.sealed(subscribe(stream=1, start=0, gap=900), "ble:2")[0]
+    assert station.sealed(subscribe(stream=2, start=0, gap=900), "ble:2")[0]
+    twins.pass_time(100 * MS_1)  # two are full at once: the second leaves a gap later
+    twins.enable("ble:3", False)
+    assert twins.py.streaming
+    twins.enable("ble:2", False)
+    before = twins.notified
+    twins.pass_time(100 * MS_1)
+    assert not twins.py.streaming
+    assert twins.notified == before
+    assert station.sealed(Command(1, 3, 1, bytes(4)), "ble:2")[0]  # the claim stands
+    twins.c.close()
+
+
+def test_a_drive_message_is_one_whole_write_under_0() -> None:
+    twins = InTheAir(6, 247)
+    station = Roamer(twins, 6)
+    station.air = twins
+    station.begin_measuring("ble:2")
+    _layout, sealer = station.driven["ble:2"]
+    until = (twins.hardware.tick // 1000 + 10_000).to_bytes(4, "big")
+    message = sealer.seal(0, until + b"\x11\x22" + bytes(5))
+    for spoilt in (message + b"\0", message[:-1]):
+        twins.drive("ble:2", spoilt)
+    twins.c.ble_driven(0, ble_frame(1, message))
+    twins.c.ble_driven(0, b"")
+    assert twins.c.set_point(7, 2) == bytes(2)
+    twins.drive("ble:2", message)
+    assert twins.c.set_point(7, 2) == b"\x11\x22"
+    twins.c.close()
 
 
 def test_it_advertises_after_a_tap_and_drops_whoever_has_no_session() -> None:

@@ -141,7 +141,7 @@ typedef struct teds_stream {
     bool used, ready, waits, full, ended;
     int8_t session;
     uint8_t number, kind, n, count, octets, pattern, flags, full_flags;
-    bool fd;
+    bool fd, ble;
     uint8_t channels[16]; /* places in the port's table */
     uint8_t held;
     uint16_t gap, run, length, fill;
@@ -228,7 +228,7 @@ typedef struct teds_nfc {
 
 #if TEDS_BLE
 typedef struct teds_ble_line {
-    bool used, holds, sends;
+    bool used, holds, sends, hears;
     int8_t reply;
     uint16_t mtu, transaction, total, held, sent_transaction, at;
     uint64_t silent_since;
@@ -238,6 +238,9 @@ typedef struct teds_ble_line {
 typedef struct teds_ble {
     bool was_tapped;
     uint64_t tapped_at;
+#if TEDS_OPERATION
+    uint64_t data_free_at; /* all connections are one bus */
+#endif
     teds_ble_line lines[TEDS_BLE_CONNECTIONS];
 } teds_ble;
 #endif
@@ -362,6 +365,16 @@ void teds_ble_disconnected(teds_node *node, uint8_t connection);
 /* d8570002-… was written; then the notifications of d8570003-… that are due, one a call, until 0. */
 void teds_ble_written(teds_node *node, uint8_t connection, const uint8_t *value, size_t length);
 size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[512]);
+
+#if TEDS_OPERATION
+/* d8570004-…: a station has enabled its notifications, or disabled them, which ends its streams; the next of them that may
+ * leave now and on which connection, 0: none (ask until then, after each teds_node_poll and each reply that has left); a
+ * station wrote it, without response (Drive). */
+#define TEDS_BLE_DATA 241
+void teds_ble_hears(teds_node *node, uint8_t connection, bool hears);
+size_t teds_ble_data(teds_node *node, uint8_t *connection, uint8_t out[TEDS_BLE_DATA]);
+void teds_ble_driven(teds_node *node, uint8_t connection, const uint8_t *value, size_t length);
+#endif
 
 /* Whether to advertise now (for 60 s after a tap, and while it has a key), and whether to drop a connection (10 s without
  * a session). Ask twice a second. tapped is called by teds_nfc_field. */

@@ -426,6 +426,21 @@ size_t memory_ble_notify(memory_board *board, uint8_t connection, uint8_t out[51
     return teds_ble_notify(&board->node, connection, out);
 }
 
+void memory_ble_hears(memory_board *board, uint8_t connection, bool hears)
+{
+    teds_ble_hears(&board->node, connection, hears);
+}
+
+size_t memory_ble_data(memory_board *board, uint8_t *connection, uint8_t out[TEDS_BLE_DATA])
+{
+    return teds_ble_data(&board->node, connection, out);
+}
+
+void memory_ble_driven(memory_board *board, uint8_t connection, const uint8_t *value, size_t length)
+{
+    teds_ble_driven(&board->node, connection, value, length);
+}
+
 bool memory_ble_advertises(const memory_board *board)
 {
     return teds_ble_advertises(&board->node);
