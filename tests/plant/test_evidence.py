@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,7 +15,7 @@ from in_toto_attestation.v1.statement import Statement
 from securesystemslib.dsse import Envelope
 from securesystemslib.signer import SSlibKey
 
-from teds_provision.errors import NodeSilent, NotAuthentic, TedsProvisionError
+from teds_provision.errors import BadData, NodeSilent, NotAuthentic, TedsProvisionError
 from teds_provision.plant.evidence import sign_evidence
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.protocol.plant import evidence as codec
@@ -120,8 +121,6 @@ def test_a_certified_station_cannot_pass_anothers_evidence_off_as_its_own(statio
     certificate = station.identity.certify(other.point)
 
     def mine(statement: dict[str, Any]) -> None:
-        import base64
-
         statement["predicate"]["facts"]["station"] = fingerprint(other.point)
         told = {"point": other.point.hex(), "certificate": base64.b64encode(certificate).decode()}
         statement["predicate"]["station"] = told
@@ -153,6 +152,40 @@ def test_a_board_that_passed_must_sign(station: Station, board: Board) -> None:
     other = Board()  # the same UUID, another key
     with pytest.raises(NotAuthentic), talk(other) as node:
         sign_evidence(node, station.credentials(board.uuid), claim)
+
+
+@pytest.mark.parametrize(
+    "text", ["QR==", "QUJ=", "QUJD=", "QUJD====", "QUI=\n", " QUI=", "QUI", "QUI=QUI=", "=", "\n", 5]
+)
+def test_base64_has_one_spelling(text: object) -> None:
+    """Spare bits, needless padding, white space: other texts for the same octets would be other documents."""
+    assert [codec.base64_of(plain, "sig") for plain in ("", "QQ==", "QUI=", "QUJD")] == [b"", b"A", b"AB", b"ABC"]
+    with pytest.raises(BadData):
+        codec.base64_of(text, "sig")
+
+
+DIGEST = "0" * 64
+
+
+@pytest.mark.parametrize(
+    ("member", "row"),
+    [
+        *(("blocks", row) for row in ([65536, 1, DIGEST], [0, 256, DIGEST], [0, 1, "A" * 64], [0, 1, 5])),
+        *(("blocks", row) for row in ([0, 1], [0, 1, DIGEST, 1], ["0", 1, DIGEST], [0, None, DIGEST], DIGEST, {})),
+        *(
+            ("steps", row)
+            for row in (["write", "done"], ["write", "done", "5"], [1, "done", 5], ["write", "do\nne", 5])
+        ),
+        *(("steps", row) for row in (["wri\u202ete", "done", 5], ["write", None, 5], "wd5", None)),
+    ],
+)
+def test_a_row_of_the_facts_has_one_form(member: str, row: object) -> None:
+    told = json.loads(KAT["evidence"]["file"])
+    statement = json.loads(codec.base64_of(told["payload"], "payload"))
+    statement["predicate"]["facts"][member][0] = row
+    told["payload"] = base64.b64encode(json.dumps(statement).encode()).decode()
+    with pytest.raises(BadData, match=member[:-1]):
+        codec.read(json.dumps(told).encode())
 
 
 def test_known_answers_of_another_implementation() -> None:
