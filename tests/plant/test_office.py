@@ -6,13 +6,14 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
+from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
+from teds_provision.plant import jobs
 from teds_provision.plant.asking import NotAnswered, Refused
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
@@ -322,3 +323,31 @@ def test_a_request_from_the_future_waits(desk: Desk) -> None:
     request = desk.request(desk.run(), board(1))
     late = replace(request, created=NOW + timedelta(hours=25))
     assert answer(desk.office, seal_request(late, desk.line.credentials().key)) is None
+
+
+def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing carried for a day: one job ended meanwhile, another began; its unit is the board's first there."""
+    begins = NOW + timedelta(hours=23)
+    today, one = desk.run(), board(1)
+    tomorrow = {"not_before": begins, "ends": begins + timedelta(days=2), "title": "tomorrow"}
+    with pytest.raises(PolicyRefused, match="it begins"):
+        desk.run(**tomorrow)
+    waiting = desk.request(today, one)
+
+    class NextDay(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
+            return datetime.now(tz) + timedelta(days=1)
+
+    monkeypatch.setattr(jobs, "datetime", NextDay)
+    assert desk.asks(waiting).refused == "job"
+    with pytest.raises(PolicyRefused, match="it ended"):
+        build(today, one)
+    run = desk.run(**tomorrow)
+    assert build(run, one).verified.verdict == "authentic"
+    assert run.job is not None
+    assert today.job is not None
+    for station, units in ((desk.office, (0, 1)), (desk.line, (1, 1))):
+        assert tuple(station.plant.line.count_units(job.id)[0] for job in (today.job, run.job)) == units
