@@ -96,56 +96,22 @@ def view(
     keepers_pins = {pins[station] for station in keepers if station in pins}
     pin = next(iter(keepers_pins)) if len(keepers_pins) == 1 else None
 
-    # A reset counts where its proof is of the key that the node is pinned to: anybody can reset a board of his own.
-    judge = own.pin if own.pin is not None else pin
-    resets = frozenset(
-        reset for claim in counted.values() for reset in claim.resets if judge is not None and same_key(reset[0], judge)
-    )
-    reset_to = max((epoch for _, epoch in resets), default=-1)
-
-    held: dict[str, Key] = {}
-    made: set[str] = set()
-    left: dict[str, Key] = {}
-    for station, claim in counted.items():
-        key = claim.key()
-        if key is not None and roster.member(station) is None and claim.agreed is not None and claim.agreed[:2] == key:
-            left[station] = key
-        if key is None or roster.member(station) is None or key[0] <= max(claim.forgot, reset_to):
-            continue
-        if any((epoch, key_id) == key and mode == "move" for _, _, epoch, key_id, mode in claim.left()):
-            continue
-        held[station] = key
-        if claim.agreed is not None and claim.agreed[:2] == key:
-            made.add(station)
-    says: dict[str, list[str]] = {}
-    hearable = {one: key for one, key in held.items() if roster.roles_of(one) & {"line", "base", "keeper"}}
-    top = max((epoch for epoch, _ in hearable.values()), default=None)
-    for station, (epoch, key_id) in hearable.items():
-        if epoch == top:
-            says.setdefault(key_id, []).append(station)
-
-    conflicts: dict[str, str] = {}
-    named = {**{s: c.agreed[2] for s, c in counted.items() if c.agreed is not None}, **pins}
-    if own.pin is not None:
-        named[own.station] = own.pin
-    if len(keepers_pins) > 1:
-        conflicts[TWO_KEYS] = "keepers pin " + _who(roster, {s: pins[s] for s in keepers if s in pins})
-    elif pin is None and not own.met and len(_keys(named.values())) > 1:
-        conflicts[TWO_KEYS] = _who(roster, named)
-    elif pin is not None and own.pin is not None and not same_key(pin, own.pin):
-        conflicts[OTHER_PIN] = f"keepers pin {pin[:16]}, and {own.pin[:16]} is pinned here"
-    if len(says) > 1:
-        conflicts[TWO_HOLDERS] = f"epoch {top}: " + "; ".join(
-            f"{', '.join(roster.name_of(one) for one in stations)} hold {key_id}" for key_id, stations in says.items()
+    resets = _resets(counted, own.pin if own.pin is not None else pin)
+    holdings = _holdings(roster, counted, max((epoch for _, epoch in resets), default=-1))
+    epoch, holders = _holders(roster, holdings.held)
+    conflicts = _pin_conflicts(roster, counted, own, pins, keepers)
+    if len(holders) > 1:
+        conflicts[TWO_HOLDERS] = f"epoch {epoch}: " + "; ".join(
+            f"{', '.join(map(roster.name_of, stations))} hold {key_id}" for key_id, stations in holders.items()
         )
     own_word = own.met or own.holds or (own.pin is not None and own.assurance != "registry")
 
     return View(
         pin=pin,
         pins=pins,
-        held=held,
-        made=frozenset(made),
-        holder=None if top is None else (top, {key_id: tuple(stations) for key_id, stations in says.items()}),
+        held=holdings.held,
+        made=frozenset(holdings.made),
+        holder=None if epoch is None else (epoch, holders),
         written={s: (c.written[0], c.written[1], c.written[3]) for s, c in counted.items() if c.written is not None},
         gave=frozenset(
             (station, epoch, key_id, peer, mode, bundle)
@@ -159,7 +125,7 @@ def view(
         groups=_groups(roster, counted),
         conflicts=conflicts,
         key_it=TWO_KEYS not in conflicts or own_word,
-        left=left,
+        left=holdings.left,
         keeper_groups=_groups(roster, {one: counted[one] for one in keepers}),
         own_groups={
             station: tuple(sorted(group for group, (member, _) in claim.groups.items() if member))
@@ -167,6 +133,76 @@ def view(
             if claim.groups
         },
     )  # fmt: skip
+
+
+def _resets(claims: Mapping[str, Claim], pinned: str | None) -> frozenset[tuple[str, int]]:
+    """Resets whose proof is of the key that the node is pinned to: anybody can reset a board of his own."""
+    return frozenset(
+        reset
+        for claim in claims.values()
+        for reset in claim.resets
+        if pinned is not None and same_key(reset[0], pinned)
+    )
+
+
+@dataclass
+class _Holdings:
+    """Keys by station: those that members hold, who of them agreed on his himself, and what former members took."""
+
+    held: dict[str, Key] = field(default_factory=dict)
+    made: set[str] = field(default_factory=set)
+    left: dict[str, Key] = field(default_factory=dict)
+
+
+def _holdings(roster: Roster, claims: Mapping[str, Claim], reset_to: int) -> _Holdings:
+    """Whose key still counts: not forgotten, not given away, newer than the newest reset."""
+    found = _Holdings()
+    for station, claim in claims.items():
+        key = claim.key()
+        if key is None:
+            continue
+        agreed = claim.agreed is not None and claim.agreed[:2] == key
+        if roster.member(station) is None:
+            if agreed:
+                found.left[station] = key
+            continue
+        given_away = any((epoch, key_id) == key and mode == "move" for _, _, epoch, key_id, mode in claim.left())
+        if key[0] > max(claim.forgot, reset_to) and not given_away:
+            found.held[station] = key
+            if agreed:
+                found.made.add(station)
+    return found
+
+
+def _holders(roster: Roster, held: Mapping[str, Key]) -> tuple[int | None, dict[str, tuple[str, ...]]]:
+    """The newest epoch that a station that works with nodes says it holds, and who holds which key of it."""
+    heard = {one: key for one, key in held.items() if roster.roles_of(one) & {"line", "base", "keeper"}}
+    newest = max((epoch for epoch, _ in heard.values()), default=None)
+    found: dict[str, tuple[str, ...]] = {}
+    for station, (epoch, key_id) in heard.items():
+        if epoch == newest:
+            found[key_id] = (*found.get(key_id, ()), station)
+    return newest, found
+
+
+def _pin_conflicts(
+    roster: Roster, claims: Mapping[str, Claim], own: Own, pins: Mapping[str, str], keepers: Collection[str]
+) -> dict[str, str]:
+    """Where stations name other keys of the board: keepers among themselves, anybody where none has pinned it."""
+    by_keepers = {station: pins[station] for station in keepers if station in pins}
+    if len(set(by_keepers.values())) > 1:
+        return {TWO_KEYS: "keepers pin " + _who(roster, by_keepers)}
+    if by_keepers:
+        pin = next(iter(by_keepers.values()))
+        if own.pin is not None and not same_key(pin, own.pin):
+            return {OTHER_PIN: f"keepers pin {pin[:16]}, and {own.pin[:16]} is pinned here"}
+        return {}
+    named = {**{s: c.agreed[2] for s, c in claims.items() if c.agreed is not None}, **pins}
+    if own.pin is not None:
+        named[own.station] = own.pin
+    if not own.met and len(_keys(named.values())) > 1:
+        return {TWO_KEYS: _who(roster, named)}
+    return {}
 
 
 def bans(roster: Roster, one: Statement, own: Own, liftings: Mapping[str, Collection[str]]) -> bool:
