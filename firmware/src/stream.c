@@ -393,7 +393,8 @@ static bool is_free(const teds_node *node, bool ble, uint64_t now)
 
 static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
 {
-    uint64_t due;
+    uint64_t due = next_instant(stream);
+    stream->late = stream->late || (due <= now && now - due >= span(stream)); /* two may be full at once */
     while ((due = next_instant(stream)) <= now) {
         if (stream->kind == EVENT) {
             teds_put64(stream->filling, due);
@@ -403,8 +404,9 @@ static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
             full(stream);
             continue;
         }
-        if (stream->full && stream->ready && stream->held + 1u == stream->n && is_free(node, stream->ble, now)) {
-            return; /* a late loop, not a slow bus: the one that waits leaves first, and the loop comes back at once */
+        if (stream->full && stream->ready && stream->held + 1u == stream->n &&
+            (is_free(node, stream->ble, now) || stream->late)) {
+            return; /* a late loop, not a slow bus: what waits or is half sent leaves first; the loop comes back at once */
         }
         if (stream->held == 0 && now - due >= 2 * span(stream) + ASLEEP_NS && stream->counter < UINT32_MAX) {
             /* the board slept for longer than a station waits: those messages are lost, and shown as lost */
@@ -416,6 +418,7 @@ static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
         }
         instant(node, stream, due);
     }
+    stream->late = false; /* it has caught up */
 }
 
 /* What comes sooner than the period after the last that was sent is dropped, its counter too. */

@@ -463,6 +463,53 @@ class Operation:
         return hashlib.sha256(flash.security_teds()).digest()[:16]
 
 
+class Halfway:
+    """The node in C alone, in the middle of the sixth message of a stream: 20 samples of 1 ms each, 7 frames."""
+
+    def __init__(self) -> None:
+        self.twins = Twins(7)
+        station = Station(self.twins, 7)
+        station.begin_measuring()
+        asked = bytes([0, 0, 20]) + (100).to_bytes(2, "big") + MS.to_bytes(8, "big") + bytes(8) + b"\x01"
+        assert station.sealed(security_command(Function.SUBSCRIBE, asked), "can:f1")[0]
+        self.counters: list[int] = []
+        self.frames = 0
+        while self.frames < 7 * 5 + 3:
+            self.turn()
+
+    def turn(self, *, bus: bool = True) -> None:
+        """A turn of the board's loop, every 0.1 ms; ``bus``: its controller takes frames."""
+        self.twins.hardware.tick += MS // 10
+        self.twins.c.poll()
+        while bus and (frame := self.twins.c.next_frame()) is not None:
+            self.frames += 1
+            if frame[0] >> 8 & 7 == 0:
+                self.counters.append(int.from_bytes(frame[1][:4], "big"))
+
+    def lost_after(self, turns: int = 2000) -> int:
+        """Messages that never left."""
+        for _ in range(turns):
+            self.turn()
+        self.twins.c.close()
+        assert self.counters == sorted(self.counters)
+        return self.counters[-1] + 1 - len(self.counters)
+
+
+@pytest.mark.parametrize(("held_up", "lost"), [(19, 0), (41, 0), (65, 0), (180, 0), (400, 18)])
+def test_a_loop_held_up_in_the_middle_of_a_message_loses_none_before_it_sleeps(held_up: int, lost: int) -> None:
+    """Two messages' time and 150 ms: that long a station waits for what is late."""
+    node = Halfway()
+    node.twins.hardware.tick += held_up * MS
+    assert node.lost_after() == lost
+
+
+def test_of_a_slow_bus_the_newest_message_wins() -> None:
+    node = Halfway()
+    for _ in range(1000):
+        node.turn(bus=False)
+    assert node.lost_after() == 4
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_both_nodes_answer_the_same(seed: int) -> None:
     twins = Twins(seed)

@@ -138,7 +138,7 @@ typedef struct teds_pending {
 #if TEDS_OPERATION
 #define TEDS_MESSAGE 240
 typedef struct teds_stream {
-    bool used, ready, waits, full, ended;
+    bool used, ready, waits, full, ended, late;
     int8_t session;
     uint8_t number, kind, n, count, octets, pattern, flags, full_flags;
     bool fd, ble;
