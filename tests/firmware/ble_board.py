@@ -14,9 +14,13 @@ from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Line, Peripheral
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.handler import InTheAir
+from teds_provision.node.hardware.board import Board
+from teds_provision.teds.image import Image
+from teds_provision.teds.sheet import Sheet
 from tests.firmware.memory_node import MemoryNode
 
 FIRST = 2
+_BEAT = 0.002
 """The link of connection 0."""
 
 
@@ -28,10 +32,14 @@ class CPeripheral(Peripheral):
         state = file.load()
         self._secret = file.key.secret()
         self.c = MemoryNode(self._draw, time.monotonic, uuid=state.uuid, max_message=2048, max_teds=16384)
+        if file.hardware:
+            for number, facts in Board(Sheet.of(Image(state.uuid, file.hardware))).channels.items():
+                self.c.add_channel(number, int(facts.kind), facts.octets, model=facts.model, shortest=facts.shortest)
         assert self.c.start() == 0
         self.c.put(state)
         self._turn = threading.Lock()
         self.pieces = 0
+        self._beats: asyncio.Task[None] | None = None
         super().__init__(cast(InTheAir, self), StaticAddress(folder, factory=False))
 
     def _draw(self, kind: str, size: int) -> bytes:
@@ -52,7 +60,42 @@ class CPeripheral(Peripheral):
             self.c.ble_disconnected(int(name.partition(":")[2], 16) - FIRST)
 
     def unheard(self, name: str) -> None:
-        """It sends no data messages."""
+        """It was told already."""
+
+    # -- data messages -------------------------------------------------------------------------------------------
+
+    async def power_on(self, host: Any) -> None:
+        await super().power_on(host)
+        self._beats = asyncio.get_running_loop().create_task(self._beat())
+
+    async def power_off(self) -> None:
+        if self._beats is not None:
+            self._beats.cancel()
+        await super().power_off()
+
+    async def _beat(self) -> None:
+        while True:
+            with self._turn:
+                self.c.poll()
+                due = self.c.ble_data()
+            if due is None:
+                await asyncio.sleep(_BEAT)
+                continue
+            with suppress(Exception):  # the connection is gone
+                await self.notify_data(due[0] + FIRST, due[1])
+
+    def _subscribed(self, connection: Any, notify: bool, indicate: bool) -> None:
+        super()._subscribed(connection, notify, indicate)
+        line = self._line_of(connection)
+        if line is not None:
+            with self._turn:
+                self.c.ble_hears(line.number - FIRST, notify)
+
+    def _driven(self, connection: Any, value: bytes) -> None:
+        line = self._line_of(connection)
+        if line is not None:
+            with self._turn:
+                self.c.ble_driven(line.number - FIRST, bytes(value))
 
     # -- connections ---------------------------------------------------------------------------------------------
 

@@ -5,7 +5,9 @@ The GATT server and the radio are bumble's, as on a board they are the chip's: w
 
 from __future__ import annotations
 
+import json
 import random
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -23,6 +25,7 @@ from tests.firmware.test_beside_python import Twins
 from tests.links.ble.conftest import air  # noqa: F401 - a fixture
 from tests.links.ble.radio import Radio, needs_dbus
 from tests.links.ble.test_whole_runs import tapped_once
+from tests.pace import until
 
 pytestmark = pytest.mark.system
 SECONDS = 10**9
@@ -280,7 +283,7 @@ def test_it_advertises_after_a_tap_and_drops_whoever_has_no_session() -> None:
 
 @needs_dbus
 @pytest.mark.link
-def test_it_is_checked_verified_and_written_over_the_air(
+def test_it_is_checked_written_verified_and_measured_over_the_air(
     tmp_path_factory: pytest.TempPathFactory,
     air: Callable[..., Radio],  # noqa: F811
 ) -> None:
@@ -302,5 +305,12 @@ def test_it_is_checked_verified_and_written_over_the_air(
         radio.do("manners", {"mtu": 517})
         assert bench.ask("verify", done["uuid"], "--via", "ble")["verdict"] == "authentic"
         assert radio.do("pieces", 0) > 20
+        running = bench.start("--json", "measure", done["uuid"], "--ble", "auto", "--rate", "100")
+        until(lambda: (running.read(0.1), running.out.count('"event":"data"') > 30)[1])
+        running.signal(signal.SIGTERM)
+        measured = running.end()
+        assert measured.code == 0, measured
+        (node,) = json.loads(measured.out.splitlines()[-1])["nodes"]
+        assert all(stream["samples"] > 30 and stream["bad"] == 0 for stream in node["streams"])
     finally:
         desk.clear()

@@ -266,6 +266,19 @@ static void nodes_that_meet_sort_themselves_out(void)
     memory_free(board);
 }
 
+static void a_classic_frame_has_eight_octets_at_most(void)
+{
+    memory_board *board = fresh();
+    static const char identify[] = "\x06\x07\x00\x00\x80\x07\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00";
+    in(board, TO_NODE, identify, 9, false);
+    CHECK(silent(board), "nine octets, as of a DLC that was read as that of FD");
+    in(board, TO_NODE, identify, 16, false);
+    CHECK(silent(board), "sixteen");
+    in(board, TO_NODE, identify, 8, false);
+    CHECK(!silent(board), "eight");
+    memory_free(board);
+}
+
 int main(void)
 {
     a_long_answer_waits_for_flow_control();
@@ -276,5 +289,6 @@ int main(void)
     a_repetition_while_the_reply_is_under_way_gets_it_again();
     everyone_is_answered_after_a_wait();
     nodes_that_meet_sort_themselves_out();
+    a_classic_frame_has_eight_octets_at_most();
     return ENDED("isotp");
 }
