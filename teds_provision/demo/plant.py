@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,14 +52,14 @@ class PlantDone:
     seconds: float
 
 
-def run_plant_demo(reporter: Reporter, say: Callable[[str], None], *, files: bool = False) -> PlantDone:
+def run_plant_demo(reporter: Reporter, say: Callable[[str], None]) -> PlantDone:
     """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
     folder = Path(tempfile.mkdtemp(prefix="teds-provision-plant-"))
     folder.chmod(0o755)  # the server runs as another user
     try:
         demo = Demo(folder, reporter, say)
         with demo.stack:
-            return _Story(demo, files).run()
+            return _Story(demo).run()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -66,9 +67,9 @@ def run_plant_demo(reporter: Reporter, say: Callable[[str], None], *, files: boo
 class _Story:
     """The demo's stations and what carries between them."""
 
-    def __init__(self, demo: Demo, files: bool) -> None:
+    def __init__(self, demo: Demo) -> None:
         self.demo = demo
-        self.bin = None if files else cluster.programs()
+        self.bin = None if find_spec("psycopg") is None else cluster.programs()
         self.stations: dict[str, Station] = {}
         self.server: cluster.Cluster | None = None
         self.places = demo.folder / "homes"
@@ -78,7 +79,8 @@ class _Story:
     def run(self) -> PlantDone:
         demo, began = self.demo, time.monotonic()
         if self.bin is None:
-            demo.say("No PostgreSQL 15 is installed here, so the stations meet in a folder, as by a stick.")
+            lacks = "PostgreSQL 15" if find_spec("psycopg") is not None else "psycopg (the extra registry)"
+            demo.say(f"No {lacks} is installed here, so the stations meet in a folder, as by a stick.")
         else:
             demo.say("A PostgreSQL of the demo's own: TLS, its own port; nothing of the system's is touched.")
             with demo.steps.step("start database") as step:

@@ -2,18 +2,22 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.demo import cluster
-from teds_provision.demo.plant import run_plant_demo
+from teds_provision.demo import cluster, plant
 from teds_provision.talk.progress import Silent
 
 
 @pytest.mark.link
-@pytest.mark.parametrize("files", [pytest.param(False, marks=pytest.mark.system), True], ids=["postgresql", "files"])
-def test_three_stations_share_a_key_and_refuse_what_the_stolen_one_signs(files: bool) -> None:
-    if not files and cluster.programs() is None:
+@pytest.mark.parametrize("driver", [pytest.param(True, marks=pytest.mark.system), False], ids=["postgresql", "files"])
+def test_three_stations_share_a_key_and_refuse_what_the_stolen_one_signs(
+    driver: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By files, with a word, also where a server is installed and its driver is not."""
+    if driver and cluster.programs() is None:
         pytest.skip("no PostgreSQL 15 here (scripts/install-test-packages)")
+    if not driver:
+        monkeypatch.setattr(plant, "find_spec", lambda _name: None)
     said: list[str] = []
-    done = run_plant_demo(Silent(), said.append, files=files)
-    assert (done.by, done.before, done.after) == ("files" if files else "postgresql", "authentic", "not authentic")
-    assert ("No PostgreSQL" in said[0]) == files
+    done = plant.run_plant_demo(Silent(), said.append)
+    assert (done.by, done.before, done.after) == ("postgresql" if driver else "files", "authentic", "not authentic")
+    assert ("No psycopg (the extra registry) is installed here" in said[0]) == (not driver)
     assert all(step.result != "failed" for step in done.steps)
