@@ -141,10 +141,11 @@ uint16_t teds_ble_longest(const teds_node *node, teds_link link)
 void teds_ble_hears(teds_node *node, uint8_t connection, bool hears)
 {
     teds_ble_line *line = line_of(node, connection);
-    const int8_t session = line != NULL ? teds_session_on(node, link_of(connection)) : -1;
-    if (line != NULL) {
-        line->hears = hears;
+    const int8_t session = teds_session_on(node, link_of(connection));
+    if (line == NULL) {
+        return;
     }
+    line->hears = hears;
     if (session >= 0 && !hears) {
         teds_streams_end(node, session, UINT32_MAX);
     }
