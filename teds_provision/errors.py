@@ -67,12 +67,6 @@ class Fork(NotAuthentic):
     code = "fork"
 
 
-class TwoHistories(NotAuthentic):
-    """A station signed two pages of one number."""
-
-    code = "two-histories"
-
-
 class BadDatasheet(NotAuthentic):
     """A datasheet that was read is not authentic: no disturbed frame, which another try would cure."""
 
@@ -181,12 +175,6 @@ class RosterExpired(PolicyRefused):
     """The roster is older than the owner's CA said that it may become."""
 
     code = "roster-expired"
-
-
-class PlantConflict(PolicyRefused):
-    """Stations of the plant say different things, and a person has to decide."""
-
-    code = "conflict"
 
 
 class NodeRefused(PolicyRefused):

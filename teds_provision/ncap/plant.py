@@ -19,7 +19,6 @@ from teds_provision.errors import (
     NotAuthentic,
     NotFound,
     NotMember,
-    RosterExpired,
     StoreLocked,
     TedsProvisionError,
 )
@@ -167,8 +166,6 @@ class PlantWatch:
             return True
         except NotMember as error:
             self._tell("removed", error.message)
-        except RosterExpired as error:
-            self._tell("expired", error.message)
         except LinkFailure as error:
             self._tell("unreachable", error.message)
         except TedsProvisionError as error:

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, RosterExpired
 from teds_provision.files import read_limited
 from teds_provision.plant import parcels
 from teds_provision.protocol.plant.document import JOB, is_form
@@ -23,7 +23,7 @@ _MAX_PROFILE_OCTETS: Final = 1 << 20
 
 
 def roster_of(station: Station) -> Roster:
-    """The roster that counts; raises PolicyRefused where none was joined, or it has expired."""
+    """The roster that counts; raises PolicyRefused where none was joined, RosterExpired."""
     roster = station.plant.roster
     if roster is None:
         raise PolicyRefused(
@@ -31,7 +31,7 @@ def roster_of(station: Station) -> Roster:
             hint="Join one: teds-provision registry connect; or begin one: teds-provision registry create",
         )
     if now_of(roster) >= roster.expires:
-        raise PolicyRefused(
+        raise RosterExpired(
             "The roster has expired: no job begins.", hint="Have it renewed: teds-provision registry renew"
         )
     return roster

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadData, NotFound, PolicyRefused, RosterExpired, TedsProvisionError
 from teds_provision.plant import scram
 from teds_provision.plant.folding import now, recount, require_roster
 from teds_provision.plant.post import Post
@@ -74,7 +74,7 @@ def found_roster(station: Station, post: Post, octets: bytes | None) -> Roster:
         )
     best = max(mine, key=lambda one: (one.version, one.hash))
     if best.expires <= now():
-        raise PolicyRefused(
+        raise RosterExpired(
             f"The roster of {best.name} expired on {best.expires:%Y-%m-%d}.",
             hint="Have its owner renew it: registry renew",
         )

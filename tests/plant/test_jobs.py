@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, OtherKey, PolicyRefused
+from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, OtherKey, PolicyRefused, RosterExpired
 from teds_provision.plant import owner as owning
 from teds_provision.plant.asking import send_job
 from teds_provision.plant.files import FilesPost
@@ -29,7 +29,7 @@ from teds_provision.steps.provision import Provisioned, inspect, provision
 from teds_provision.talk.progress import Silent
 from tests.bench import Board, MemoryLink, make_station, talk
 
-from .owner import NOW, alone, job_of, join, member, roster_of
+from .owner import ALL, NOW, alone, job_of, join, member, roster_of
 from .stations import Plant
 
 
@@ -109,6 +109,15 @@ def test_one_board_too_many_is_refused_and_stays_what_it_is(owner: Station) -> N
 def test_what_can_be_refused_before_a_tap_is(owner: Station, changes: dict[str, Any], why: str) -> None:
     with pytest.raises(PolicyRefused, match=why):
         line_of(owner, **changes)
+
+
+def test_no_job_begins_once_the_roster_has_expired(tmp_path: Path) -> None:
+    station = make_station(tmp_path / "home", "owner")
+    join(station, roster_of(station, member(station, "owner", *ALL), expires=NOW - timedelta(hours=1)))
+    with pytest.raises(RosterExpired) as caught:
+        take_job(station, job_of(station))
+    assert (caught.value.exit_code, caught.value.code) == (6, "roster-expired")
+    station.close()
 
 
 def test_a_closed_job_is_refused(owner: Station) -> None:
