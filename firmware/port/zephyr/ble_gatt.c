@@ -1,5 +1,6 @@
-/* The profile's GATT service on Zephyr's Bluetooth host: connectable advertising while the node says so, one write and
- * one notify characteristic. The host's callbacks fill a queue; the node's thread empties it.
+/* The profile's GATT service on Zephyr's Bluetooth host: connectable advertising while the node says so, a write and a
+ * notify characteristic for commands, one for data messages and set points. The host's callbacks fill a queue; the
+ * node's thread empties it.
  */
 #include "teds_zephyr.h"
 
@@ -15,17 +16,19 @@
 static const struct bt_uuid_128 service_uuid = BT_UUID_INIT_128(OF_PROFILE(0xd8570001));
 static const struct bt_uuid_128 write_uuid = BT_UUID_INIT_128(OF_PROFILE(0xd8570002));
 static const struct bt_uuid_128 notify_uuid = BT_UUID_INIT_128(OF_PROFILE(0xd8570003));
+static const struct bt_uuid_128 data_uuid = BT_UUID_INIT_128(OF_PROFILE(0xd8570004));
 
 /* What the host's thread says of a connection, in flags: a queue that is full would hold up that thread while the node's
  * waits for a buffer of it. Only what was written is queued; where there is no room its writer is told. */
 typedef struct line {
     struct bt_conn *connection; /* set by the host's thread while it is NULL, given back by the node's thread */
-    atomic_t begun, ended, mtu, subscribed;
-    bool known; /* the node knows of it */
+    atomic_t begun, ended, mtu, subscribed, hears;
+    bool known, heard; /* the node knows of it, and that it hears data messages */
 } line;
 
 typedef struct said {
     uint8_t place;
+    bool drives; /* a set point, not a command */
     uint16_t length;
     uint8_t octets[512];
 } said;
@@ -45,12 +48,11 @@ static line *line_of(const struct bt_conn *connection)
     return NULL;
 }
 
-static ssize_t on_write(struct bt_conn *connection, const struct bt_gatt_attr *attribute, const void *octets,
-                        uint16_t length, uint16_t offset, uint8_t flags)
+static ssize_t take(const struct bt_conn *connection, const void *octets, uint16_t length, uint16_t offset,
+                    uint8_t flags, bool drives)
 {
     static said one; /* the host calls back from one thread */
     const line *own = line_of(connection);
-    (void)attribute;
     if ((flags & BT_GATT_WRITE_FLAG_PREPARE) != 0) {
         return 0;
     }
@@ -58,6 +60,7 @@ static ssize_t on_write(struct bt_conn *connection, const struct bt_gatt_attr *a
         return BT_GATT_ERR(BT_ATT_ERR_INVALID_ATTRIBUTE_LEN);
     }
     one.place = own != NULL ? (uint8_t)(own - lines) : 0;
+    one.drives = drives;
     one.length = length;
     memcpy(one.octets, octets, length);
     if (own == NULL || k_msgq_put(&teds_ble_said, &one, K_NO_WAIT) != 0) {
@@ -65,6 +68,20 @@ static ssize_t on_write(struct bt_conn *connection, const struct bt_gatt_attr *a
     }
     teds_zephyr_wake();
     return (ssize_t)length;
+}
+
+static ssize_t on_write(struct bt_conn *connection, const struct bt_gatt_attr *attribute, const void *octets,
+                        uint16_t length, uint16_t offset, uint8_t flags)
+{
+    (void)attribute;
+    return take(connection, octets, length, offset, flags, false);
+}
+
+static ssize_t on_drive(struct bt_conn *connection, const struct bt_gatt_attr *attribute, const void *octets,
+                        uint16_t length, uint16_t offset, uint8_t flags)
+{
+    (void)attribute;
+    return take(connection, octets, length, offset, flags, true);
 }
 
 static ssize_t on_subscribe(struct bt_conn *connection, const struct bt_gatt_attr *attribute, uint16_t value)
@@ -78,14 +95,31 @@ static ssize_t on_subscribe(struct bt_conn *connection, const struct bt_gatt_att
     return sizeof value;
 }
 
+static ssize_t on_hear(struct bt_conn *connection, const struct bt_gatt_attr *attribute, uint16_t value)
+{
+    line *own = line_of(connection);
+    (void)attribute;
+    if (own != NULL) {
+        atomic_set(&own->hears, value == BT_GATT_CCC_NOTIFY);
+    }
+    teds_zephyr_wake();
+    return sizeof value;
+}
+
 static struct bt_gatt_ccc_managed_user_data subscriptions = BT_GATT_CCC_MANAGED_USER_DATA_INIT(NULL, on_subscribe, NULL);
+static struct bt_gatt_ccc_managed_user_data hearers = BT_GATT_CCC_MANAGED_USER_DATA_INIT(NULL, on_hear, NULL);
 
 BT_GATT_SERVICE_DEFINE(teds_service, BT_GATT_PRIMARY_SERVICE(&service_uuid),
                        BT_GATT_CHARACTERISTIC(&write_uuid.uuid, BT_GATT_CHRC_WRITE, BT_GATT_PERM_WRITE, NULL, on_write,
                                               NULL),
                        BT_GATT_CHARACTERISTIC(&notify_uuid.uuid, BT_GATT_CHRC_NOTIFY, BT_GATT_PERM_NONE, NULL, NULL,
                                               NULL),
-                       BT_GATT_CCC_MANAGED(&subscriptions, BT_GATT_PERM_READ | BT_GATT_PERM_WRITE));
+                       BT_GATT_CCC_MANAGED(&subscriptions, BT_GATT_PERM_READ | BT_GATT_PERM_WRITE),
+                       BT_GATT_CHARACTERISTIC(&data_uuid.uuid, BT_GATT_CHRC_WRITE_WITHOUT_RESP | BT_GATT_CHRC_NOTIFY,
+                                              BT_GATT_PERM_WRITE, NULL, on_drive, NULL),
+                       BT_GATT_CCC_MANAGED(&hearers, BT_GATT_PERM_READ | BT_GATT_PERM_WRITE));
+#define REPLIES 4 /* places of the values that are notified, as BT_GATT_SERVICE_DEFINE lays attributes out */
+#define DATA 7
 
 static void on_connected(struct bt_conn *connection, uint8_t error)
 {
@@ -94,6 +128,7 @@ static void on_connected(struct bt_conn *connection, uint8_t error)
     if (error == 0 && own != NULL) {
         atomic_set(&own->mtu, bt_gatt_get_mtu(connection));
         atomic_set(&own->subscribed, 0);
+        atomic_set(&own->hears, 0);
         own->connection = bt_conn_ref(connection);
         atomic_set(&own->begun, 1);
     }
@@ -165,13 +200,40 @@ static void end(teds_node *node, uint8_t place)
     line *own = &lines[place];
     if (own->known) {
         teds_ble_disconnected(node, place);
-        own->known = false;
+        own->known = own->heard = false;
     }
     bt_conn_unref(own->connection);
     atomic_set(&own->begun, 0);
     own->connection = NULL;
     atomic_set(&own->ended, 0); /* last: from now on the place is free */
 }
+
+#if TEDS_OPERATION
+static void tell_who_hears(teds_node *node, uint8_t place)
+{
+    line *own = &lines[place];
+    const bool hears = atomic_get(&own->hears) != 0;
+    if (hears != own->heard) {
+        own->heard = hears;
+        teds_ble_hears(node, place, hears);
+    }
+}
+
+static bool send_data(teds_node *node)
+{
+    static uint8_t out[TEDS_BLE_DATA];
+    bool moved = false;
+    uint8_t place;
+    size_t length;
+    while ((length = teds_ble_data(node, &place, out)) > 0) {
+        if (lines[place].known && atomic_get(&lines[place].ended) == 0) {
+            (void)bt_gatt_notify(lines[place].connection, &teds_service.attrs[DATA], out, (uint16_t)length);
+        }
+        moved = true;
+    }
+    return moved;
+}
+#endif
 
 static bool serve(teds_node *node, uint8_t place)
 {
@@ -194,13 +256,16 @@ static bool serve(teds_node *node, uint8_t place)
         own->known = true;
     }
     teds_ble_mtu(node, place, (uint16_t)atomic_get(&own->mtu));
+#if TEDS_OPERATION
+    tell_who_hears(node, place);
+#endif
     if (teds_ble_drops(node, place)) {
         (void)bt_conn_disconnect(own->connection, BT_HCI_ERR_REMOTE_USER_TERM_CONN);
         return false;
     }
     /* bt_gatt_notify waits for a buffer on this thread: no notification is lost, and no other is reordered. */
     while (atomic_get(&own->subscribed) != 0 && (length = teds_ble_notify(node, place, out)) > 0) {
-        (void)bt_gatt_notify(own->connection, &teds_service.attrs[4], out, (uint16_t)length);
+        (void)bt_gatt_notify(own->connection, &teds_service.attrs[REPLIES], out, (uint16_t)length);
         moved = true;
     }
     return moved;
@@ -214,12 +279,20 @@ bool teds_zephyr_ble_work(teds_node *node)
         moved = serve(node, i) || moved;
     }
     while (k_msgq_get(&teds_ble_said, &one, K_NO_WAIT) == 0) {
-        if (lines[one.place].known) {
+        if (lines[one.place].known && !one.drives) {
             teds_ble_written(node, one.place, one.octets, one.length);
         }
+#if TEDS_OPERATION
+        if (lines[one.place].known && one.drives) {
+            teds_ble_driven(node, one.place, one.octets, one.length);
+        }
+#endif
         (void)serve(node, one.place);
         moved = true;
     }
+#if TEDS_OPERATION
+    moved = send_data(node) || moved;
+#endif
     advertise(node);
     return moved;
 }

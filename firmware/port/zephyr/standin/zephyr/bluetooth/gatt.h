@@ -34,6 +34,7 @@ struct bt_gatt_cb {
 #define BT_GATT_SERVICE_DEFINE(_name, ...)                        \
     static const struct bt_gatt_attr attr_##_name[] = {__VA_ARGS__}; \
     static const struct bt_gatt_service_static _name = {attr_##_name, ARRAY_SIZE(attr_##_name)}
+#define BT_GATT_CHRC_WRITE_WITHOUT_RESP 0x04
 #define BT_GATT_CHRC_WRITE 0x08
 #define BT_GATT_CHRC_NOTIFY 0x10
 #define BT_GATT_PERM_NONE 0
