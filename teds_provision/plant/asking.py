@@ -221,18 +221,19 @@ class PostOffice:
         self.station, self.post, self.timeout = station, post, timeout
         self._inbox = Inbox(station, post, SIGNED)
         self._news = threading.Condition()
-        self._came: dict[str, Came] = {}
+        self._came: dict[tuple[str, str], Came] = {}
         self._looking = False
 
     def ask(self, request: SignRequest) -> bytes | None:
-        """Send the request and wait for its answer."""
+        """Send the request and wait for its answer; what others than that office signed answers nothing."""
         send(self.station, self.post, request.to, request.octets, name_of(request.hash))
+        wanted = request.to, request.hash
         until, pause = time.monotonic() + self.timeout, _LOOK_SECONDS
         while True:
             with self._news:
-                while self._looking and request.hash not in self._came:
+                while self._looking and wanted not in self._came:
                     self._news.wait(max(0.0, until - time.monotonic()) + _LOOK_SECONDS)
-                come = self._came.pop(request.hash, None)
+                come = self._came.pop(wanted, None)
                 self._looking = come is None
             if come is not None:
                 come.drop()
@@ -245,25 +246,26 @@ class PostOffice:
                     pause = min(2 * pause, _MOST_LOOK_SECONDS)
             finally:
                 with self._news:
-                    self._came |= {_of(one.document): one for one in found}
+                    self._came |= {self._answered(one.document): one for one in found}
                     self._looking = False
                     self._news.notify_all()
             if not found and time.monotonic() >= until:
                 return None
 
+    def _answered(self, document: bytes) -> tuple[str, str]:
+        """Who signed an answer, and the H of the request that it is to; "" where nobody here signed it."""
+        try:
+            told = jose.verify_compact(
+                document.strip(), roster_of(self.station).point_of, typ=SIGNED.typ, max_octets=SIGNED.most
+            )
+            return told.kid, str(load_object(told.payload, "The answer").get("of"))
+        except (BadData, NotAuthentic, PolicyRefused):
+            return "", ""
+
     def close(self) -> None:
         """Let go of what carries."""
         self._inbox.close()
         self.post.close()
-
-
-def _of(document: bytes) -> str:
-    """The H of the request that an answer says it is to, "" for none; who signed it is looked at later."""
-    try:
-        told = load_object(decode_base64url(document.split(b".")[1], "The answer"), "The answer")
-    except (BadData, IndexError):
-        return ""
-    return str(told.get("of"))
 
 
 @dataclass

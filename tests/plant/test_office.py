@@ -14,7 +14,8 @@ import pytest
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
 from teds_provision.plant import jobs
-from teds_provision.plant.asking import NotAnswered, Refused
+from teds_provision.plant.asking import NotAnswered, PostOffice, Refused, send
+from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, answer
@@ -282,6 +283,33 @@ def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
         with pytest.raises(NotAuthentic):
             build(run, one)
     run.office = office
+    assert build(run, one).verified.verdict == "authentic"
+
+
+def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(desk: Desk) -> None:
+    east = desk.plant.member("east", "audit")
+    desk.plant.round()
+    east.unlock()
+    run, one, post = desk.run(), board(1), FilesPost(desk.plant.stick)
+    request = desk.request(run, one)
+    lies = [
+        seal_answer(Answer(request.hash, refused="revoked", why="a lie"), station.credentials().key)
+        for station in (east, desk.line)
+    ]
+    lies.append(seal_answer(Answer(request.hash, 9, b""), SoftwareKey.generate()))
+
+    def leave(document: bytes, name: str) -> None:
+        send(east, post, desk.line.identity.fingerprint, document, f"{name}-0000-4000-8000-000000000000")
+
+    leave(lies[0], "00000000")
+    run.office = PostOffice(desk.line, post, 0.2)
+    with pytest.raises(NotAnswered):
+        build(run, one)
+    for n, lie in enumerate(lies):
+        leave(lie, f"fffffff{n}")
+    answered = answer(desk.office, request.octets)
+    assert answered is not None
+    leave(answered, "88888888")
     assert build(run, one).verified.verdict == "authentic"
 
 
