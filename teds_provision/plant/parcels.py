@@ -36,6 +36,8 @@ from teds_provision.store.tables.plant import Alarm
 NODES: Final = 10_000
 """So many nodes go into one copy."""
 DAYS: Final = 7
+_DAYS_OF_A_LINE: Final = 31
+"""So long a request or an answer waits here: no registry keeps one longer."""
 _COMMAND: Final = "registry sync"
 _KEPT: Final = 64
 """So many parcels of one sender wait here for a person; the others stay where they are."""
@@ -62,6 +64,7 @@ def take_in(station: Station, post: Post, views: Views, now: datetime) -> Receiv
     roster = station.plant.roster
     if roster is None:
         return Received(0, 0)
+    _drop_outlived(station, now)
     reader = _Reader(station, roster, views, now)
     taken = sum(reader.again(row) for row in station.plant.parcels.parcels("in", "later"))
     for parcel in post.parcels(station.fingerprint):
@@ -70,6 +73,23 @@ def take_in(station: Station, post: Post, views: Views, now: datetime) -> Receiv
             post.drop(parcel.id, station.fingerprint)
             taken += done
     return Received(taken, len(station.plant.parcels.parcels("in", "waiting", "later")))
+
+
+def _drop_outlived(station: Station, now: datetime) -> None:
+    """Drop what waits here and can be of no use: a bundle that has expired, an old request or answer.
+
+    A sender makes an expired copy anew, a line asks again; what stayed would take the room of what comes (64 of a sender).
+    """
+    tables, oldest = station.plant.parcels, time_text(now - timedelta(days=_DAYS_OF_A_LINE))
+    for row in tables.parcels("in", "waiting", "later"):
+        if row.kind == "bundle":
+            over = bool(row.expires) and row.expires <= time_text(now)
+        else:
+            over = row.kind in ("sign-request", "signed") and row.created < oldest
+        if over:
+            with station.durable(_COMMAND):
+                tables.drop_parcel(row.id, "in")
+                station.audit("import", None, "expired", parcel=row.id, handover=row.about)
 
 
 class _Reader:

@@ -14,6 +14,7 @@ from teds_provision.plant import parcels
 from teds_provision.plant.post import Parcel
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
+from teds_provision.store.tables.parcels import ParcelKind
 from tests.plant.handing import Plant, board_of
 
 ROLES = {"north": "keeper sign line base", "south": "base", "west": "line"}
@@ -105,6 +106,43 @@ def test_a_copy_that_nobody_shares_waits_for_a_person(plant: Plant) -> None:
     assert holds(plant["south"], board.uuid) == []
     assert waits(plant["south"]) == [f"{board.uuid.hex()}: no share of the roster sends it here"]
     assert plant.post.there == {}
+
+
+def test_a_copy_that_expired_while_it_waited_makes_room_for_the_next_one(plant: Plant) -> None:
+    board_of(plant["west"], os.urandom(10))
+    plant.roster(ROLES, everything(plant, "south"))
+    parcels.send_out(plant["west"], plant.post, plant.views("west"), now())
+    plant.roster(ROLES)  # shared no more: it waits for a person
+    sync(plant, "south")
+    assert len(waits(plant["south"])) == 1
+    sync(plant, "south", at=now(6))
+    assert len(waits(plant["south"])) == 1
+    sync(plant, "south", at=now(8))
+    assert waits(plant["south"]) == []
+
+
+def test_answers_that_nobody_asks_for_any_more_do_not_keep_jobs_out(plant: Plant) -> None:
+    from teds_provision.protocol.plant import document
+
+    plant.roster(ROLES)
+    north, west = plant["north"], plant["west"]
+
+    def send(kind: document.Kind, name: ParcelKind, n: int) -> None:
+        members = {"format": kind.format, "id": f"6f1c0a52-6f0e-4c1b-8a55-{n:012d}"}
+        parcels.enqueue(north, name, west.fingerprint, document.seal(members, north.vault.identity(), kind), days=60)
+        sync(plant, "north")
+
+    for n in range(64):
+        send(document.SIGNED, "signed", n)
+    sync(plant, "west")
+    send(document.JOB, "job", 0)
+    sync(plant, "west", at=now(30))
+    assert parcels.received(west, "job") == []
+    sync(plant, "west", at=now(32))
+    assert len(parcels.received(west, "job")) == 1
+    assert parcels.received(west, "signed") == []
+    sync(plant, "west", at=now(90))
+    assert len(parcels.received(west, "job")) == 1
 
 
 def test_a_move_waits_for_a_person_whatever_the_roster_shares(plant: Plant) -> None:
