@@ -10,6 +10,7 @@
 #define FIRST_STATION 0xF1u
 #define LAST_STATION 0xF7u
 #define CR_NS TEDS_SECOND
+#define MOST_OF_12_BITS 4095u
 #define EVERYONE_NS (UINT64_C(50) * 1000000u)
 #define START_NS (UINT64_C(500) * 1000000u)
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
@@ -154,13 +155,16 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
     if (frame->length < 8) {
         return;
     }
-    if (length == 0) { /* more than 4095 octets */
+    if (length == 0) { /* in 32 bits: more than 4095 octets, else it is ignored (ISO 15765-2) */
         length = teds_get32(frame->data + 2);
         head = 6;
+        if (length <= MOST_OF_12_BITS) {
+            return;
+        }
     } else if (length < frame->length - 1u) {
         return; /* would fit one frame: not to be answered (ISO 15765-2) */
     }
-    if (length > sizeof can->rx) {
+    if (length > sizeof can->rx) { /* always so of a length in 32 bits; what is taken is longer than its first frame */
         refuse(line, frame->data[head], TEDS_TOO_LARGE, frame->fd);
         return;
     }

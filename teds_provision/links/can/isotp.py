@@ -248,8 +248,8 @@ def _is_plain(single_frame: bytes) -> bool:
 def _tolerable(data: bytes) -> bytes | None:
     """Drop what ISO 15765-2 says to ignore and can-isotp would take for the end of a transfer.
 
-    Unknown frame types, single frames with an impossible length, first frames of 7 octets or fewer and unknown flow
-    states are ignored; a reserved STmin counts as 127 ms.
+    Unknown frame types, single frames with an impossible length, first frames of 7 octets or fewer, or of 4095 or fewer
+    by 32 bits, and unknown flow states are ignored; a reserved STmin counts as 127 ms.
     """
     if len(data) < 2:
         return None
@@ -257,11 +257,18 @@ def _tolerable(data: bytes) -> bytes | None:
     if kind == _SINGLE:
         return data if read_single(data) is not None else None
     if kind == _FIRST:
-        length = (data[0] & 0xF) << 8 | data[1]
-        return data if len(data) >= 8 and (length > 7 or length == 0) else None
+        return data if len(data) >= 8 and _announced(data)[0] > 7 else None
     if kind == _CONSECUTIVE:
         return data
     return _tolerable_flow(data) if kind == _FLOW else None
+
+
+def _announced(first: bytes) -> tuple[int, int]:
+    """Octets that a first frame announces, and where they begin; 0 where 32 bits say what 12 bits hold."""
+    if length := (first[0] & 0xF) << 8 | first[1]:
+        return length, 2
+    length = int.from_bytes(first[2:6], "big")
+    return (length if length > LONGEST else 0), 6
 
 
 def _tolerable_flow(data: bytes) -> bytes | None:
@@ -302,12 +309,10 @@ class Reassembly:
     @classmethod
     def begin(cls, peer: int, frame: Frame) -> Reassembly | None:
         """Start with a first frame; None where it is none, or announces a length that needs none."""
-        data, start = frame.data, 2
+        data = frame.data
         if len(data) < 8 or data[0] >> 4 != 1:
             return None
-        length = (data[0] & 0xF) << 8 | data[1]
-        if not length:  # the escape for more than 4095 octets
-            length, start = int.from_bytes(data[2:6], "big"), 6
+        length, start = _announced(data)
         if length <= 7:
             return None
         return cls(peer, length, bytearray(data[start : start + length]), data, frame.fd)

@@ -172,6 +172,39 @@ static void what_cannot_be_taken_is_refused_by_one_frame(void)
     memory_free(board);
 }
 
+/* A length in 32 bits that 12 bits hold is ignored (ISO 15765-2), and nothing is ever written behind what it announced:
+ * a first frame that says less than it carries would never end. */
+static void a_long_length_that_is_short_is_nobodys(void)
+{
+    static const uint16_t lengths[] = {0, 1, 2, 3, 7, 8, 57, 58, 59, 1024, 1025, 4095};
+    for (size_t i = 0; i < 2 * (sizeof lengths / sizeof lengths[0]); i++) {
+        memory_board *board = fresh();
+        const bool fd = i % 2 != 0;
+        const uint8_t octets = fd ? 64 : 8;
+        uint8_t streams[sizeof board->node.streams], staging[sizeof board->node.staging];
+        char frame[64];
+        memcpy(streams, &board->node.streams, sizeof streams);
+        memcpy(staging, board->node.staging, sizeof staging);
+        memset(frame, 0x41, sizeof frame);
+        memcpy(frame, "\x10\x00\x00\x00", 4);
+        teds_put16((uint8_t *)frame + 4, lengths[i / 2]);
+        in(board, TO_NODE, frame, octets, fd);
+        CHECK(silent(board), "%u by 32 bits, FD %d", lengths[i / 2], fd);
+        for (int number = 1; number < 600; number++) {
+            frame[0] = (char)(0x20 | (number & 15));
+            in(board, TO_NODE, frame, octets, fd);
+            CHECK(board->node.can.rx_at <= sizeof board->node.can.rx, "%u octets held", board->node.can.rx_at);
+            if (board->node.can.rx_at > sizeof board->node.can.rx) {
+                break;
+            }
+        }
+        CHECK(memcmp(streams, &board->node.streams, sizeof streams) == 0 &&
+                  memcmp(staging, board->node.staging, sizeof staging) == 0,
+              "what lies behind is as it was");
+        memory_free(board);
+    }
+}
+
 static void frames_may_come_twice(void)
 {
     memory_board *board = fresh();
@@ -285,6 +318,7 @@ int main(void)
     what_nobody_takes_up_is_given_up();
     a_broken_question_is_dropped();
     what_cannot_be_taken_is_refused_by_one_frame();
+    a_long_length_that_is_short_is_nobodys();
     frames_may_come_twice();
     a_repetition_while_the_reply_is_under_way_gets_it_again();
     everyone_is_answered_after_a_wait();

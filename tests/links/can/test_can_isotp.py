@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from teds_provision.links.can import pacing
 from teds_provision.links.can.bus import Bus, Frame
-from teds_provision.links.can.isotp import Pair, addresses, padded, physical_id, read_single, single
+from teds_provision.links.can.isotp import Pair, Reassembly, addresses, padded, physical_id, read_single, single
 from teds_provision.links.can.pacing import Pacer, classic_bits, fd_seconds
 from teds_provision.links.can.shared import Gathering
 from teds_provision.links.can.spec import parse_spec
@@ -106,6 +106,16 @@ def test_more_than_4095_octets_are_answered_with_overflow() -> None:
     wire.station.send(bytes(100))
     wire.station.take(overflow)
     assert wire.station.overflow
+
+
+@pytest.mark.parametrize("length", [0, 1, 8, 57, 58, 1025, 4095, 4096])
+@pytest.mark.parametrize("fd", [False, True])
+def test_a_length_in_32_bits_that_12_bits_hold_is_nobodys(length: int, fd: bool) -> None:
+    data = (b"\x10\x00" + length.to_bytes(4, "big")).ljust(64 if fd else 8, b"A")
+    wire = Wire()
+    wire.node.take(Frame(physical_id(NODE, STATION), data, fd))
+    assert wire.node.receiving is False
+    assert (Reassembly.begin(STATION, Frame(0, data, fd)) is None) == (length <= 4095)
 
 
 def test_a_second_first_frame_begins_again() -> None:
