@@ -48,13 +48,37 @@ def option_names() -> str:
         names = ", ".join(f'"{_long(option)}"' for option in options_of(command))
         if names:
             rows.append(f'    "{path}": frozenset({{{names}}}),')
+    parameters, several = parameter_names()
     return (
         '"""The options of every command, by its path ("" for the program). Written by scripts/options.py."""\n\n'
         "from __future__ import annotations\n\nfrom typing import Final\n\n# fmt: off\n"
         "OPTIONS: Final[dict[str, frozenset[str]]] = {\n" + "\n".join(rows) + "\n}\n"
         "FILES: Final = frozenset({" + ", ".join(f'"{name}"' for name in file_names()) + "})\n"
         '"""Options that name a file or a folder, in every command that has them."""\n'
+        "PARAMETERS: Final[dict[str, dict[str, str]]] = {\n" + "\n".join(parameters) + "\n}\n"
+        '"""Options that the code calls otherwise than the command line does."""\n'
+        "SEVERAL: Final[dict[str, frozenset[str]]] = {\n" + "\n".join(several) + "\n}\n"
+        '"""Options that may be given several times."""\n'
     ).replace("# fmt: off\n", "# fmt: off\n# ruff: noqa: E501\n")
+
+
+def parameter_names() -> tuple[list[str], list[str]]:
+    """Rows of the options that have another name in the code, and of those that may be given several times."""
+    parameters, several = [], []
+    for path, command in commands():
+        options = options_of(command)
+        names = [option.name for option in options]
+        renamed = [  # flags that share a parameter are a choice of the moment, no settings
+            f'"{_long(option)}": "{option.name}"'
+            for option in options
+            if option.name != _long(option).replace("-", "_") and names.count(option.name) == 1
+        ]
+        repeated = [f'"{_long(option)}"' for option in options if option.multiple]
+        if renamed:
+            parameters.append(f'    "{path}": {{{", ".join(renamed)}}},')
+        if repeated:
+            several.append(f'    "{path}": frozenset({{{", ".join(repeated)}}}),')
+    return parameters, several
 
 
 def file_names() -> list[str]:
@@ -89,7 +113,9 @@ def configuration() -> str:
         "",
         "A key that no command knows is an error that names its line. `teds-provision config show` lists what is set,",
         "and where; `config set` and `config unset` change the file.",
-        "Flags are `true` or `false` in the file, `1` or `0` in a variable. `make man` writes this page.",
+        "Flags are `true` or `false` in the file, `1` or `0` in a variable. Several values are a list in the file",
+        '(`can = ["socketcan:can0", "socketcan:can1"]`), divided by blanks in a variable; outside of a table such a',
+        "list serves the commands that take several. `make man` writes this page.",
         "",
         "Without `--via` a command takes the link that `--can` or `--ble` names. Where none is named, a node is looked",
         "for on the bus in `config.toml` or the variable, else on the bus where it was last met; then a tap is waited",

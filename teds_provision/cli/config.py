@@ -14,8 +14,8 @@ import click
 from teds_provision.cli import completing
 from teds_provision.cli.configuration import (
     anchored,
-    as_parameters,
     config_path,
+    parameter_of,
     problems,
     read_config,
     read_config_text,
@@ -108,6 +108,8 @@ def _check_value(root: click.Context, name: str, value: Any, place: Path) -> Non
     if found is None:
         return
     path, command, option = found
+    if option.multiple and not isinstance(value, list):
+        value = [value]
     try:
         option.process_value(click.Context(command, parent=root, info_name=path), value)
     except click.BadParameter as error:
@@ -118,10 +120,9 @@ def _check_value(root: click.Context, name: str, value: Any, place: Path) -> Non
 def _parameter(root: click.Context, name: str) -> tuple[str, click.Command, click.Parameter] | None:
     """The first command that a setting serves, with its path and the option that is meant; None for a broker."""
     *words, option = name.replace("_", "-").split(".")
-    wanted = next(iter(as_parameters({option: None})))
     for path, options in OPTIONS.items():
         if option in options and path.split()[: len(words)] == words:
-            command = _command(root, path)
+            command, wanted = _command(root, path), parameter_of(path, option)
             return next(((path, command, each) for each in command.params if each.name == wanted), None)
     return None
 
@@ -199,7 +200,8 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
         return value if listed is None else listed
     path, command, option_ = parameter
     try:
-        read = option_.process_value(click.Context(command, parent=root, info_name=path), value)
+        given = [value] if option_.multiple else value
+        read = option_.process_value(click.Context(command, parent=root, info_name=path), given)
     except click.BadParameter as error:
         raise UsageFailure(f"{name}: {error.message.rstrip('.')}.") from error
     return read if isinstance(read, bool | int | float) else value

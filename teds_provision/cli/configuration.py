@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.cli.option_names import FILES, OPTIONS
+from teds_provision.cli.option_names import FILES, OPTIONS, PARAMETERS, SEVERAL
 from teds_provision.cli.table import COMMANDS, GROUPS
 from teds_provision.errors import BadData, NotFound
 from teds_provision.lazy import late
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 else:
     difflib, files, limits = late("difflib"), late("teds_provision.files"), late("teds_provision.limits")  # where it is
 
-PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "all": "everything"}
-"""Options that the code calls otherwise than the command line does."""
 NEVER_IN_FILE: Final = frozenset({"home", "help", "version", "passphrase-fd"})
 BROKERS: Final = "ncap brokers"
 """A table of names and URLs, not of options."""
@@ -38,36 +36,55 @@ _MEND: Final = "Fix or remove the file."
 class Defaults(dict[str, Any]):
     """Values of config.toml: what stands outside of a table serves every command, a table the command of its name.
 
-    The same word may be an option and a command (``profile``), so a command is given plain values, never tables.
+    The same word may be an option and a command (``profile``), so a command is given plain values, never tables, and of
+    these the ones that it has options for, under the names of its parameters.
     """
+
+    def __init__(self, values: dict[str, Any], path: str = "") -> None:
+        self._values, self._path = {name.replace("_", "-"): value for name, value in values.items()}, path
+        super().__init__({parameter_of(path, name): value for name, value in self._values.items()})
 
     def get(self, key: str, default: Any = None) -> Any:
         """Return the defaults of command ``key``, or the value of global option ``key``."""
-        if key not in COMMANDS:
-            return super().get(key, default)
-        return _of_command(self, key, GroupDefaults if key in GROUPS else dict)
+        path = f"{self._path} {key}".strip()
+        if path in GROUPS or (self._path and path not in OPTIONS and is_command(path)):
+            return Defaults({**_common(self._values), **self._own(key)}, path)
+        if key in COMMANDS or path in OPTIONS:
+            return self._of_command(path, self._own(key))
+        return super().get(key, default)
+
+    def _own(self, key: str) -> dict[str, Any]:
+        own = self._values.get(key)
+        return {name.replace("_", "-"): value for name, value in own.items()} if isinstance(own, dict) else {}
+
+    def _of_command(self, path: str, own: dict[str, Any]) -> dict[str, Any]:
+        """What click is given for a command: by parameter, a list for what may be given several times."""
+        found = {}
+        for name, value in {**_common(self._values), **own}.items():
+            if name not in OPTIONS.get(path, ()) or isinstance(value, dict):
+                continue
+            listed = isinstance(value, list)
+            repeats = name in SEVERAL.get(path, ())
+            if listed and not repeats and name in own:
+                raise BadData(f"config.toml: {path} takes one --{name}, and {len(value)} are named.", hint=_MEND)
+            if listed and not repeats:
+                continue  # several buses are for the commands that work with several
+            found[parameter_of(path, name)] = [value] if repeats and not listed else value
+        return found
 
 
-class GroupDefaults(dict[str, Any]):
-    """The values of a command that has commands of its own, which are all that it is asked for."""
-
-    def get(self, key: str, default: Any = None) -> Any:
-        """Return the defaults of command ``key``."""
-        return _of_command(self, key, dict)
+def _common(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if not isinstance(value, dict)}
 
 
-def _of_command(values: dict[str, Any], name: str, make: type[dict[str, Any]]) -> dict[str, Any]:
-    own = dict.get(values, name.replace("-", "_"))
-    common = {key: value for key, value in values.items() if not isinstance(value, dict)}
-    return make({**common, **(own if isinstance(own, dict) else {})})
+def is_command(path: str) -> bool:
+    """Whether there is such a command, or a group of commands with options."""
+    return path in OPTIONS or any(name.startswith(f"{path} ") for name in OPTIONS)
 
 
-def as_parameters(values: dict[str, Any]) -> dict[str, Any]:
-    """Spell the keys as click names parameters, in every table."""
-    return {
-        PARAMETERS.get(name, name.replace("-", "_")): as_parameters(value) if isinstance(value, dict) else value
-        for name, value in values.items()
-    }
+def parameter_of(path: str, option: str) -> str:
+    """What the code of a command calls one of its options, as the command line spells that."""
+    return PARAMETERS.get(path, {}).get(option, option.replace("-", "_"))
 
 
 def anchored(values: dict[str, Any], folder: Path, above: str = "") -> dict[str, Any]:
@@ -159,7 +176,7 @@ def _problems_of_command(command: str, values: dict[str, Any], text: str) -> Ite
             inner = f"{command} {plain}"
             if inner == BROKERS:
                 yield from _problems_of_brokers(value, text)
-            elif inner in OPTIONS:
+            elif is_command(inner):
                 yield from _problems_of_command(inner, value, text)
             else:
                 yield f"{_line(text, name)}: there is no command {inner[:_LONGEST]!r}."

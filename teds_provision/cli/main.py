@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import click
 
 from teds_provision import __version__
-from teds_provision.cli.configuration import PARAMETERS, Defaults, anchored, as_parameters, config_path, read_config
+from teds_provision.cli.configuration import Defaults, anchored, config_path, read_config
 from teds_provision.cli.context import App, nowhere, say
+from teds_provision.cli.option_names import PARAMETERS
 from teds_provision.cli.table import COMMANDS, SECTIONS
 from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError
 from teds_provision.lazy import late
@@ -59,7 +60,7 @@ class LazyGroup(click.Group):
         module = importlib.import_module(f"teds_provision.cli.{entry.module}")
         command = getattr(module, entry.attribute)
         assert isinstance(command, click.Command)
-        _read_by_name(command)
+        _read_by_name(command, cmd_name)
         for teach in self.teachers:
             teach(command)
         return command
@@ -92,14 +93,15 @@ class LazyGroup(click.Group):
                         formatter.write_dl([(name.ljust(width), entry.help)])
 
 
-def _read_by_name(command: click.Command) -> None:
-    """Have such options read TEDS_PROVISION_<NAME>, where the name is the command line's."""
-    names = {parameter: name for name, parameter in PARAMETERS.items()}
+def _read_by_name(command: click.Command, path: str) -> None:
+    """Have each option read TEDS_PROVISION_<NAME> where the code has another name for it than the command line."""
+    options = {parameter: option for option, parameter in PARAMETERS.get(path, {}).items()}
     for option in command.params:
-        if option.name in names and isinstance(option, click.Option):
-            option.envvar = f"{ENVIRONMENT_PREFIX}_{names[option.name].upper()}"
-    for inner in command.commands.values() if isinstance(command, click.Group) else ():
-        _read_by_name(inner)
+        if option.name in options and isinstance(option, click.Option):
+            option.envvar = f"{ENVIRONMENT_PREFIX}_{options[option.name].replace('-', '_').upper()}"
+            option.allow_from_autoenv = False
+    for name, inner in command.commands.items() if isinstance(command, click.Group) else ():
+        _read_by_name(inner, f"{path} {name}")
 
 
 class _Folder(click.Path):
@@ -121,7 +123,7 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
         ctx.meta[_BROKEN] = error
         return home
     if values is not None:
-        ctx.default_map = Defaults(as_parameters(anchored(values, place.parent)))
+        ctx.default_map = Defaults(anchored(values, place.parent))
     return home
 
 

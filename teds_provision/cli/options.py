@@ -45,14 +45,6 @@ def command(*lines: str, **attributes: Any) -> Callable[[Callable[..., Any]], cl
     return click.command(context_settings=settings, epilog=examples(*lines), **attributes)
 
 
-class _Several(click.Option):
-    """An option that may be given several times, and once, as a bare word, in config.toml."""
-
-    def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
-        """Take a word for a list of one."""
-        return super().type_cast_value(ctx, (value,) if isinstance(value, str) else value)
-
-
 class Number(click.FloatRange):
     """A finite number within bounds: NaN is within all bounds of click, and nothing can be done with it."""
 
@@ -172,7 +164,6 @@ def link_options(function: Function) -> Function:
             "--nfc",
             metavar="PATH",
             multiple=True,
-            cls=_Several,
             help="Reader: auto (the one that is connected), usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321; "
             "several with --watch.",
         ),
@@ -180,7 +171,6 @@ def link_options(function: Function) -> Function:
             "--can",
             metavar="INTERFACE:CHANNEL",
             multiple=True,
-            cls=_Several,
             help="Bus: socketcan:can0, udp_multicast:239.74.163.2, …; several with measure.",
         ),
         click.option(

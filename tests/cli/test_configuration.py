@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import click
 import pytest
 
-from teds_provision.cli.configuration import anchored
+from teds_provision.cli.configuration import Defaults, anchored
+from teds_provision.cli.main import cli
 
 from .shell import call, clean_environment
 
@@ -63,6 +67,57 @@ def test_a_bad_value_is_named_before_it_hurts(home: Path) -> None:
     (home / "config.toml").write_text('[provision]\ntimeout = "soon"\n')
     done = call(home, "--json", "config", "show")
     assert (done.code, "provision.timeout = 'soon'" in done.json["error"]["message"]) == (8, True)
+
+
+def options(command: click.Command = cli, *path: str) -> Iterator[tuple[tuple[str, ...], click.Option, str]]:
+    """Every option of every command but flags, with its name on the command line."""
+    for option in command.params:
+        long = next((name[2:] for name in option.opts if name.startswith("--")), "")
+        if isinstance(option, click.Option) and path and long and not option.is_flag:
+            yield path, option, long
+    context = click.Context(command)
+    for name in command.list_commands(context) if isinstance(command, click.Group) else ():
+        inner = command.get_command(context, name)
+        assert inner is not None
+        yield from options(inner, *path, name)
+
+
+def test_each_option_is_read_from_file_and_variable_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    for path, option, name in options():
+        nested: dict[str, Any] = {name: "x"}
+        for word in reversed(path):
+            nested = {word: nested}
+        found: Any = Defaults(nested)
+        for word in path:
+            found = found.get(word)
+        assert found == {option.name: ["x"] if option.multiple else "x"}, f"{path} --{name}"
+        variable = f"TEDS_PROVISION_{name.replace('-', '_').upper()}"
+        with monkeypatch.context() as patched:
+            patched.setenv(variable, "x")
+            context = click.Context(cli, auto_envvar_prefix="TEDS_PROVISION")
+            assert option.resolve_envvar_value(context) == "x", f"{variable} of {path}"
+
+
+def test_a_setting_for_all_commands_reaches_those_that_have_the_option_and_no_other_parameter() -> None:
+    root = Defaults({"can": "socketcan:can0", "files": "carried", "timeout": 5})
+    assert root.get("measure") == {"can": ["socketcan:can0"], "timeout": 5}  # --to is what the code calls files
+    assert root.get("ncap").get("run") == {"can": ["socketcan:can0"]}
+    assert root.get("doctor") == {"can": "socketcan:can0"}
+    two = Defaults({"can": ["socketcan:can0", "socketcan:can1"]})
+    assert two.get("ncap").get("run") == {"can": ["socketcan:can0", "socketcan:can1"]}
+    assert two.get("doctor") == {}  # which opens one
+
+
+def test_what_takes_one_value_is_not_given_several(home: Path) -> None:
+    (home / "config.toml").write_text('[doctor]\ncan = ["socketcan:can8", "socketcan:can9"]\n')
+    done = call(home, "--json", "doctor")
+    assert (done.code, done.json["error"]["message"]) == (8, "config.toml: doctor takes one --can, and 2 are named.")
+
+
+def test_one_bus_in_the_file_is_the_bus_of_the_service(home: Path) -> None:
+    assert call(home, "config", "set", "can", "socketcan:can0?bitrat=1").code == 0
+    done = call(home, "--json", "ncap", "run")
+    assert (done.code, "bitrat" in done.json["error"]["message"]) == (2, True), done.json
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -35,7 +35,7 @@ def given(kept: dict[str, Any], *typed: str, read: Callable[[LinkSettings], Link
     def probe(links: LinkSettings) -> None:
         found.append(read(links))
 
-    probe.main(list(typed), default_map=Defaults(kept), standalone_mode=False)
+    probe.main(list(typed), default_map=Defaults(kept).get("measure"), standalone_mode=False)
     return found[0]
 
 
