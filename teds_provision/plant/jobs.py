@@ -92,6 +92,8 @@ def take_received(station: Station) -> None:
     for row, octets in parcels.received(station, "job"):
         try:
             take_job(station, octets)
+        except RosterExpired:
+            return  # nothing begins now; a renewed roster decides
         except (BadData, NotAuthentic, PolicyRefused) as error:
             station.notice(f"A job that came was not taken: {error.message}")
         with station.durable("job"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import timedelta
@@ -11,8 +12,10 @@ from typing import Any
 
 import pytest
 
+from teds_provision import plant
 from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, OtherKey, PolicyRefused, RosterExpired
 from teds_provision.plant import owner as owning
+from teds_provision.plant import parcels
 from teds_provision.plant.asking import send_job
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import find_job, take_job, take_received
@@ -26,6 +29,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoard
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import Provisioned, inspect, provision
+from teds_provision.store.tables.parcels import ParcelRow
 from teds_provision.talk.progress import Silent
 from tests.bench import Board, MemoryLink, make_station, talk
 
@@ -117,6 +121,24 @@ def test_no_job_begins_once_the_roster_has_expired(tmp_path: Path) -> None:
     with pytest.raises(RosterExpired) as caught:
         take_job(station, job_of(station))
     assert (caught.value.exit_code, caught.value.code) == (6, "roster-expired")
+    station.close()
+
+
+def test_a_job_that_comes_while_the_roster_has_expired_waits_for_the_renewed_one(tmp_path: Path) -> None:
+    station = make_station(tmp_path / "home", "owner")
+    own = member(station, "owner", *ALL)
+    expired = roster_of(station, own, expires=NOW - timedelta(hours=1))
+    join(station, expired)
+    job = open_job(job_of(station), lambda kid: station.point)
+    me = station.identity.fingerprint
+    row = ParcelRow(str(uuid.uuid4()), "in", me, "job", "waiting", "")
+    station.plant.parcels.put_parcel(row, job.octets)
+    take_received(station)
+    assert station.plant.line.jobs() == []
+    plant.folding.put_roster(station, roster_of(station, own, version=2, previous=expired.hash))
+    take_received(station)
+    assert [one.id for one in station.plant.line.jobs()] == [job.id]
+    assert parcels.received(station, "job") == []
     station.close()
 
 
