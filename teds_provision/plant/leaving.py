@@ -53,7 +53,7 @@ def review(station: Station, roster: Roster, now: datetime) -> Review | None:
         return None
     named = hashlib.sha256("".join(sorted(one.fingerprint for one in roster.removed)).encode()).hexdigest()
     before = last(station)
-    if before is not None and before.removed == named and now - datetime.fromisoformat(before.at) < EVERY:
+    if before is not None and before.removed == named and abs(now - datetime.fromisoformat(before.at)) < EVERY:
         return before
     ours = _first_removals(station)
     beyond = _beyond(station, roster)

@@ -101,3 +101,21 @@ def test_what_was_looked_at_while_others_took_its_place_leaves(watch: Watch, mon
     watch._for_strangers = SimpleNamespace(submit=lambda work, contact: work(contact))  # type: ignore[assignment]
     watch.saw(one)
     assert present(watch) == 0
+
+
+@pytest.mark.parametrize("set_by", [-86_400.0, 86_400.0], ids=["back", "forward"])
+def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch, set_by: float
+) -> None:
+    looked: list[str] = []
+    watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
+    one = sighting(3)
+    watch.saw(one)
+    watch._pending.clear()
+    watch._roster.note(one.uuid.hex(), "problem", problem={"code": "link", "message": "It fell silent."})
+    watch.saw(sighting(3))
+    assert len(looked) == 1, "not at once"
+    now = time.time() + set_by
+    monkeypatch.setattr(watching.time, "time", lambda: now)
+    watch.saw(sighting(3))
+    assert len(looked) == 2

@@ -95,6 +95,17 @@ def test_who_has_a_copy_rotates_it_a_day_later(scene: Scene) -> None:
     assert scene.south.keys.rotation_due(uuid) == "registry: west (lost) has had this key"
 
 
+def test_a_clock_that_was_ahead_does_not_keep_anybody_from_looking_again(scene: Scene) -> None:
+    scene.keyed_by(scene.west)
+    scene.remove(scene.west, "lost")
+    scene.sync(scene.south)
+    later(scene.south, 20_000)
+    later(scene.south, 0)
+    review = leaving.last(scene.south)
+    assert review is not None
+    assert abs(datetime.fromisoformat(review.at) - datetime.now(UTC)) < timedelta(minutes=5)
+
+
 def test_a_retired_one_that_forgot_has_no_key_any_more(scene: Scene) -> None:
     kept, forgotten = (board_of(scene.north, os.urandom(10)).uuid for _ in range(2))
     scene.sync(scene.north, scene.south, scene.north)

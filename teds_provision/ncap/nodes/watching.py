@@ -260,7 +260,7 @@ class Watch:
             seen = self._roster.seen(uuid)
             here = seen.place == self.place  # it may have been on another bus meanwhile
             same = here and (before.address, before.identity.state) == (sighting.address, identity.state)
-            retry = seen.problem is not None and time.time() - seen.seen > LOOK_AGAIN
+            retry = seen.problem is not None and abs(time.time() - seen.seen) > LOOK_AGAIN
             if same and not retry and uuid not in self._looked_for:
                 return
         self._looked_for.discard(uuid)
