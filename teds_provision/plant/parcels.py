@@ -78,7 +78,7 @@ def take_in(station: Station, post: Post, views: Views, now: datetime) -> Receiv
 def _drop_outlived(station: Station, now: datetime) -> None:
     """Drop what waits here and can be of no use: a bundle that has expired, an old request or answer.
 
-    A sender makes an expired copy anew, a line asks again; what stayed would take the room of what comes (64 of a sender).
+    A sender makes an expired copy anew, a line asks again; what stayed would take the room of what comes (64 of one).
     """
     tables, oldest = station.plant.parcels, time_text(now - timedelta(days=_DAYS_OF_A_LINE))
     for row in tables.parcels("in", "waiting", "later"):

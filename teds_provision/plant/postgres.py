@@ -360,8 +360,8 @@ class PostgresPost:
         yield from self._registry.small_parcels(to, known)
 
     def send(self, parcel: Parcel) -> None:
-        """Leave a parcel."""
-        if all(waiting.id != parcel.id for waiting in self._look.parcels):
+        """Leave a parcel; a large one is not sent twice only to hear that it is there."""
+        if len(parcel.octets) <= SMALL or all(waiting.id != parcel.id for waiting in self._look.parcels):
             self._registry.send(parcel.id, parcel.to, parcel.octets, datetime.fromisoformat(parcel.expires))
 
     def drop(self, parcel: str, to: str) -> None:

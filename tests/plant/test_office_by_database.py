@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
+import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -15,8 +17,10 @@ from teds_provision.plant.asking import Inbox, PostOffice, send_job
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer_all
+from teds_provision.plant.post import Parcel
 from teds_provision.plant.sync import sync
 from teds_provision.plant.yields import attempts_of
+from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.plant.document import SIGN_REQUEST
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
@@ -75,6 +79,23 @@ def test_an_office_signs_through_the_registry_for_all_readers_of_a_line(plant: O
     assert {security.decode(done.image.blocks[SECURITY]).station_key for done in built} == {north.point}
     units = [west.plant.line.unit(job.id, done.who.uuid) for done in built]
     assert sorted(row.unit for row in units if row is not None) == list(range(1, 9))
+
+
+def test_a_request_that_its_office_took_away_is_there_again_when_it_is_asked_again(plant: Office) -> None:
+    """What lay there when the line began was taken for lying there still: who asked again waited for nothing."""
+    north, west = plant.north, plant.member("west", "line")
+    plant.sync(north, west)
+    at_office, at_line = plant.post(north), plant.post(west)
+    parcel = Parcel(str(uuid.uuid4()), north.fingerprint, b"{}" * 100, time_text(datetime.now(UTC) + timedelta(days=1)))
+    at_line.send(parcel)
+    at_line.registry()
+    at_office.drop(parcel.id, north.fingerprint)
+    at_line.send(parcel)
+    assert [one.id for one in at_office.new_parcels(north.fingerprint, ())] == [parcel.id]
+    at_line.send(parcel)
+    assert [one.id for one in at_office.new_parcels(north.fingerprint, ())] == [parcel.id]
+    at_office.close()
+    at_line.close()
 
 
 def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
