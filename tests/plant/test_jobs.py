@@ -14,11 +14,12 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, OtherKey, PolicyRefused, RosterExpired
+from teds_provision.plant import line as line_module
 from teds_provision.plant import owner as owning
 from teds_provision.plant import parcels
 from teds_provision.plant.asking import send_job
 from teds_provision.plant.files import FilesPost
-from teds_provision.plant.jobs import find_job, take_job, take_received
+from teds_provision.plant.jobs import digest_of_file, find_job, take_job, take_received
 from teds_provision.plant.line import LineRun, Scans
 from teds_provision.plant.verify_evidence import Grounds
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
@@ -27,13 +28,14 @@ from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoard
-from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.build import BuildOrder, Prepared, prepare
 from teds_provision.steps.provision import Provisioned, inspect, provision
 from teds_provision.store.tables.parcels import ParcelRow
 from teds_provision.talk.progress import Silent
+from teds_provision.teds.profile.load import find_profile
 from tests.bench import Board, MemoryLink, make_station, talk
 
-from .owner import ALL, NOW, alone, job_of, join, member, roster_of
+from .owner import ALL, ANGLE, NOW, alone, job_of, join, member, roster_of
 from .stations import Plant
 
 
@@ -201,6 +203,66 @@ def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Statio
     build(line, one)
     (row,) = owner.plant.line.evidence(uuid=one.uuid)
     assert codec.read(row.document).facts.calibration_sha256 == rule.by_uuid[one.uuid]
+
+
+TABLE = "raw, value\n0, 0\n16384, 6.283185307\n"
+
+
+def test_a_calibration_that_is_rewritten_while_it_is_read_is_not_used(
+    tmp_path: Path, owner: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its digest was looked at, then the file was read again: evidence would name another one than the board has."""
+    one = board(1)
+    file = tmp_path / f"{one.uuid.hex()}.csv"
+    file.write_text(TABLE)
+    listed = CalibrationRule("list", by_uuid={one.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
+    line = line_of(owner, tmp_path, calibration=listed)
+
+    def rewritten(*given: Any, **more: Any) -> Prepared:
+        file.write_text(TABLE.replace("6.28", "6.27"))
+        return prepare(*given, **more)
+
+    monkeypatch.setattr(line_module, "prepare", rewritten)
+    with pytest.raises(PolicyRefused, match="changed while it was read"):
+        build(line, one)
+    outside = LineRun(owner, None, BuildOrder(profile=ANGLE, calibration=file))
+    file.write_text(TABLE)
+    with pytest.raises(PolicyRefused, match="changed while it was read"):
+        build(outside, one)
+    assert units(line) == []
+    assert one.state.state == NodeState.FACTORY
+
+
+def test_evidence_names_the_calibration_that_was_read_whatever_lies_there_later(tmp_path: Path, owner: Station) -> None:
+    one, file = board(1), tmp_path / "angle.csv"
+    file.write_text(TABLE)
+    read = hashlib.sha256(file.read_bytes()).hexdigest()
+    line = LineRun(owner, None, BuildOrder(profile=ANGLE, calibration=file))
+
+    def rewrite(who: Any) -> None:
+        file.write_text(TABLE.replace("6.28", "6.27"))
+
+    with talk(one) as node:
+        provision(owner, node, line.order, accept=rewrite, reporter=Silent(), line=line)
+    (row,) = owner.plant.line.evidence(uuid=one.uuid)
+    assert codec.read(row.document).facts.calibration_sha256 == read
+
+
+def test_a_profile_that_is_edited_beside_a_job_makes_no_board_of_it(tmp_path: Path, owner: Station) -> None:
+    own = owner.home / "profiles" / f"{ANGLE}.toml"
+    own.parent.mkdir(exist_ok=True)
+    own.write_bytes(find_profile(ANGLE).read_bytes())
+    boards = [board(1), board(2)]
+    for one in boards:
+        (tmp_path / f"{one.uuid.hex()}.csv").write_text(f"# date: {NOW:%Y-%m-%d}\n{TABLE}")
+    any_date = CalibrationRule("any", max_age_days=30)
+    line = line_of(owner, tmp_path, calibration=any_date, profile_sha256=digest_of_file(own))
+    build(line, boards[0])
+    own.write_text(own.read_text() + "\n# edited\n")
+    with pytest.raises(PolicyRefused, match="not the one of the job any more"):
+        build(line, boards[1])
+    assert len(units(line)) == 1
+    assert boards[1].state.state == NodeState.FACTORY
 
 
 def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: Path, owner: Station) -> None:
