@@ -11,6 +11,7 @@
 #define LAST_STATION 0xF7u
 #define CR_NS TEDS_SECOND
 #define MOST_OF_12_BITS 4095u
+#define LONGEST_SILENCE 30u /* s */
 #define EVERYONE_NS (UINT64_C(50) * 1000000u)
 #define START_NS (UINT64_C(500) * 1000000u)
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
@@ -78,23 +79,33 @@ static teds_line *line_of(teds_node *node, uint8_t source, uint64_t now)
 static void lose_all(teds_node *node)
 {
     for (uint8_t source = FIRST_STATION; source <= LAST_STATION; source++) {
-        teds_node_link_lost(node, source);
+        teds_link_forget(node, source);
     }
     memset(node->can.lines, 0, sizeof node->can.lines);
     node->can.rx_line = -1;
 }
 
-void teds_can_lose(teds_node *node)
+/* Two nodes under one address drive each other off the bus: a second of silence, doubling to half a minute. */
+static void be_silent(teds_can *can, uint64_t now)
 {
-    lose_all(node);
-    node->can.moves_to = 0;
-    node->can.announces = false;
+    if (now < can->back_at) {
+        return; /* told twice */
+    }
+    if (now >= can->back_at + 2 * LONGEST_SILENCE * TEDS_SECOND) {
+        can->bus_offs = 0;
+    }
+    can->back_at = now + (can->bus_offs < 5 ? UINT64_C(1) << can->bus_offs : LONGEST_SILENCE) * TEDS_SECOND;
+    can->bus_offs = (uint8_t)(can->bus_offs < 5 ? can->bus_offs + 1 : 5);
 }
 
 void teds_node_bus_off(teds_node *node)
 {
-    teds_can_lose(node);
-    node->can.started = false;
+    lose_all(node);
+    be_silent(&node->can, teds_now(node));
+    node->can.announces = false;
+    if (node->can.moves_to != 0) { /* no reply leaves any more */
+        teds_can_move(node, node->can.moves_to);
+    }
 }
 
 /* Every link is a pair of addresses: with a new own one all begin anew. */
@@ -265,6 +276,12 @@ static void functional(teds_node *node, const teds_can_frame *frame, uint64_t no
     }
 }
 
+/* An answer to everyone that nobody takes up gives way to the next. */
+static bool may_answer_everyone(const teds_line *line)
+{
+    return !is_sending(line) || (line->out_reply < 0 && line->out_state == TEDS_OUT_WAITS);
+}
+
 /* It leaves the stored reply alone. */
 static void answer_everyone(teds_node *node, teds_line *line)
 {
@@ -287,8 +304,7 @@ static void announce_soon(teds_node *node, uint64_t now, uint64_t most)
 
 void teds_can_start(teds_node *node, uint64_t now)
 {
-    node->can.started = true;
-    announce_soon(node, now, START_NS);
+    announce_soon(node, now > node->can.back_at ? now : node->can.back_at, START_NS);
 }
 
 static uint8_t next_free(const teds_node *node, uint8_t own)
@@ -355,7 +371,10 @@ static void announce(const teds_node *node, teds_can_frame *frame)
 void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick)
 {
     uint8_t source = (uint8_t)frame->identifier;
-    if (frame->length > (frame->fd && TEDS_CAN_FD ? 64 : 8)) {
+    if (tick < node->can.back_at) {
+        return;
+    }
+    if (frame->length > (frame->fd ? 64 : 8) || (frame->fd && !TEDS_CAN_FD)) {
         return;
     }
     if (source >= 1 && source <= TEDS_LAST_ADDRESS) {
@@ -407,8 +426,7 @@ static bool line_next(teds_node *node, teds_line *line, teds_can_frame *frame, u
         line->single[0] = 0;
         return true;
     }
-    if (line->asked && now >= line->asked_due &&
-        (!is_sending(line) || (line->out_reply < 0 && line->out_state == TEDS_OUT_WAITS))) {
+    if (line->asked && now >= line->asked_due && may_answer_everyone(line)) {
         answer_everyone(node, line);
     }
     if (!is_sending(line) || !teds_isotp_next(line, frame, now)) {
@@ -422,6 +440,9 @@ static bool line_next(teds_node *node, teds_line *line, teds_can_frame *frame, u
 
 bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
 {
+    if (now < node->can.back_at) {
+        return false;
+    }
     for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
         if (node->can.lines[i].used && line_next(node, &node->can.lines[i], frame, now)) {
             return true;
@@ -459,7 +480,7 @@ uint64_t teds_can_poll(teds_node *node, uint64_t now)
         if (is_sending(line) && line->out_due < due) {
             due = line->out_due;
         }
-        if (line->used && line->asked && line->asked_due < due && !is_sending(line)) {
+        if (line->used && line->asked && line->asked_due < due && may_answer_everyone(line)) {
             due = line->asked_due;
         }
         if (line->used && (line->flow != 0 || line->single[0] != 0)) {

@@ -174,6 +174,8 @@ int teds_to_factory(teds_node *node);
 int teds_store_state(teds_node *node, const teds_state *state);
 
 /* -- node.c -------------------------------------------------------------------------------------------------------- */
+/* Loss of a link, but for the move that 128.10 may have left. */
+void teds_link_forget(teds_node *node, teds_link link);
 teds_stored_reply *teds_reply_place(teds_node *node, teds_link link);
 /* Run a request, or take up the stored reply of an octet-equal one: the reply's place, octets from 1 on. */
 teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *transaction,
@@ -196,7 +198,6 @@ bool teds_isotp_single(const uint8_t *data, size_t length, const uint8_t **body,
 void teds_can_pad(teds_can_frame *frame, size_t used);
 
 /* -- can.c --------------------------------------------------------------------------------------------------------- */
-void teds_can_lose(teds_node *node);
 void teds_can_move(teds_node *node, uint8_t address);
 bool teds_can_sending(const teds_node *node);
 uint64_t teds_can_poll(teds_node *node, uint64_t now);
@@ -231,6 +232,7 @@ uint16_t teds_ble_longest(const teds_node *node, teds_link link);
 
 /* -- operation.c, stream.c ----------------------------------------------------------------------------------------- */
 #if TEDS_OPERATION
+bool teds_channels_good(const teds_port *port);
 void teds_operation_start(teds_node *node);
 bool teds_operation_knows(const teds_command *command);
 int teds_operation_run(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out);

@@ -478,6 +478,11 @@ int teds_node_init(teds_node *node, const teds_config *config, const teds_port *
         (config->nfc.present && config->nfc.max_ndef != 0 && config->nfc.max_ndef < 160)) {
         return TEDS_E_USAGE;
     }
+#if TEDS_OPERATION
+    if (!teds_channels_good(port)) {
+        return TEDS_E_USAGE;
+    }
+#endif
     failed = teds_store_load(node);
     if (failed) {
         return failed;
@@ -489,9 +494,6 @@ int teds_node_init(teds_node *node, const teds_config *config, const teds_port *
     node->opens = teds_get64(counter);
     node->can.address = node->state.address;
 #if TEDS_OPERATION
-    if (port->channel_count > TEDS_CHANNELS) {
-        return TEDS_E_USAGE;
-    }
     teds_operation_start(node);
 #endif
 #if TEDS_NFC
@@ -510,7 +512,7 @@ void teds_node_reply_left(teds_node *node, teds_link link)
     }
 }
 
-void teds_node_link_lost(teds_node *node, teds_link link)
+void teds_link_forget(teds_node *node, teds_link link)
 {
     teds_session_end(node, teds_session_on(node, link));
     for (size_t i = 0; i < TEDS_SESSIONS; i++) {
@@ -526,6 +528,14 @@ void teds_node_link_lost(teds_node *node, teds_link link)
     }
     if (node->pending.used && node->pending.link == link) {
         teds_pending_forget(node);
+    }
+}
+
+void teds_node_link_lost(teds_node *node, teds_link link)
+{
+    teds_link_forget(node, link);
+    if (node->can.moves_to != 0 && node->can.moves_link == link) {
+        teds_can_move(node, node->can.moves_to); /* nobody waits for the reply any more */
     }
 }
 

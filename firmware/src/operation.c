@@ -86,6 +86,27 @@ static void go_safe(teds_node *node, int place)
     node->safe |= UINT32_C(1) << place;
 }
 
+/* Whether the board's table is one that this build can serve. */
+bool teds_channels_good(const teds_port *port)
+{
+    size_t events = 0;
+    if (port->channel_count > TEDS_CHANNELS) {
+        return false;
+    }
+    for (size_t i = 0; i < port->channel_count; i++) {
+        const teds_channel *own = &port->channels[i];
+        if (own->number == 0 || (i > 0 && own->number <= own[-1].number) || own->octets == 0 ||
+            own->kind > TEDS_EVENT_SENSOR) {
+            return false;
+        }
+        events += own->kind == TEDS_EVENT_SENSOR ? 1 : 0;
+        if (own->kind == TEDS_EVENT_SENSOR && own->octets > TEDS_EVENT_OCTETS) {
+            return false;
+        }
+    }
+    return events <= TEDS_EVENT_CHANNELS;
+}
+
 void teds_operation_start(teds_node *node)
 {
     for (size_t i = 0; i < node->port->channel_count; i++) {

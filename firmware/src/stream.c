@@ -437,40 +437,79 @@ static void event(teds_stream *stream, uint64_t tick, const uint8_t *octets, boo
     full(stream);
 }
 
-void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid)
+static uint8_t next_of(uint8_t place)
 {
-    teds_events *events = &node->events;
-    uint8_t next = (uint8_t)((events->in + 1) % (TEDS_EVENTS + 1));
-    int place = teds_place_of(node, channel);
-    if (place < 0 || next == events->out || node->port->channels[place].octets > TEDS_EVENT_OCTETS) {
-        return;
-    }
-    events->ring[events->in].channel = channel;
-    events->ring[events->in].tick = tick;
-    events->ring[events->in].valid = valid;
-    memcpy(events->ring[events->in].octets, octets, node->port->channels[place].octets);
-    events->in = next;
+    return (uint8_t)((place + 1) % (TEDS_EVENTS + 1));
 }
 
-static void take_events(teds_node *node)
+void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid)
 {
-    teds_events *events = &node->events;
-    for (; events->out != events->in; events->out = (uint8_t)((events->out + 1) % (TEDS_EVENTS + 1))) {
+    teds_events *events = node->events;
+    const teds_channel *own = node->port->channels;
+    size_t left = node->port->channel_count;
+    uint8_t at;
+    for (; left > 0 && own->number != channel; left--, own++) {
+        events += own->kind == TEDS_EVENT_SENSOR ? 1 : 0;
+    }
+    if (left == 0 || own->kind != TEDS_EVENT_SENSOR) {
+        return;
+    }
+    at = events->in;
+    if (next_of(at) == events->out) {
+        events->lost++;
+        return;
+    }
+    events->ring[at].tick = tick;
+    events->ring[at].valid = valid;
+    for (size_t i = 0; i < own->octets; i++) {
+        events->ring[at].octets[i] = octets[i];
+    }
+    events->in = next_of(at);
+}
+
+/* What the interrupts of one event sensor have left, for one of its streams. */
+static void take_events(const teds_events *events, teds_stream *stream, uint8_t in, uint16_t lost, uint64_t now)
+{
+    uint8_t octets[TEDS_EVENT_OCTETS];
+    for (uint8_t at = events->out; at != in && !stream->ended; at = next_of(at)) {
+        for (size_t i = 0; i < stream->octets; i++) {
+            octets[i] = events->ring[at].octets[i];
+        }
+        if (events->ring[at].tick >= stream->start) {
+            event(stream, events->ring[at].tick, octets, events->ring[at].valid);
+        }
+    }
+    for (; lost > 0 && now >= stream->start && !stream->ended; lost--) {
+        count(stream);
+    }
+}
+
+static void take_all_events(teds_node *node, uint64_t now)
+{
+    teds_events *events = node->events;
+    for (size_t place = 0; place < node->port->channel_count; place++) {
+        uint8_t in;
+        uint16_t lost;
+        if (node->port->channels[place].kind != TEDS_EVENT_SENSOR) {
+            continue;
+        }
+        in = events->in;
+        lost = events->lost;
         for (size_t i = 0; i < TEDS_STREAMS; i++) {
             teds_stream *each = &node->streams[i];
-            uint64_t tick = events->ring[events->out].tick;
-            if (each->used && each->kind == EVENT && each->pattern == 0 && !each->waits && !each->ended &&
-                node->port->channels[each->channels[0]].number == events->ring[events->out].channel &&
-                tick >= each->start) {
-                event(each, tick, events->ring[events->out].octets, events->ring[events->out].valid);
+            if (each->used && each->kind == EVENT && each->pattern == 0 && !each->waits && each->channels[0] == place) {
+                take_events(events, each, in, (uint16_t)(lost - events->told), now);
             }
         }
+        events->out = in;
+        events->told = lost;
+        events++;
     }
 }
 
 void teds_streams_sample(teds_node *node, uint64_t now)
 {
-    take_events(node);
+    take_all_events(node, now);
     for (size_t i = 0; i < TEDS_STREAMS; i++) {
         teds_stream *each = &node->streams[i];
         if (each->used) {

@@ -311,11 +311,15 @@ class MemoryNode:
         return None if length < 0 else (identifier.value, data.raw[:length], fd.value)
 
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool = True) -> None:
-        """An event sensor has seen something."""
+        """An event sensor has seen something, and the loop takes it up."""
+        self.interrupt(channel, tick, octets, valid=valid)
+        self.poll()
+
+    def interrupt(self, channel: int, tick: int, octets: bytes, *, valid: bool = True) -> None:
+        """An event sensor has seen something; the loop is held up."""
         self._library.memory_event(
             self._board, ctypes.c_uint8(channel), ctypes.c_uint64(tick), octets, ctypes.c_bool(valid)
         )
-        self.poll()
 
     def set_point(self, channel: int, octets: int) -> bytes:
         """What an actuator does."""

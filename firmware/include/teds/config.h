@@ -64,7 +64,10 @@
 #define TEDS_DRIVE_OCTETS 32
 #endif
 
-/* Events that wait for the main loop, and the longest data set of an event sensor. */
+/* Event sensors of the board; events of each that wait for the main loop, and the longest data set of one. */
+#ifndef TEDS_EVENT_CHANNELS
+#define TEDS_EVENT_CHANNELS 1
+#endif
 #ifndef TEDS_EVENTS
 #define TEDS_EVENTS 4
 #endif
@@ -88,9 +91,6 @@
 #define TEDS_MAX_NDEF (TEDS_MAX_MESSAGE + 64)
 #endif
 
-#if TEDS_MAX_MESSAGE < 512 || TEDS_MAX_MESSAGE > 4094
-#error "TEDS_MAX_MESSAGE is 512 to 4094"
-#endif
 /* 1: Bluetooth LE, its framing. Connections at once: two or more, so that a stranger does not hold the only one. */
 #ifndef TEDS_BLE
 #define TEDS_BLE 0
@@ -99,20 +99,41 @@
 #define TEDS_BLE_CONNECTIONS 2
 #endif
 
+#if TEDS_MAX_MESSAGE < 512 || TEDS_MAX_MESSAGE > 4094
+#error "TEDS_MAX_MESSAGE is 512 to 4094"
+#endif
 #if TEDS_BLE_CONNECTIONS < 2 || TEDS_BLE_CONNECTIONS > 20
 #error "two to twenty connections"
 #endif
 #if TEDS_MAX_NDEF < 160 || TEDS_MAX_NDEF > 32000
 #error "TEDS_MAX_NDEF is 160 to 32000"
 #endif
-#if TEDS_DRIVE_OCTETS > 200
-#error "TEDS_DRIVE_OCTETS is at most 200"
+#if TEDS_SESSIONS < 2 || TEDS_REPLIES <= TEDS_SESSIONS || TEDS_REPLIES > 127
+#error "two sessions at least, and a stored reply more than sessions, at most 127"
 #endif
-#if TEDS_SESSIONS < 2 || TEDS_REPLIES <= TEDS_SESSIONS
-#error "two sessions at least, and a stored reply more than sessions"
+#if TEDS_STAGING < 1024 || TEDS_STAGING > 60000
+#error "TEDS_STAGING is 1024 to 60000"
 #endif
-#if TEDS_CHANNELS > 32 || TEDS_STREAMS < 1 || TEDS_STAGING > 60000
-#error "at most 32 channels, one stream at least, staging at most 60000"
+#if TEDS_CAN_LINES < 1 || TEDS_CAN_LINES > 7
+#error "one to seven lines: there are no more stations"
+#endif
+#if TEDS_CAN_BLOCK < 0 || TEDS_CAN_BLOCK > 255
+#error "TEDS_CAN_BLOCK is 0 to 255"
+#endif
+#if TEDS_CAN_STMIN < 0 || (TEDS_CAN_STMIN > 0x7F && TEDS_CAN_STMIN < 0xF1) || TEDS_CAN_STMIN > 0xF9
+#error "TEDS_CAN_STMIN is 00 to 7F or F1 to F9"
+#endif
+#if TEDS_CHANNELS < 1 || TEDS_CHANNELS > 32 || TEDS_STREAMS < 1 || TEDS_STREAMS > 127
+#error "one to 32 channels, one to 127 streams"
+#endif
+#if TEDS_DRIVE_OCTETS < 1 || TEDS_DRIVE_OCTETS > 200
+#error "TEDS_DRIVE_OCTETS is 1 to 200"
+#endif
+#if TEDS_EVENT_CHANNELS < 1 || TEDS_EVENT_CHANNELS > TEDS_CHANNELS || TEDS_EVENTS < 1 || TEDS_EVENTS > 254
+#error "one event sensor at least and no more than channels, 1 to 254 events"
+#endif
+#if TEDS_EVENT_OCTETS < 1 || TEDS_EVENT_OCTETS > 219
+#error "TEDS_EVENT_OCTETS is 1 to 219: more fits no data message"
 #endif
 
 #endif

@@ -154,13 +154,14 @@ typedef struct teds_stream {
 #endif
 
 #if TEDS_OPERATION
-/* From an interrupt to the main loop: one side writes `in`, the other `out`. */
+/* Of one event sensor, from its interrupt to the main loop: one side writes `in` and `lost`, the other `out` and `told`. */
 typedef struct teds_events {
     volatile uint8_t in, out;
-    struct {
-        uint8_t channel;
-        bool valid;
+    volatile uint16_t lost; /* found no room */
+    uint16_t told;
+    volatile struct {
         uint64_t tick;
+        bool valid;
         uint8_t octets[TEDS_EVENT_OCTETS];
     } ring[TEDS_EVENTS + 1];
 } teds_events;
@@ -187,10 +188,11 @@ typedef struct teds_line {
 } teds_line;
 
 typedef struct teds_can {
-    bool started, announces;
+    bool announces;
+    uint8_t bus_offs; /* in a row */
     uint8_t address, moves_to; /* moves_to: where 128.10 leads once its reply has left; 0: nowhere */
     teds_link moves_link;
-    uint64_t announce_due;
+    uint64_t announce_due, back_at; /* back_at: after bus-off it is silent until then */
     uint32_t announced[20];
     uint8_t announced_at;
     uint8_t heard[30];
@@ -276,7 +278,7 @@ typedef struct teds_node {
     teds_can can;
 #if TEDS_OPERATION
     teds_stream streams[TEDS_STREAMS];
-    teds_events events;
+    teds_events events[TEDS_EVENT_CHANNELS];
 #endif
     teds_stored_reply replies[TEDS_REPLIES];
 #if TEDS_NFC
@@ -303,7 +305,8 @@ void teds_node_reply_left(teds_node *node, teds_link link);
 /* Loss of a link or field: its session, half-open Open, pending agreement and stored reply go. */
 void teds_node_link_lost(teds_node *node, teds_link link);
 
-/* The bus is gone: all CAN links are lost. teds_can_start when it is back. */
+/* The controller is off the bus: all CAN links are lost. Restart it at once, and teds_can_start: the node itself stays
+ * silent for 1 s, doubling to 30 s while it recurs (operation.md, 6). */
 void teds_node_bus_off(teds_node *node);
 
 /* Button, pad or magnet held 5 s: the effect of Reset. 0, or TEDS_E_FLASH. */
@@ -383,8 +386,8 @@ bool teds_ble_advertises(const teds_node *node);
 bool teds_ble_drops(teds_node *node, uint8_t connection);
 #endif
 
-/* An event sensor has seen something at `tick`: the one function that an interrupt may call. `octets` is a data set.
- * Where the ring is full the event is lost. */
+/* An event sensor has seen something at `tick`: the one function that an interrupt may call, each sensor from one of
+ * its own. `octets` is a data set. Where its ring is full the event is lost, and the counter of its stream shows it. */
 void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid);
 
 /* Data messages that could not leave in time, since the start. */

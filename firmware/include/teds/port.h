@@ -69,7 +69,7 @@ typedef struct teds_port {
 
     /* -- flash. Areas of whole erase pages; a slot holds TEDS_STAGING + 256 octets or more. ------------------- */
     uint32_t slot_octets;
-    uint32_t identity_octets; /* 256 or more */
+    uint32_t identity_octets; /* 192 or more */
     uint8_t unit;   /* 1, 2, 4, 8, 16 or 32: writes are whole units, ascending, each unit once after an erase */
     uint8_t erased; /* 0xFF or 0x00 */
     int (*erase)(void *user, int area);

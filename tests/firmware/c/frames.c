@@ -264,6 +264,87 @@ static void everyone_is_answered_after_a_wait(void)
     memory_free(board);
 }
 
+/* Its answer waits for a flow control that never comes, and it is asked again: a loop that sleeps until what is due next
+ * must not sleep through it. */
+static void everyone_is_answered_in_time_though_the_last_answer_waits(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    uint64_t due;
+    in(board, 0x18DBFFF3u, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    now += 50 * MS;
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "the first answer begins");
+    in(board, 0x18DBFFF3u, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
+    due = memory_poll(board);
+    CHECK(due <= now + 50 * MS, "due in %u ms", (unsigned)((due - now) / MS));
+    now = due;
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && data[2] == 0x2b, "the second one");
+    memory_free(board);
+}
+
+static uint8_t address_of(const memory_board *board)
+{
+    uint8_t identity[23];
+    teds_node_identify(&board->node, identity);
+    return identity[22];
+}
+
+/* Set CAN address while the link over which it came goes: the reply never leaves, and the address is stored. */
+static void a_new_address_counts_though_its_reply_is_lost(void)
+{
+    static const uint8_t command[7] = {0, 0, 128, 10, 0, 1, 0x55};
+    static uint8_t reply[TEDS_MAX_MESSAGE];
+    for (int way = 0; way < 3; way++) {
+        memory_board *board = fresh();
+        const uint8_t link = way == 1 ? 1 : 0xF1, kind = way == 1 ? TEDS_AT_NFC : TEDS_CAN;
+        CHECK(memory_handle(board, link, kind, true, command, 7, reply) == 3 && reply[0] == 1, "128.10");
+        CHECK(address_of(board) == OWN, "until the reply has left it answers at the old one");
+        if (way == 0) {
+            teds_node_bus_off(&board->node);
+        } else {
+            memory_lost(board, link);
+        }
+        CHECK(address_of(board) == 0x55, "way %d: it is at %02x", way, address_of(board));
+        CHECK(memory_start(board) == 0 && address_of(board) == 0x55, "and stays there");
+        memory_free(board);
+    }
+}
+
+static int identified(memory_board *board)
+{
+    uint32_t identifier;
+    uint8_t data[64];
+    in(board, TO_NODE, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    return out(board, &identifier, data) == 8 && data[0] == 0x10;
+}
+
+static void after_bus_off_it_is_silent_for_longer_and_longer(void)
+{
+    static const uint16_t seconds[] = {1, 2, 4, 8, 16, 30, 30};
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    CHECK(identified(board), "it is there");
+    for (size_t i = 0; i < sizeof seconds / sizeof seconds[0]; i++) {
+        teds_node_bus_off(&board->node);
+        teds_node_bus_off(&board->node);
+        teds_can_start(&board->node, now);
+        now += seconds[i] * 1000 * MS - 1;
+        CHECK(!identified(board) && silent(board), "%u s: neither hears nor speaks", seconds[i]);
+        now += 1;
+        CHECK(identified(board), "%u s: it answers", seconds[i]);
+        now += 1500 * MS;
+        CHECK(out(board, &identifier, data) == 8 && identifier == (0x1CFF0000u | OWN), "and has announced itself");
+    }
+    now += 60000 * MS;
+    teds_node_bus_off(&board->node);
+    teds_can_start(&board->node, now);
+    now += 1000 * MS;
+    CHECK(identified(board), "a minute on the bus, and it begins with a second again");
+    memory_free(board);
+}
+
 static void nodes_that_meet_sort_themselves_out(void)
 {
     memory_board *board = fresh();
@@ -322,6 +403,9 @@ int main(void)
     frames_may_come_twice();
     a_repetition_while_the_reply_is_under_way_gets_it_again();
     everyone_is_answered_after_a_wait();
+    everyone_is_answered_in_time_though_the_last_answer_waits();
+    a_new_address_counts_though_its_reply_is_lost();
+    after_bus_off_it_is_silent_for_longer_and_longer();
     nodes_that_meet_sort_themselves_out();
     a_classic_frame_has_eight_octets_at_most();
     return ENDED("isotp");
