@@ -340,8 +340,8 @@ def _beyond_raw_range(calibration: Calibration, had: SheetChannel, now: SheetCha
     told = f"raw {before[0]:.8g} to {before[1]:.8g}", f"raw {raw[0]:.8g} to {raw[1]:.8g}"
     if raw[0] < before[0] - step or raw[1] > before[1] + step:
         return f"it was made for {told[0]}, and this channel gives {told[1]}"
-    if now.actuator:
-        return ""
+    if now.actuator or max(abs(raw[0] - before[0]), abs(raw[1] - before[1])) <= step:
+        return ""  # points beyond the range were taken when it was made for this very one
     part = next((one for one in calibration.inputs if one.channel == now.number), calibration.inputs[0])
     if part.boundaries[0] < raw[0] - step or part.boundaries[-1] > raw[1] + step:
         return f"it covers raw {part.boundaries[0]:.8g} to {part.boundaries[-1]:.8g}, and this channel gives {told[1]}"

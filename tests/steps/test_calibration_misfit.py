@@ -69,6 +69,16 @@ def test_the_same_type_keeps_it(station: Station, board: Board, calibrated: Path
     assert any("keeps its calibration" in text for text in built.warnings)
 
 
+def test_points_beyond_the_raw_range_are_kept_by_the_type_that_took_them(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    path = tmp_path / "force.csv"
+    path.write_text("# date: 2026-10-01\nraw,value [N]\n0,-1000\n16777215,1000\n")
+    assert provisioned(station, board, BuildOrder("load-cell", path)).verified.verdict == "authentic"
+    built = build(station, board.uuid, BuildOrder("load-cell", name="left cell"))
+    assert (1, AccessCode.CALIBRATION) in built.image.blocks
+
+
 def test_a_draft_that_was_never_written_is_kept_for_its_own_type_alone(
     station: Station, board: Board, calibrated: Path
 ) -> None:
