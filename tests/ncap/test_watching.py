@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from teds_provision.errors import LinkFailure
 from teds_provision.ncap.nodes import watching
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.roster import MOST_GONE, Roster
 from teds_provision.ncap.nodes.watching import MOST_KNOWN, Watch
+from tests.pace import until
 
 
 class Silence:
@@ -41,6 +45,29 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     roster = Roster(nothing, silence)
     monkeypatch.setattr(roster, "refresh", lambda _uuids=None: None)
     return Watch("can:x", nothing, roster, silence, Turns(), nothing, lambda: True, nothing)
+
+
+@pytest.fixture
+def reader(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> Iterator[Watch]:
+    """A watch on a reader that runs; ``open_place`` is to be given before it starts."""
+    watch.place = "nfc:x"
+    monkeypatch.setattr(watch._roster, "forget_place", lambda _place: None)
+    yield watch
+    watch.stop()
+    watch.join(5)
+
+
+class Reader:
+    """A reader on which nothing lies."""
+
+    closed = False
+
+    def watch(self, *, stop: threading.Event, notice: Any) -> Iterator[Any]:
+        stop.wait()
+        yield from ()
+
+    def close(self) -> None:
+        self.closed = True
 
 
 def present(watch: Watch) -> int:
@@ -119,3 +146,40 @@ def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
     monkeypatch.setattr(watching.time, "time", lambda: now)
     watch.saw(sighting(3))
     assert len(looked) == 2
+
+
+def test_a_reader_is_lent_again_while_it_is_being_opened(reader: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second command of a script waited ten seconds, and then met a reader that the station had not closed."""
+    opened: list[Reader] = []
+    first, second = object(), object()
+
+    def open_place(*_words: Any) -> Reader:
+        if opened:  # the first borrower has just ended, and the next one is there before the reader is watched
+            reader._borrowers.add(id(second))
+            reader._anew.set()
+        opened.append(Reader())
+        return opened[-1]
+
+    monkeypatch.setattr(watching, "open_place", open_place)
+    reader.start()
+    reader.borrow(first)
+    reader.give_back(first)
+    until(lambda: len(opened) == 2)
+    until(lambda: opened[1].closed)
+    assert reader.state.state == "lent"
+    reader.give_back(second)
+
+
+def test_a_reader_that_is_not_there_keeps_no_command_waiting(reader: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    def open_place(*_words: Any) -> Reader:
+        raise LinkFailure("No reader there.")
+
+    monkeypatch.setattr(watching, "open_place", open_place)
+    monkeypatch.setattr(watching, "FIRST_PAUSE", 20.0)
+    reader.start()
+    until(lambda: reader.state.state == "down")
+    began = time.monotonic()
+    for _ in range(3):
+        assert reader.borrow(reader)
+        reader.give_back(reader)
+    assert time.monotonic() - began < watching.LENDING / 2

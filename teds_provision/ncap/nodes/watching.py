@@ -175,7 +175,13 @@ class Watch:
 
     def _run(self) -> None:
         pause = FIRST_PAUSE
-        while not self._stop.is_set():
+        while True:
+            self._anew.clear()  # who stops or borrows after it is heard by what waits, who did before is seen here
+            if self._stop.is_set():
+                return
+            if self._borrowers:
+                self._lend()
+                continue
             try:
                 if self.port is None:
                     self.port = open_place(self.place, self._trace)
@@ -188,7 +194,7 @@ class Watch:
                 _log.exception("The watch on %s failed; it begins anew.", self.place)
                 self._down(TedsProvisionError("This link failed unexpectedly.", hint="See the log."))
             if self.port is None:
-                self._stop.wait(pause)
+                self._anew.wait(pause)
                 pause = min(2 * pause, LAST_PAUSE)
 
     def _down(self, error: TedsProvisionError) -> None:
@@ -207,13 +213,8 @@ class Watch:
             self._watch_reader(port)
 
     def _watch_reader(self, port: Port) -> None:
-        while not self._stop.is_set():
-            self._anew.clear()
-            for contact in port.watch(stop=self._anew, notice=self._notice):
-                self._came(contact)
-            if self._borrowers:
-                self._lend()
-                return
+        for contact in port.watch(stop=self._anew, notice=self._notice):
+            self._came(contact)
 
     def _watch_bus(self, port: CanPort | BlePort, poll: float) -> None:
         """The look-out tells of who answers (:meth:`saw`); here is seen who does not any more, and whether it works."""
@@ -298,9 +299,12 @@ class Watch:
         self._roster.forget_place(self.place)
         self._say("lent")
         self._free.set()
-        while self._borrowers and not self._stop.wait(0.1):
-            pass
-        self._free.clear()
+        while self._borrowers and not self._stop.is_set():
+            while self._borrowers and not self._stop.wait(0.1):
+                pass
+            self._free.clear()
+            if self._borrowers:  # who came in that instant was told that the reader is free
+                self._free.set()
 
     def _close(self) -> None:
         port, self.port = self.port, None
