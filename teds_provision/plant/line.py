@@ -121,7 +121,9 @@ class LineRun:
         if self.scans is not None:
             self.scans.require(who)
         if job is None:
-            return prepare(self.station, self.order_of_all, who.uuid)
+            return self._with_digest(
+                self.order_of_all.calibration, who.uuid, lambda: prepare(self.station, self.order_of_all, who.uuid)
+            )
         self._require_open()  # the last board of a long night may come after its end
         if job.boards:
             listed = job.boards.get(who.uuid)
@@ -140,22 +142,50 @@ class LineRun:
         if wanted is not None and digest != wanted:
             raise PolicyRefused(f"The calibration {path} is not the one that the job names for {who.uuid.hex()}.")
         order = replace(self.order_of_all, calibration=path, drop_calibration=False)
-        if job.calibration.rule == "one":
-            prepared = self._prepared(digest, order)
-        else:
-            prepared = prepare(self.station, order, who.uuid)
+        one_for_all = job.calibration.rule == "one"
+        prepared = self._with_digest(
+            path, who.uuid, lambda: self._prepared(digest, order) if one_for_all else self._read(order, who.uuid)
+        )
         if job.calibration.rule == "any":
             self._require_fresh(path, prepared)
-        with self._turn:
-            self._digests[who.uuid] = digest
+        return prepared
+
+    def _with_digest(self, calibration: Path | None, uuid: bytes, read: Callable[[], Prepared]) -> Prepared:
+        """What ``read`` gives, and note the digest of the calibration's file that evidence of this board names.
+
+        Raises PolicyRefused where the file changed meanwhile: a bench writes calibrations beside the line.
+        """
+        digest = digest_of_file(calibration) if calibration is not None and calibration.is_file() else None
+        prepared = read()
+        if calibration is not None and digest_of_file(calibration) != digest:
+            raise PolicyRefused(
+                f"The calibration {calibration} changed while it was read.", hint="Tap the board again."
+            )
+        if digest is not None:
+            with self._turn:
+                self._digests[uuid] = digest
         return prepared
 
     def _prepared(self, calibration: str | None, order: BuildOrder) -> Prepared:
         """What all boards get alike, read and guarded once a run; ``calibration`` is the SHA-256 of its file."""
         with self._turn:
             if calibration not in self._common:
-                self._common[calibration] = prepare(self.station, order)
+                self._common[calibration] = self._read(order)
             return self._common[calibration]
+
+    def _read(self, order: BuildOrder, uuid: bytes | None = None) -> Prepared:
+        """What an order names; raises PolicyRefused where the profile's file was changed since the run began.
+
+        The digest that evidence names must be of what was read, and files are edited beside a run of many hours.
+        """
+        assert self.job is not None
+        prepared, path = prepare(self.station, order, uuid), Path(self.order_of_all.profile or "")
+        if digest_of_file(path) != self.job.profile_sha256:
+            raise PolicyRefused(
+                f"The profile {path} is not the one of the job any more: somebody changed it.",
+                hint="Put the job's profile back.",
+            )
+        return prepared
 
     def _calibration_of(self, uuid: bytes) -> Path | None:
         assert self.job is not None
@@ -283,8 +313,6 @@ class LineRun:
 
     def calibration_digest(self, uuid: bytes) -> str | None:
         """SHA-256 of the calibration file that a board got, None for none."""
-        if self.job is None and self.order_of_all.calibration is not None:
-            return digest_of_file(self.order_of_all.calibration)
         return self._digests.get(uuid)
 
 
