@@ -155,12 +155,14 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
     if junk:
         done.told.append(f"{post.where}: {len(junk)} files in this station's place that it did not sign; passed over")
     new = [page for page in found if (page.n, page.hash) not in known]
-    if not new:
-        station.plant.tables.end_alarms("fork", station.fingerprint)
-    elif restored and _follows(chain, new):
+    if new and restored and _follows(chain, new):
         adopt(station, roster, new)
-        done.told.append(f"{len(new)} pages that this station wrote before its backup are back")
-    else:
+        station.plant.tables.end_alarms("fork", station.fingerprint)
+        back = "1 page that this station wrote before its backup is"
+        if len(new) > 1:
+            back = f"{len(new)} pages that this station wrote before its backup are"
+        done.told.append(f"{back} back")
+    elif new:
         homes = ", ".join(sorted({page.home or "unknown" for page in new}))
         first = min(page.n for page in new)
         alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
@@ -169,13 +171,33 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
             f" (home {homes}; here {station.plant.home}): a disk image was put back, or a copy of it is at work.",
             hint="Look who has a copy; in doubt remove this station. Then: teds-provision registry resume",
         )
+    else:
+        _require_resumed(station)
     if restored:
-        _after_restore(station, roster, {page.n for page in found})
+        _require_all_seen(station, roster, {page.n for page in found})
+        if new or connected or joined.url is None:
+            station.plant.end_restored()
+        else:  # a stick that knows less than what this home joined by shows nothing: it would say a number twice
+            done.told.append(
+                "this home came back from a backup: it says nothing new before registry sync with what it joined by"
+            )
     there = max((page.n for page in found), default=0)
     if connected and there < joined.acknowledged and not post.everybody:
+        there = post.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
         alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why)
         done.told.append(f"{post.where} was rolled back: {why}; it is filled again")
+
+
+def _require_resumed(station: Station) -> None:
+    """Raise Fork where one was found before and no person has decided: a folder that shows less of it ends nothing."""
+    found = [one for one in station.plant.tables.alarms() if one.code == "fork" and one.about == station.fingerprint]
+    if found:
+        raise Fork(
+            f"Pages under this station's key that are not of this home were found, from number {found[0].n} on, and"
+            " nobody has decided since.",
+            hint="Look who has a copy; in doubt remove this station. Then: teds-provision registry resume",
+        )
 
 
 def _follows(chain: Chain, new: Sequence[Page]) -> bool:
@@ -247,7 +269,7 @@ def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit:
     tables.put_unit(replace(row, passed=passed))
 
 
-def _after_restore(station: Station, roster: Roster, there: set[int]) -> None:
+def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None:
     """A home that a backup rebuilt goes on only when nobody has seen pages of it that are neither here nor there."""
     newest = max({own_chain(station).counted[0]} | there)
     for who, about, n, _ in station.plant.tables.heads():
@@ -257,7 +279,6 @@ def _after_restore(station: Station, roster: Roster, there: set[int]) -> None:
                 " last one here.",
                 hint=f"Bring them: registry sync --files DIR that {roster.name_of(who)} filled; or registry resume",
             )
-    station.plant.end_restored()
 
 
 def resume(station: Station, post: Post) -> int:

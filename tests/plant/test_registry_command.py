@@ -187,6 +187,11 @@ def test_a_fork_stops_the_copy_and_a_person_resumes(desk: Desk) -> None:
     planned = desk.ask("west", "registry", "resume", "--files", desk.stick, "--dry-run")
     assert (planned["done"], planned["adopts"]) == (0, 1)
     assert desk.ask("west", "registry", "status", code=4)["alarms"], "a plan resumes nothing"
+    empty = desk.folder / "empty stick"
+    empty.mkdir()
+    told = desk.ask("west", "registry", "sync", "--files", empty, code=4)
+    assert told["error"]["code"] == "fork", "a stick that shows nothing of it resumes nothing"  # type: ignore[index]
+    assert not list(empty.glob("*/1.jws")), "a page from here would prove two histories"
     assert desk.ask("west", "registry", "resume", "--files", desk.stick, "--yes")["done"] == 1
     desk.sync("west")
 
@@ -206,6 +211,25 @@ def test_a_home_rebuilt_from_a_backup_takes_its_own_pages_back(desk: Desk) -> No
     told = desk.sync("west")
     assert "before its backup" in str(told["told"])
     assert desk.ask("west", "registry", "status")["unsent"] == 0
+    desk.sync("north")
+    assert len(desk.ask("north", "registry", "log", "--station", "west")["events"]) == 2  # type: ignore[arg-type]
+
+
+def test_a_home_rebuilt_from_a_backup_says_nothing_new_by_a_stick_that_knows_less(desk: Desk) -> None:
+    joined(desk)
+    copy, stale = desk.folder / "west.backup", desk.folder / "old stick"
+    desk.sync("west")
+    desk.ask("west", "backup", copy)
+    shutil.copytree(desk.stick, stale)
+    desk.ask("west", "whitelist", "add", UUID, "--fingerprint", KEY)
+    desk.sync("west")
+    shutil.rmtree(desk.folder / "west")
+    desk.ask("west", "restore", copy, "--yes")
+    desk.ask("west", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
+    told = desk.ask("west", "registry", "sync", "--files", stale)
+    assert "came back from a backup" in str(told["told"])
+    assert not list(stale.glob("*/1.jws")), "page 1 was said before"
+    assert "1 page that this station wrote before its backup is back" in desk.sync("west")["told"]  # type: ignore[operator]
     desk.sync("north")
     assert len(desk.ask("north", "registry", "log", "--station", "west")["events"]) == 2  # type: ignore[arg-type]
 

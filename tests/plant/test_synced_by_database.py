@@ -139,7 +139,8 @@ def test_a_database_of_yesterday_is_brought_up_to_today(office: Office) -> None:
     office.sync(office.north)
     newest = office.north.plant.tables.chains()[office.north.fingerprint].counted[0]
     office.database.sql(mend_sql(office.north.fingerprint, newest))  # as if it had not come yet
-    assert any("rolled back" in line for line in office.sync(office.north).told)
+    told = office.sync(office.north).told
+    assert any(f"page {newest} was there, and now {newest - 1} is the last" in line for line in told), told
     assert [alarm.code for alarm in office.north.plant.tables.alarms()] == ["rolled-back"]
     office.sync(south)
     assert south.plant.tables.chains()[office.north.fingerprint].counted[0] >= newest
