@@ -678,7 +678,7 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool,
     station.unlock()
     with plant.sync.alone(station):
         n, hash = plant.membership.accept(station, member.fingerprint, page, post)
-        plant.folding.judge(station)
+        plant.folding.apply_claims(station)
     app.emit({"done": 1, "n": n, "hash": hash}, f"Page {n} ({hash[:16]}) and what follows it counts here.")
 
 

@@ -65,13 +65,13 @@ class HeardStream:
     def take(self, frame: Frame) -> None:
         """A frame of this stream."""
         self._take_early()
-        self._take(frame)
+        self._assemble(frame)
 
     def _take_early(self) -> None:
         while self.early:
-            self._take(self.early.popleft())
+            self._assemble(self.early.popleft())
 
-    def _take(self, frame: Frame) -> None:
+    def _assemble(self, frame: Frame) -> None:
         segment = frame.identifier >> 8 & 7
         octets = self.assembly.take(segment, frame.data)
         if octets is not None:
@@ -247,14 +247,14 @@ class CanHearing(Hearing):
             looked = time.monotonic()
             while not self._stop.is_set():
                 # All that wait first: a thread that fell behind calibrates more at once, and catches up.
-                touched = {frame.identifier & _STREAM: self._take(frame) for frame in listener.get_all(SLICE)}
+                touched = {frame.identifier & _STREAM: self._dispatch(frame) for frame in listener.get_all(SLICE)}
                 for heard in touched.values():
                     if heard is not None and heard.due:
                         heard.finish()
                 looked = self._flush(looked, listener.lost)
                 time.sleep(REST)
 
-    def _take(self, frame: Frame) -> HeardStream | None:
+    def _dispatch(self, frame: Frame) -> HeardStream | None:
         # Whoever is registered has a good address, and other stations' frames do not come here.
         key = (frame.identifier & 0xFF, frame.identifier >> 11 & 3)
         heard = self._streams.get(key)

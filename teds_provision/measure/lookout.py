@@ -93,15 +93,15 @@ class Asking:
             raise self.failure
 
     def _run(self) -> None:
-        """The thread; it calls :meth:`_begin` and :meth:`_done` around each round."""
+        """The thread; it calls :meth:`_round_begins` and :meth:`_round_ends` around each round."""
         raise NotImplementedError
 
-    def _begin(self) -> None:
+    def _round_begins(self) -> None:
         with self._turn:
             self._asked.clear()
             self._begun += 1
 
-    def _done(self) -> None:
+    def _round_ends(self) -> None:
         with self._turn:
             self._finished = self._begun
             self._turn.notify_all()
@@ -133,8 +133,8 @@ class Lookout(Asking):
                 self._watch()
             except LinkFailure as failure:
                 self.failure = failure
-                self._begin()  # whoever waits for the next round hears of the failure now
-                self._done()
+                self._round_begins()  # whoever waits for the next round hears of the failure now
+                self._round_ends()
                 self._stop.wait(LEAST)
 
     def _watch(self) -> None:
@@ -191,7 +191,7 @@ class Lookout(Asking):
 
     def _ask(self) -> None:
         """One question to everybody (or to ``node=`` alone); each is told of as soon as it answers."""
-        self._begin()
+        self._round_begins()
         port, began = self.port, time.monotonic()
         if port.spec.node is not None:
             self._ask_one(port.spec.node, LEAST)
@@ -207,7 +207,7 @@ class Lookout(Asking):
                     return
             self._settle(found, began)
         self.failure = None
-        self._done()
+        self._round_ends()
 
     def _settle(self, found: Found, began: float) -> None:
         settled = settle(found, self.port.identify, until=began + 2 * LONGEST_SECONDS)
@@ -298,7 +298,7 @@ class AirLookout(Asking):
             pace.asked = time.monotonic()
 
     def _look(self) -> None:
-        self._begin()
+        self._round_begins()
         self.failure = None
         try:
             for contact in self.port.everyone(seconds=2 * LEAST, notice=_nothing):
@@ -308,7 +308,7 @@ class AirLookout(Asking):
             pass
         except LinkFailure as failure:
             self.failure = failure
-        self._done()
+        self._round_ends()
 
 
 def air_time(time_: BusTime, mtu: int) -> BusTime:

@@ -445,7 +445,7 @@ class Measuring:
         try:
             self._wait_for_members(one)
             for uuid in one.uuids:
-                self._take(one, uuid)
+                self._wait_for_turn(one, uuid)
                 if one.stop.is_set():
                     return
                 taken.append(uuid)
@@ -563,7 +563,7 @@ class Measuring:
             newcomers.end()
             self._say(one, "ended")
 
-    def _take(self, one: Running, uuid: str) -> None:
+    def _wait_for_turn(self, one: Running, uuid: str) -> None:
         while not one.stop.is_set():
             try:
                 self._turns.take(uuid, f"measurement {one.kept.id}", frozen=True)

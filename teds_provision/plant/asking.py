@@ -38,7 +38,7 @@ from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, time_text
 from teds_provision.protocol.keys import fingerprint, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
-from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, Kind, hash_of
+from teds_provision.protocol.plant.document import SIGNED, Kind, hash_of
 from teds_provision.protocol.plant.job import Job
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.protocol.plant.signing import (
@@ -56,7 +56,6 @@ from teds_provision.steps.commands import at_node
 from teds_provision.steps.read import read_identity
 from teds_provision.steps.sign import Signed
 from teds_provision.store import Draft, SignRequestRow
-from teds_provision.store.tables.parcels import ParcelKind
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.codec import security
@@ -65,7 +64,6 @@ from teds_provision.teds.image import SECURITY, Image
 DAYS: Final = 7
 _LOOK_SECONDS: Final = 0.05
 _MOST_LOOK_SECONDS: Final = 1.0
-_KINDS: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
 
 
 class Refused(PolicyRefused):
@@ -105,7 +103,7 @@ def send(station: Station, post: Post, to: str, document: bytes, name: str) -> N
 
 
 @dataclass(frozen=True)
-class Came:
+class Arrival:
     """A document of a line that came for this station; ``drop`` throws its parcel away."""
 
     document: bytes
@@ -125,20 +123,20 @@ class Inbox:
         self._listener: postgres.Registry | None = None
         self._hears = isinstance(post, postgres.PostgresPost)
 
-    def take(self) -> list[Came]:
+    def take(self) -> list[Arrival]:
         """What came since; raises LinkFailure."""
         station, own = self._station, self._station.identity.fingerprint
         tables = station.plant.parcels
         found = []
-        for row, document in parcels.received(station, _KINDS[self._kind.typ]):
+        for row, document in parcels.received(station, parcels.OF_A_LINE[self._kind.typ]):
             if row.id not in self._known:
                 self._known.add(row.id)
-                found.append(Came(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
+                found.append(Arrival(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
         for parcel in self._post.new_parcels(own, self._known):
             self._known.add(parcel.id)
             opened = self._opened(parcel.octets)
             if opened is not None:
-                found.append(Came(opened, partial(self._drop, parcel.id, self._post.drop, own)))
+                found.append(Arrival(opened, partial(self._drop, parcel.id, self._post.drop, own)))
         return found
 
     def _drop(self, parcel: str, drop: Callable[[str, Any], object], of: str) -> None:
@@ -221,7 +219,7 @@ class PostOffice:
         self.station, self.post, self.timeout = station, post, timeout
         self._inbox = Inbox(station, post, SIGNED)
         self._news = threading.Condition()
-        self._came: dict[tuple[str, str], Came] = {}
+        self._came: dict[tuple[str, str], Arrival] = {}
         self._looking = False
 
     def ask(self, request: SignRequest) -> bytes | None:
@@ -238,7 +236,7 @@ class PostOffice:
             if come is not None:
                 come.drop()
                 return come.document
-            found: list[Came] = []
+            found: list[Arrival] = []
             try:
                 found = self._inbox.take()
                 if not found:

@@ -24,7 +24,7 @@ from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import join, split
 from teds_provision.protocol.plant.event import Event
 from teds_provision.protocol.plant.fold import BY_CONTACT, Own, Statement, View, view
-from teds_provision.protocol.plant.page import Page, open_page
+from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, Taking, open_roster, taking
 from teds_provision.station.station import Station
 from teds_provision.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
@@ -113,7 +113,7 @@ def put_roster(station: Station, roster: Roster) -> None:
         for one, chain in station.plant.tables.chains().items():
             if before is None or _last(before, one) != _last(roster, one):
                 recount(station, chain, roster)
-        station.plant.tables.judge_all()
+        station.plant.tables.queue_judging_of_all()
 
 
 def _last(roster: Roster, station: str) -> tuple[int, str] | None:
@@ -239,16 +239,6 @@ def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, coun
                 station.plant.tables.put_ban(hash, chain.chain, counts=counts, uuid=one.uuid, statement=text)
 
 
-def counted_page(station: Station, of: str, n: int) -> Page | None:
-    """One page of a chain that is here, read anew; None where it is not."""
-    chain = station.plant.tables.chains().get(of)
-    roster = require_roster(station)
-    for number, hash, _ in station.plant.tables.page_names(chain.chain) if chain is not None else ():
-        if number == n and chain is not None and (row := station.plant.tables.page(chain.chain, n, hash)) is not None:
-            return open_page(octets_of(row), roster.registry, roster.point_of)
-    return None
-
-
 def octets_of(row: PageRow) -> bytes:
     """The octets of a page, as they came."""
     return join(row.header, row.content, row.signature)
@@ -327,7 +317,7 @@ def _lifters(station: Station, hash: str) -> set[str]:
     return {one for one, mac in rows if station.seals.noted("plant lifted", f"{hash} {one}", mac)}
 
 
-def judge(station: Station) -> int:
+def apply_claims(station: Station) -> int:
     """Bring whitelist, deny list and conflicts in order for every node of which something new was said; how many.
 
     Rule 2: no pin, key or right of this station's own goes; what the registry pinned, or a page banned, comes and goes.
@@ -343,7 +333,7 @@ def judge(station: Station) -> int:
             for uuid, (seen, statements) in judged.items():
                 if statements or station.policy.revocation(uuid) is not None:
                     _ban(station, uuid, seen, statements)
-            station.plant.tables.judged(uuids)
+            station.plant.tables.note_judged(uuids)
         done += len(uuids)
     return done
 

@@ -41,7 +41,7 @@ _DAYS_OF_A_LINE: Final = 31
 _COMMAND: Final = "registry sync"
 _KEPT: Final = 64
 """So many parcels of one sender wait here for a person; the others stay where they are."""
-_OF_A_LINE: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
+OF_A_LINE: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
 _KINDS: Final = {JOB.typ: JOB, SIGN_REQUEST.typ: SIGN_REQUEST, SIGNED.typ: SIGNED}
 
 Views = Callable[[Sequence[bytes]], Mapping[bytes, View]]
@@ -121,7 +121,7 @@ class _Reader:
             return False
         try:
             typ, inner = _inner(parcel.octets, self.station)
-            if typ in _OF_A_LINE:
+            if typ in OF_A_LINE:
                 return self._keep_document(parcel, typ, inner)
             if not parcel.octets.startswith(b"{"):
                 return self._receipt(parcel)
@@ -211,7 +211,7 @@ class _Reader:
     def _keep_document(self, parcel: Parcel, typ: str, inner: bytes) -> bool | None:
         """Keep a job, a request or an answer for the command that it is for; a member signed it."""
         document = open_document(inner, self._member, _KINDS[typ])
-        row = replace(self._row(parcel, _OF_A_LINE[typ]), peer=document.signer, about=document.hash, state="waiting")
+        row = replace(self._row(parcel, OF_A_LINE[typ]), peer=document.signer, about=document.hash, state="waiting")
         with self.station.durable(_COMMAND):
             return self._keep(row, replace(parcel, octets=inner))
 
@@ -261,7 +261,7 @@ def _inner(octets: bytes, station: Station) -> tuple[str, bytes]:
     inner = jose.decrypt(octets, station.vault.identity(), cty=CONTENT_TYPE, max_octets=SMALL)
     header = load_object(decode_base64url(inner.partition(b".")[0], "The JWS header"), "The JWS header")
     typ = header.get("typ")
-    return (typ, inner) if isinstance(typ, str) and typ in _OF_A_LINE else ("", b"")
+    return (typ, inner) if isinstance(typ, str) and typ in OF_A_LINE else ("", b"")
 
 
 def import_parcel(station: Station, row: ParcelRow, plan: incoming.ImportPlan | incoming.Imported) -> incoming.Imported:
@@ -269,7 +269,7 @@ def import_parcel(station: Station, row: ParcelRow, plan: incoming.ImportPlan | 
     with station.transaction():
         done = plan if isinstance(plan, incoming.Imported) else incoming.import_bundle(station, plan)
         station.plant.parcels.drop_parcel(row.id, "in")
-        _put_out(station, "receipt", done.row.peers[0], done.receipt.strip(), done.row.id, DAYS)
+        _put_out(station, "receipt", done.row.peers[0], done.receipt.strip(), done.row.id)
     return done
 
 
@@ -280,17 +280,6 @@ def received(station: Station, kind: ParcelKind) -> list[tuple[ParcelRow, bytes]
 
 
 # -- out ---------------------------------------------------------------------------------------------------------------
-
-
-def enqueue(station: Station, kind: ParcelKind, to: str, document: bytes, days: int = DAYS) -> str:
-    """Seal a signed document of a line for a member, to leave with the next sync; its id. Raises NotFound."""
-    roster = station.plant.roster
-    member = roster.member(to) if roster is not None else None
-    if member is None:
-        raise NotFound(f"Station {to[:16]} is no member of the plant.", hint="See: teds-provision registry status")
-    sealed = jose.encrypt(document, [member.point], cty=CONTENT_TYPE)
-    with station.durable(_COMMAND):
-        return _put_out(station, kind, to, sealed, "", days)
 
 
 def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> str:
@@ -334,11 +323,10 @@ def _put_out(
     to: str,
     document: bytes,
     about: str,
-    days: int = DAYS,
     expires: datetime | None = None,
 ) -> str:
     parcel = str(uuids.uuid4())
-    until = time_text(expires or datetime.now(UTC) + timedelta(days=days))
+    until = time_text(expires or datetime.now(UTC) + timedelta(days=DAYS))
     station.plant.parcels.put_parcel(ParcelRow(parcel, "out", to, kind, "ready", until, about), document)
     return parcel
 

@@ -17,7 +17,7 @@ from teds_provision.plant import leaving, parcels
 from teds_provision.plant.folding import (
     EVENTS_AT_ONCE,
     alarm,
-    judge,
+    apply_claims,
     now,
     octets_of,
     require_roster,
@@ -79,7 +79,7 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
         done.rosters = [one.version for one, how, _ in _rosters(station, post, done) if how.startswith("taken")]
         roster = require_roster(station)
         if roster.member(station.fingerprint) is None:
-            judge(station)
+            apply_claims(station)
             raise NotMember(
                 f"This station was removed from {roster.name} (roster {roster.version}).",
                 hint="A removed key never comes back: make a new station (init) and have it added.",
@@ -89,7 +89,7 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
             pass
         _push(station, post, roster, done, connected=connected)
         _fetch(station, post, roster, done)
-        done.judged = judge(station)
+        done.judged = apply_claims(station)
         hearsay(station, roster, done)
         _parcels(station, post, roster, done)
         if connected:

@@ -16,22 +16,13 @@ def shown_units(station: Station, uuid: bytes) -> Mapping[int, str]:
 
     Values are computed, published and kept in SI whatever it says.
     """
-    return _displays(channel_profiles(station, uuid))
-
-
-def units_of_profile(name_or_path: str, home: Path) -> Mapping[int, str]:
-    """As :func:`shown_units`, of a profile by its name or the path of its file."""
-    return _displays(_channels_of(name_or_path, home))
+    return {number: one.display for number, one in channel_profiles(station, uuid).items() if one.display}
 
 
 def channel_profiles(station: Station, uuid: bytes) -> Mapping[int, ChannelProfile]:
     """The channels of a node's profile by number; none where it has none, or one that cannot be read."""
     record = station.nodes.get(uuid)
     return _channels_of(record.profile, station.home) if record is not None and record.profile else {}
-
-
-def _displays(channels: Mapping[int, ChannelProfile]) -> Mapping[int, str]:
-    return {number: one.display for number, one in channels.items() if one.display}
 
 
 def _channels_of(name_or_path: str, home: Path) -> Mapping[int, ChannelProfile]:

@@ -184,10 +184,10 @@ def test_what_comes_before_its_stream_is_registered_is_no_loss() -> None:
         half = len(frames) // 2
         hearing.expect(0x21, 0)
         for frame in (old, *frames[:half]):
-            assert hearing._take(frame) is None
+            assert hearing._dispatch(frame) is None
         hearing.register(0x21, 0, scene.heard)
         for frame in frames[half:]:
-            assert hearing._take(frame) is scene.heard
+            assert hearing._dispatch(frame) is scene.heard
         scene.heard.finish()
     counts = scene.heard.receiver.counts
     assert (counts.good, counts.lost, counts.bad, scene.heard.assembly.wrong) == (2, 0, 0, 0)

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from teds_provision.protocol.handover.revocation import seal_revocation
+from teds_provision.errors import TedsProvisionError
+from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, reset_message
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import counting
@@ -70,7 +71,8 @@ def add_without_statements(reader: Reader, octets: bytes) -> None:
         if one.act != "revoked":
             reader._take(page.station, (page.n, page.hash), one)
         else:
-            assert event.statement_of(one, reader.roster.point_of) is None
+            with pytest.raises(TedsProvisionError):
+                open_revocation(one.members["statement"], reader.roster.point_of)
 
 
 # -- which pages count -------------------------------------------------------------------------------------------------

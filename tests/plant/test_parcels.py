@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.handover import outgoing
-from teds_provision.plant import parcels
+from teds_provision.plant import asking, parcels
 from teds_provision.plant.post import Parcel
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
@@ -307,8 +307,7 @@ def test_a_job_travels_sealed_and_comes_out_as_it_was_signed(plant: Plant) -> No
     plant.roster(ROLES)
     members = {"format": document.JOB.format, "id": "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"}
     signed = document.seal(members, plant["north"].vault.identity(), document.JOB)
-    parcels.enqueue(plant["north"], "job", plant["west"].fingerprint, signed)
-    sync(plant, "north")
+    asking.send(plant["north"], plant.post, plant["west"].fingerprint, signed, members["id"])
     [parcel] = plant.post.there.values()
     assert b"teds-job" not in parcel.octets
     sync(plant, "west")

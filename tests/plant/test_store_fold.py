@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant
-from teds_provision.plant.folding import judge, put_roster, recount, take_pages, views
+from teds_provision.plant.folding import apply_claims, put_roster, recount, take_pages, views
 from teds_provision.protocol.plant.page import open_page
 from teds_provision.protocol.plant.roster import Roster, open_roster, seal_roster
 from teds_provision.station.station import Station
@@ -60,8 +60,8 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
         if len(waiting) == half:
             put_roster(station, second)
         if chance.random() < 0.3:
-            judge(station)
-    judge(station)
+            apply_claims(station)
+    apply_claims(station)
     roster = station.plant.roster
     assert roster is not None
     oracle = Reader(roster, [octets for one in speakers for octets in one.pages])

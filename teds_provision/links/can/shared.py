@@ -248,7 +248,7 @@ class Gathering:
     def _single(self, node: int, data: bytes) -> None:
         body = read_single(data)
         if body and body[0] == self.transaction:
-            self._begin(node, data)
+            self._note_first_piece(node, data)
             self._whole(node, body)
 
     def _first(self, node: int, frame: Frame) -> Frame | None:
@@ -257,7 +257,7 @@ class Gathering:
             return None
         if partial.too_long or partial.octets[0] != self.transaction:  # or late: of an Identify before this one
             return flow(node, self.own, OVERFLOW, fd=frame.fd)
-        self._begin(node, frame.data)
+        self._note_first_piece(node, frame.data)
         self._partial[node] = partial
         return flow(node, self.own, CONTINUE, fd=frame.fd)
 
@@ -276,7 +276,7 @@ class Gathering:
                 return flow(node, self.own, CONTINUE, fd=partial.fd)
         return None
 
-    def _begin(self, node: int, data: bytes) -> None:
+    def _note_first_piece(self, node: int, data: bytes) -> None:
         if node in self._began:
             self.conflicts.add(node)
             if self._began[node] != data:
@@ -437,7 +437,7 @@ class SharedBus:
         self._sending = threading.Lock()
         self._closing = False
         self._wake, self._woken = socket.socketpair()
-        self._reading = Reading(bus, self._take, self._fail, self._woken)
+        self._reading = Reading(bus, self._route, self._fail, self._woken)
         self._thread = threading.Thread(target=self._reading.run, name=f"can {self.spec.text}", daemon=True)
         self._thread.start()
 
@@ -545,7 +545,7 @@ class SharedBus:
             line.events.put(Event("failed"))
             line.flows.put(b"")
 
-    def _take(self, frame: Frame) -> None:
+    def _route(self, frame: Frame) -> None:
         self.rivals.heard(frame)
         if is_announce(frame.identifier):
             self._note_announce(frame.identifier & 0xFF)

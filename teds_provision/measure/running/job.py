@@ -193,10 +193,10 @@ class Job:
         )
 
     def _new_sinks(self) -> list[Sink]:
-        take = self._take if self._moves else None
-        return [*(self._opened(spec, take) for spec in self.kept.sinks), *self._more(take)]
+        admit = self._admit if self._moves else None
+        return [*(self._opened(spec, admit) for spec in self.kept.sinks), *self._more(admit)]
 
-    def _take(self, command: Command) -> None:
+    def _admit(self, command: Command) -> None:
         """A set point that came by a topic."""
         if self._admits is not None and self._admits(command):
             self._commands(command)

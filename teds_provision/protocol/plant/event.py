@@ -10,8 +10,6 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
-from teds_provision.errors import TedsProvisionError
-from teds_provision.protocol.handover.revocation import Revocation, open_revocation
 from teds_provision.protocol.keys import fingerprint, reset_message, verify
 from teds_provision.protocol.plant.document import hash_of, is_form, is_name, is_number, is_text
 
@@ -150,15 +148,6 @@ def unit_of(event: Event) -> tuple[str, int] | None:
     ):
         return None
     return str(job), int(unit)
-
-
-def statement_of(event: Event, point_of: Callable[[str], bytes | None]) -> Revocation | None:
-    """The statement of a ``revoked`` event by a signer whose point is known, None where it is not good."""
-    try:
-        statement = open_revocation(event.members["statement"], point_of)
-    except TedsProvisionError:
-        return None
-    return statement if statement.uuid == event.uuid else None
 
 
 def reset_proven(event: Event) -> str | None:

@@ -413,7 +413,7 @@ class PlantTables:
         """Return nodes that are to be judged anew."""
         return [row[0] for row in self._database.execute("SELECT uuid FROM to_judge ORDER BY uuid LIMIT ?", (most,))]
 
-    def judge_all(self) -> None:
+    def queue_judging_of_all(self) -> None:
         """Have every node judged anew of which anybody claims anything, or bans it."""
         with self._database.together():
             self._database.execute("INSERT OR IGNORE INTO to_judge SELECT DISTINCT uuid FROM claims")
@@ -421,12 +421,8 @@ class PlantTables:
                 "INSERT OR IGNORE INTO to_judge SELECT DISTINCT uuid FROM statements WHERE uuid IS NOT NULL"
             )
 
-    def judge(self, uuids: Iterable[bytes]) -> None:
-        """Have these nodes judged anew."""
-        self._database.execute_many("INSERT OR IGNORE INTO to_judge VALUES(?)", ((uuid,) for uuid in uuids))
-
-    def judged(self, uuids: Iterable[bytes]) -> None:
-        """Note that these nodes were judged."""
+    def note_judged(self, uuids: Iterable[bytes]) -> None:
+        """Take these nodes off those that are to be judged anew."""
         self._database.execute_many("DELETE FROM to_judge WHERE uuid = ?", ((uuid,) for uuid in uuids))
 
 

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 else:
     np = late("numpy")
 
-LEAST_READINGS: Final = 16
 _SIGMAS: Final = 3
 _STEP: Final = 2.0**-23
 
