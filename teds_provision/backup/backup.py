@@ -80,18 +80,15 @@ def _write(station: Station, vault: Vault, file: BinaryIO, sealer: Sealer) -> by
     """
     while True:
         vault.refresh()
-        kind = _kind(station.identity.keystore)
+        # Never a path in the head: nothing may be loaded because a backup names it.
+        kind = station.identity.keystore
+        kind = "pkcs11" if kind.startswith("pkcs11:") else kind
         head = Head(station.id, station.point, station.name, utc_now(), kind, vault.secret_material())
         key = write(file, head, station.rows(), vault.identity(), sealer)
         if not vault.refresh():
             return key
         file.seek(0)
         file.truncate()
-
-
-def _kind(keystore: str) -> str:
-    """What the head says of the keystore: never a path, as nothing may be loaded because a backup names it."""
-    return "pkcs11" if keystore.startswith("pkcs11:") else keystore
 
 
 def _read_back(station: Station, draft: Path, key: bytes) -> tuple[int, int, int]:

@@ -114,7 +114,9 @@ class _Run:
         for stage in Stage:
             held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
             self._skip(stage, _NEEDS_KEY if held else _NEEDS_FACTORY)
-        checks = tuple(self._checks[each.name] for each in _ordered())
+        stages = list(Stage)
+        ordered = sorted(RULES, key=lambda each: stages.index(each.stage))
+        checks = tuple(self._checks[each.name] for each in ordered)
         return Report(self._node.uuid, checks, self._lost, self._explained)
 
     def _explain(self) -> None:
@@ -246,9 +248,3 @@ class _Run:
             station.keys.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
             station.keys.set_ca_of(uuid, station.identity.ca)
             station.audit("agree", uuid, "pending", key_id=agreed.key_id.hex(), by="node check")
-
-
-def _ordered() -> list[Rule]:
-    """Every rule in the order of the stages."""
-    stages = list(Stage)
-    return sorted(RULES, key=lambda each: stages.index(each.stage))

@@ -23,14 +23,10 @@ def group() -> None:
     """Manage groups of nodes that are measured together. A group cannot change while it is measured."""
 
 
-def _to_json(groups: Sequence[Group]) -> dict[str, object]:
-    return {"groups": [{"name": one.name, "uuids": [uuid.hex() for uuid in one.uuids]} for one in groups]}
-
-
 def _tell(app: App, groups: Sequence[Group]) -> None:
     lines = [f"{one.name}: {', '.join(uuid.hex() for uuid in one.uuids) or 'no nodes yet'}" for one in groups]
     app.emit(
-        _to_json(groups),
+        {"groups": [{"name": one.name, "uuids": [uuid.hex() for uuid in one.uuids]} for one in groups]},
         "\n".join(lines) or "There are no groups yet. To create one: teds-provision group create NAME UUID …",
     )
 

@@ -93,13 +93,14 @@ def import_keys(
         with station.lock("import-keys", app.note):
             plan = shown if station.version() == state else handover.incoming.plan_import(station, bundle)
             done = _take_in(station, plan, shown)
-            _write_receipt(receipt, done.receipt)
+            if not holds(receipt, done.receipt + b"\n"):  # the same bundle once more: its receipt may lie there
+                write_new(receipt, done.receipt + b"\n")
     outcomes: list[dict[str, Any]] = []
     if links_given(ctx) if prove is None else prove:
         outcomes = _prove(app, station, done, links)
     _tell_import(app, station, done, receipt, _import_plan(shown), outcomes)
-    if prove:
-        _require_proven(outcomes)
+    if prove and any(outcome["why"] for outcome in outcomes):
+        raise click.exceptions.Exit(LinkFailure.exit_code)
 
 
 def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
@@ -130,12 +131,6 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
     count = f"{len(told)} parcel{'s' * (len(told) != 1)}"
     text = f"{count}." if dry_run else f"{count} taken in; receipts leave with the next sync."
     app.emit({"received": told, "plan": dry_run}, text if told else "Nothing waits.")
-
-
-def _require_proven(outcomes: list[dict[str, Any]]) -> None:
-    """Exit 5 where a node that was to be met was not."""
-    if any(outcome["why"] for outcome in outcomes):
-        raise click.exceptions.Exit(LinkFailure.exit_code)
 
 
 @contextmanager
@@ -232,11 +227,6 @@ def _import_result(
         "decisions": decisions,
         "revoked": denied,
     }
-
-
-def _write_receipt(receipt: Path, octets: bytes) -> None:
-    if not holds(receipt, octets + b"\n"):
-        write_new(receipt, octets + b"\n")
 
 
 def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:

@@ -175,7 +175,7 @@ def run(arguments: list[str]) -> int:
     if asked:
         return _complete(asked)
     try:
-        arguments = in_front(arguments, _command_of)
+        arguments = in_front(arguments, lambda name: cli.get_command(click.Context(cli), name))
         with cli.make_context("teds-provision", list(arguments), terminal_width=_help_width()) as ctx:
             cli.invoke(ctx)
         return 0
@@ -213,9 +213,17 @@ def _help_width() -> int:
 
 
 def _misused(arguments: list[str], error: click.ClickException) -> int:
-    if isinstance(error, click.exceptions.NoArgsIsHelpError):
-        return _help_instead(arguments, error)
-    return _fail(arguments, 2, "usage", _usage(error), _usage_hint(error))
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):  # a group without a command: its help instead
+        if _wants(arguments, "--json"):
+            return _fail(arguments, 2, "usage", f"Missing command. (see: {error.ctx.command_path} --help)", "")
+        print(error.format_message(), file=sys.stderr)
+        return 2
+    text, hint = error.format_message(), ""
+    if isinstance(error, click.UsageError) and error.ctx is not None:
+        text += f" (see: {error.ctx.command_path} --help)"
+    if isinstance(error, click.NoSuchOption) and any(error.option_name in option.opts for option in cli.params):
+        hint = f"{error.option_name} is a global option: teds-provision {error.option_name} COMMAND …"
+    return _fail(arguments, 2, "usage", text, hint)
 
 
 def _untold(arguments: list[str], error: OSError) -> int:
@@ -244,37 +252,12 @@ def _bug(arguments: list[str], error: Exception) -> int:
     return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
 
 
-def _command_of(name: str) -> click.Command | None:
-    return cli.get_command(click.Context(cli), name)
-
-
 def _complete(instruction: str) -> int:
     """Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)."""
     from click.shell_completion import shell_complete
 
     LazyGroup.teachers.append(completing.teach)
     return shell_complete(cli, {}, "teds-provision", COMPLETE, instruction)
-
-
-def _help_instead(arguments: list[str], error: click.exceptions.NoArgsIsHelpError) -> int:
-    """Show the help of a group that was called without a command."""
-    if _wants(arguments, "--json"):
-        return _fail(arguments, 2, "usage", f"Missing command. (see: {error.ctx.command_path} --help)", "")
-    print(error.format_message(), file=sys.stderr)
-    return 2
-
-
-def _usage(error: click.ClickException) -> str:
-    text = error.format_message()
-    if isinstance(error, click.UsageError) and error.ctx is not None:
-        text += f" (see: {error.ctx.command_path} --help)"
-    return text
-
-
-def _usage_hint(error: click.ClickException) -> str:
-    if isinstance(error, click.NoSuchOption) and any(error.option_name in option.opts for option in cli.params):
-        return f"{error.option_name} is a global option: teds-provision {error.option_name} COMMAND …"
-    return ""
 
 
 def wants_json(arguments: list[str]) -> bool:
@@ -297,14 +280,9 @@ def _traceback(arguments: list[str]) -> None:
         traceback.print_exc()
 
 
-def _settle() -> None:
-    """Take the live line away before something else is told."""
-    if App.current is not None:
-        App.current.live_line()
-
-
 def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: str) -> int:
-    _settle()
+    if App.current is not None:
+        App.current.live_line()  # takes it away, before something else is told
     if _wants(arguments, "--json"):
         with contextlib.suppress(OSError):
             print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)

@@ -82,7 +82,9 @@ def nodes(
     elif form == "csv":
         _csv(described)
     elif not found:
-        _none(station)
+        known = bool(search(station))
+        print("No known node matches." if known else "No nodes are known yet.", end=" ")
+        print("To list all: teds-provision nodes" if known else "To add one by tap: teds-provision identify --add")
     elif text is not None and len(found) == 1:
         _one(next(described))
     else:
@@ -113,13 +115,6 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
         held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "held by nobody"
         line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), f"{held}{written}{banned}")))
         app.lines([line, *(f"  {one['name']}: {shown(one['why'])}" for one in node["conflicts"])])
-
-
-def _none(station: Station) -> None:
-    """Say why the list is empty."""
-    known = bool(search(station))
-    print("No known node matches." if known else "No nodes are known yet.", end=" ")
-    print("To list all: teds-provision nodes" if known else "To add one by tap: teds-provision identify --add")
 
 
 _FIELDS = (

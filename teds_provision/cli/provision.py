@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from teds_provision.steps.adopting import Brought
     from teds_provision.steps.batch import Boards, Plan, Questions, Request
     from teds_provision.steps.batch_sheet import Board, Row
-    from teds_provision.steps.build import NotNamed
     from teds_provision.steps.identify import Identified
     from teds_provision.steps.provision import Provisioned
     from teds_provision.teds.diff import Change
@@ -191,13 +190,16 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
     try:
         done = boards.one(questions)
     except steps_room.build.NotNamed as error:
-        _tell_not_named(app, error)
+        # With --json the changes stand beside the error, so that whoever asked can name them.
+        changes = [change.text for change in error.changes]
+        app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
         return
     except steps_room.adopting.NotAdopted as error:
         _show_brought(app, error.brought)
         app.conclude({"findings": error.brought.findings}, None, error)
         return
-    _tell(app, done, error=_failure(done), **_of_line(boards, done.who.uuid))
+    failure = steps_room.batch_sheet.Board(done.who.uuid, 0.0, done).failure
+    _tell(app, done, error=failure, **_of_line(boards, done.who.uuid))
 
 
 def _of_line(boards: Boards, uuid: bytes) -> dict[str, Any]:
@@ -321,16 +323,6 @@ def _tell_plan(app: App, plan: Plan) -> None:
         "warnings": list(plan.warnings),
     }
     app.emit(told, text)
-
-
-def _tell_not_named(app: App, error: NotNamed) -> None:
-    """With --json the changes stand beside the error, so that whoever asked can name them."""
-    changes = [change.text for change in error.changes]
-    app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
-
-
-def _failure(done: Provisioned) -> TedsProvisionError | None:
-    return steps_room.batch_sheet.Board(done.who.uuid, 0.0, done).failure
 
 
 def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = None, **more: object) -> None:

@@ -74,7 +74,8 @@ def _lines(result: Mapping[str, Any], summary: Summary, recording: Recording) ->
     if result["being_written"]:
         yield "It is still being written."
     elif not result["complete"]:
-        yield f"It was cut off: no end was written{_torn(result['torn'])}."
+        torn = f", and the last {result['torn']} octets are incomplete" if result["torn"] else ""
+        yield f"It was cut off: no end was written{torn}."
     for one in result["channels"]:
         facts = summary.facts.get((one["uuid"], one["channel"])) or recording.facts.get((one["uuid"], one["channel"]))
         span = _span(one, facts)
@@ -82,10 +83,6 @@ def _lines(result: Mapping[str, Any], summary: Summary, recording: Recording) ->
         yield f"  {name}: {one['samples']} values, {one['invalid']} invalid{span}"
     for one in result["notes"]:
         yield f"  {_local(one['time'])} {one['why']}"
-
-
-def _torn(octets: int) -> str:
-    return f", and the last {octets} octets are incomplete" if octets else ""
 
 
 def _span(one: Mapping[str, Any], facts: ChannelFacts | None) -> str:

@@ -80,7 +80,8 @@ def show(
     """
     plain = form in {"table", "json"}
     if diff is not None:
-        _require_nothing_else(files, plot, plain)
+        if files or plot or not plain:
+            raise UsageFailure("--diff compares two files and cannot be combined with anything else.")
         _diff(app, *diff, as_json=form == "json")
         return
     if not files:
@@ -92,12 +93,10 @@ def show(
     if plot is not None:
         _plot(app, shown, plot)
     _tell(app, shown, form)
-    _judge(shown, strict)
-
-
-def _require_nothing_else(files: tuple[str, ...], plot: Path | None, plain: bool) -> None:
-    if files or plot or not plain:
-        raise UsageFailure("--diff compares two files and cannot be combined with anything else.")
+    if any(file.malformed for file in shown) or (strict and any(map(_has_errors, shown))):
+        raise click.exceptions.Exit(_BAD_DATA)
+    if strict and any(guarded.severity == "error" for file in shown for guarded in file.guard):
+        raise click.exceptions.Exit(_POLICY)
 
 
 def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
@@ -136,14 +135,6 @@ def _write(app: App, blocks: Sequence[Block], form: Format) -> None:
     octets = written if isinstance(written, bytes) else written.encode()
     sys.stdout.buffer.write(octets)
     sys.stdout.flush()
-
-
-def _judge(files: Sequence[ShownFile], strict: bool) -> None:
-    """Exit code after everything has been told."""
-    if any(file.malformed for file in files) or (strict and any(map(_has_errors, files))):
-        raise click.exceptions.Exit(_BAD_DATA)
-    if strict and any(guarded.severity == "error" for file in files for guarded in file.guard):
-        raise click.exceptions.Exit(_POLICY)
 
 
 def _has_errors(file: ShownFile) -> bool:

@@ -68,7 +68,10 @@ class Arrivals:
         self.station.keys.refresh()
         for taken in pages(nodes):
             self._turn_to([one.node.uuid for one in taken])
-            self._take_back([one.node.uuid for one in taken if one.node.uuid in self.resting])
+            back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
+            self.station.policy.take_back(back)
+            for uuid in back:
+                self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
             self.station.handovers.take_in(self._rows(taken))
 
     def _rows(self, taken: Sequence[PlannedNode]) -> Batch:
@@ -76,7 +79,9 @@ class Arrivals:
             nodes=[self._node(one) for one in taken],
             whitelist=[entry for entry in map(self._entry, taken) if entry is not None],
             keys=[self._key(one.node) for one in taken if one.decision != "same"],
-            holders=[holder for one in taken for holder in self._holders(one.node)],
+            holders=[
+                Holder(one.node.uuid, other, self.now, self.bundle.mode) for one in taken for other in self.others
+            ],
             marks=self._marks(taken),
         )
 
@@ -87,15 +92,6 @@ class Arrivals:
         self.pins = station.pins.of_page(uuids)
         self.slots = station.keys.slots_of(uuids)
         self.cas = station.keys.cas_of_page(uuids)
-
-    def _take_back(self, uuids: list[bytes]) -> None:
-        self.station.policy.take_back(uuids)
-        for uuid in uuids:
-            self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
-
-    def _holders(self, node: BundledNode) -> list[Holder]:
-        """The other stations that have this key from now on: the sender, and who else the bundle is for."""
-        return [Holder(node.uuid, other, self.now, self.bundle.mode) for other in self.others]
 
     def _key(self, node: BundledNode) -> KeyRecord:
         return self.station.keys.wrapped(

@@ -174,7 +174,9 @@ def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[
 def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[bytes, str]:
     """Why each node of the wanted ones, or of all, cannot go, whatever its key is; "" for nothing."""
     known: Iterable[Sequence[NodeRecord | Shown]] = (
-        pages(station.nodes.each_shown()) if wanted is None else map(_listed, map(station.nodes.of_page, pages(wanted)))
+        pages(station.nodes.each_shown())
+        if wanted is None
+        else (list(station.nodes.of_page(page).values()) for page in pages(wanted))
     )
     stays: dict[bytes, str] = {}
     for page in known:
@@ -182,10 +184,6 @@ def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[
         pins = station.pins.among(page, entries.values())
         stays |= {node.uuid: _why_node_stays(node, pins.get(node.uuid, "")) for node in page}
     return stays
-
-
-def _listed(nodes: dict[bytes, NodeRecord]) -> list[NodeRecord]:
-    return list(nodes.values())
 
 
 def _why_node_stays(node: NodeRecord | Shown, pin: str) -> str:
@@ -259,7 +257,10 @@ def plan_exports(
     that is not settled; nodes of several CAs; a receiver that is not certified), BadData (a receiver's file).
     """
     receivers = tuple({record.point: record for record in _receivers(station, order)}.values())
-    _check(order, receivers)
+    if order.mode == "move" and len(receivers) != 1:
+        raise UsageFailure("A move has exactly one receiver.", hint="Use --mode copy for several.")
+    if order.days < 1:
+        raise UsageFailure("A bundle is valid for at least one day.")
     selection = Selection(station, order, {record.fingerprint for record in receivers})
     nodes, skipped = selection.choose()
     ca = _one_ca(station, order, nodes)
@@ -269,13 +270,6 @@ def plan_exports(
     common = _Common(order, receivers, ca, signatures, now or datetime.now(UTC), station.fingerprint, selection.rows)
     plans = [common.plan(part, _other_holders(station, part, receivers)) for part in selection.parts(nodes, most)]
     return [replace(plans[0], skipped=tuple(skipped)), *plans[1:]]
-
-
-def _check(order: ExportOrder, receivers: Sequence[TrustRecord]) -> None:
-    if order.mode == "move" and len(receivers) != 1:
-        raise UsageFailure("A move has exactly one receiver.", hint="Use --mode copy for several.")
-    if order.days < 1:
-        raise UsageFailure("A bundle is valid for at least one day.")
 
 
 @dataclass(frozen=True)

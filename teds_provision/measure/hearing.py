@@ -135,7 +135,9 @@ class HeardStream:
         if self._test_pattern:
             self.wrong_pattern += sum(message.data != self.receiver.expected(message) for message in messages)
         for block in blocks:
-            self._deliver(block)
+            self.samples += block.value.size
+            self.bound = block.clock_error
+            self.deliver(block)
 
     def ending(self) -> int:
         """The measurement ends now: how many messages of the run are wanted, the one that is being filled included."""
@@ -147,11 +149,6 @@ class HeardStream:
         until = time.monotonic() + HEARD_OUT
         while self.receiver.last < wanted - 1 and time.monotonic() < until:
             time.sleep(0.002)
-
-    def _deliver(self, block: Block) -> None:
-        self.samples += block.value.size
-        self.bound = block.clock_error
-        self.deliver(block)
 
 
 @dataclass

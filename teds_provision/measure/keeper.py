@@ -407,7 +407,9 @@ class NodeKeeper:
                 with self.turn:
                     self.streams.tell_time(trusted)
                     if self._lease_now() > self._lease:
-                        self._claim_longer(trusted)
+                        self._lease = self._lease_now()
+                        for number in self._claimed:
+                            claim(trusted, number, lease=self._lease)
                 told = now
             elif rest is not None:
                 with self.turn:
@@ -424,11 +426,6 @@ class NodeKeeper:
                 raise LinkFailure(
                     f"No message of the node came for {silent:.1f} s.", hint="Check its power and the bus."
                 )
-
-    def _claim_longer(self, trusted: Trusted) -> None:
-        self._lease = self._lease_now()
-        for number in self._claimed:
-            claim(trusted, number, lease=self._lease)
 
     def _is_gone(self) -> bool:
         """Whether it is of no use to wait for its answer: it is silent, or was since it was seen at another place."""

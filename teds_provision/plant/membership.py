@@ -30,18 +30,13 @@ def request(station: Station) -> bytes:
     made = MemberRequest(
         station.name, station.point, station.identity.signature, scram.verifier(secret), now().replace(microsecond=0)
     )
-    if kept is not None and _same(kept[1], made):
+    if kept is not None and replace(open_request(kept[1]), created=made.created) == made:
         return kept[1]
     octets = made.sealed(station.vault.identity())
     with station.transaction():
         station.plant.keep_login(secret, octets)
         station.audit("registry", None, "requested", fingerprint=station.fingerprint)
     return octets
-
-
-def _same(octets: bytes, made: MemberRequest) -> bool:
-    there = open_request(octets)
-    return replace(there, created=made.created) == made
 
 
 def found_roster(station: Station, post: Post, octets: bytes | None) -> Roster:

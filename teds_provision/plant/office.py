@@ -213,7 +213,8 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
 def _built(station: Station, job: Job, request: SignRequest) -> Image:
     """The datasheet as this office makes it, with the read-only TEDS that the job lists; raises _Refused."""
     try:
-        profile = _profile(station, job)
+        path = profile_file(station, job)
+        profile = _loaded(str(path), path.stat().st_mtime_ns, station.home)
         calibrations = _calibrations(job, request, profile)
         check_name(request.name)
         built = profile.build(request.uuid, calibration=calibrations, name=request.name)
@@ -282,11 +283,6 @@ def _text_of(octets: bytes) -> tuple[str, str]:
     except (ValueError, RecursionError):
         return text, "calibration.csv"
     return text, "calibration.toml"
-
-
-def _profile(station: Station, job: Job) -> Profile:
-    path = profile_file(station, job)
-    return _loaded(str(path), path.stat().st_mtime_ns, station.home)
 
 
 @lru_cache(maxsize=16)

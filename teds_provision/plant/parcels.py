@@ -106,7 +106,10 @@ class _Reader:
             try:
                 plan = incoming.plan_import(self.station, octets, self.now)
             except TedsProvisionError as error:
-                return self._end(row, error)
+                if isinstance(error, incoming.NothingTaken):
+                    self._refuse(error)
+                self.station.plant.parcels.drop_parcel(row.id, "in")
+                return True
             why = "" if isinstance(plan, incoming.Imported) else self._why_not(plan)
             if why:
                 self.station.plant.parcels.turn_parcel(row.id, "in", "waiting", why)
@@ -234,12 +237,6 @@ class _Reader:
                 told = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": one.why}
                 self.station.plant.tell("refused", one.node.uuid, **told)
             self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
-
-    def _end(self, row: ParcelRow, error: TedsProvisionError) -> bool:
-        if isinstance(error, incoming.NothingTaken):
-            self._refuse(error)
-        self.station.plant.parcels.drop_parcel(row.id, "in")
-        return True
 
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
         """What nobody can use is thrown away and told; it would lie there until it expires."""

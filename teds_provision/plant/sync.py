@@ -298,7 +298,8 @@ def resume(station: Station, post: Post) -> int:
                 newest = max(new, key=lambda one: (one.n, one.hash))
                 tables = station.plant.tables
                 theirs = {(page.n, page.hash) for page in found}
-                lost = [place for place in _counted(station, chain) if place not in theirs and place[0] >= new[0].n]
+                counted = [(n, hash) for n, hash, _ in tables.page_names(chain.chain) if n <= chain.counted[0]]
+                lost = [place for place in counted if place not in theirs and place[0] >= new[0].n]
                 tables.put_chain(replace(chain, accepted=(newest.n, newest.hash)))
                 adopt(station, roster, new)
                 _tell_again(station, chain, lost, new)
@@ -325,10 +326,6 @@ def _under_our_key(station: Station, post: Post, roster: Roster) -> list[Page]:
 def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
     known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(own_chain(station).chain)}
     return [page for page in found if (page.n, page.hash) not in known]
-
-
-def _counted(station: Station, chain: Chain) -> list[tuple[int, str]]:
-    return [(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain) if n <= chain.counted[0]]
 
 
 def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:

@@ -180,13 +180,13 @@ def verify_evidence(
     work = _Work(grounds, tell, files)
     workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
     if len(files) <= _FEW or workers <= 1:
-        yield from (work.done(range(at, min(at + _CHUNK, len(files)))) for at in range(0, len(files), _CHUNK))
+        yield from (work.judge(range(at, min(at + _CHUNK, len(files)))) for at in range(0, len(files), _CHUNK))
         return
-    yield work.done(range(1))  # what is loaded late is there before there are more processes
+    yield work.judge(range(1))  # what is loaded late is there before there are more processes
     size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
     context = multiprocessing.get_context("fork")  # what is judged by is simply there
-    with context.Pool(workers, initializer=_begin, initargs=(work,)) as pool:
-        yield from pool.imap(_done, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
+    with context.Pool(workers, initializer=_init_worker, initargs=(work,)) as pool:
+        yield from pool.imap(_judge_chunk, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class _Work:
     tell: Tell
     files: Sequence[str]
 
-    def done(self, places: range) -> tuple[list[str], Totals]:
+    def judge(self, places: range) -> tuple[list[str], Totals]:
         lines, totals = [], Totals()
         for judged in judge_files(self.grounds, [Path(self.files[place]) for place in places]):
             totals.add(judged)
@@ -206,16 +206,16 @@ class _Work:
 _work: _Work | None = None
 
 
-def _begin(work: _Work) -> None:
+def _init_worker(work: _Work) -> None:
     global _work  # noqa: PLW0603 - set once, in a process of its own
     _work = work
     gc.freeze()
     gc.disable()  # documents are trees: their count of references alone frees them, a tenth of the time sooner
 
 
-def _done(places: range) -> tuple[list[str], Totals]:
+def _judge_chunk(places: range) -> tuple[list[str], Totals]:
     assert _work is not None
-    return _work.done(places)
+    return _work.judge(places)
 
 
 def judge_file(grounds: Grounds, path: Path) -> Judged:

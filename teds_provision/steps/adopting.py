@@ -86,7 +86,8 @@ def brought_by(station: Station, image: Image, *, name: str | None = None) -> Br
     """
     blocks = dict(image.unsigned_blocks())
     if name is not None:
-        blocks[_NAME] = _named(blocks.get(_NAME), name)
+        edition = decode(blocks[_NAME]).edition if _NAME in blocks else None
+        blocks[_NAME] = compose(AccessCode.NAME, {"Format": USER_DEFINED_NAME, "TCName": name}, edition=edition or 2007)
     uuid = image.uuid.hex()
     for (channel, code), octets in blocks.items():
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), octets):
@@ -128,11 +129,6 @@ def require_a_reason(station: Station, brought: Brought, reason: str | None) -> 
             hint='Give it one of yours: --profile. Or, if it is right, say why: --accept-calibration "why".',
         )
     station.audit("accept-datasheet", brought.image.uuid, "accepted", why=reason, findings=list(brought.errors))
-
-
-def _named(teds: bytes | None, name: str) -> bytes:
-    edition = decode(teds).edition if teds is not None else None
-    return compose(AccessCode.NAME, {"Format": USER_DEFINED_NAME, "TCName": name}, edition=edition or 2007)
 
 
 def _require_own_name(station: Station, uuid: bytes, name: str) -> None:

@@ -229,12 +229,16 @@ def _agree(
     new = who.state == NodeState.FACTORY
     with station.reading():
         returning = _may_return(station, who)
-        entry = _entry_for(station, node.uuid, newcomer, returning=returning)
+        entry = newcomer
+        if entry is None or station.pins.entry(node.uuid) is not None:
+            entry = station.policy.require_whitelisted(node.uuid, returning=returning)
     demanded = rotate and not again
     # of a run that was just cut short the node may have the new key, whatever it said before
     held = open_session(station, node, word=rotate) if not new or again else None
     if held is not None:
-        _enlist_keyed(station, newcomer)
+        if newcomer is not None:  # a session under a key of ours is open: it comes onto the list at once
+            with station.durable("agree"):
+                _enlist(station, newcomer)
         if demanded or station.keys.rotation_due(node.uuid) is not None:
             return _new_key(station, node, who, entry, returning=returning, demanded=True)
         return Agreed(held.record.epoch, held.record.key_id, fresh=again)
@@ -296,20 +300,6 @@ def _new_key(
         return Agreed(held.record.epoch, held.record.key_id, fresh=True)
     except SessionLost as lost:
         raise lost.cause from lost
-
-
-def _entry_for(station: Station, uuid: bytes, newcomer: WhitelistEntry | None, *, returning: bool) -> WhitelistEntry:
-    """The node's entry on the whitelist, or the one that a newcomer is to get; raises NotWhitelisted."""
-    if newcomer is not None and station.pins.entry(uuid) is None:
-        return newcomer
-    return station.policy.require_whitelisted(uuid, returning=returning)
-
-
-def _enlist_keyed(station: Station, newcomer: WhitelistEntry | None) -> None:
-    """A newcomer with which a session is open under a key of ours comes onto the list at once."""
-    if newcomer is not None:
-        with station.durable("agree"):
-            _enlist(station, newcomer)
 
 
 def _enlist(station: Station, entry: WhitelistEntry) -> None:

@@ -263,7 +263,10 @@ class _Reading:
         for what, value in (("uuid", uuid), ("fingerprint", pin), ("name", values.get("name", ""))):
             self._once(line, what, value or "")
         if uuid is not None and prepared is not None and prepared.order.name is not None:
-            self._name_is_free(line, bytes.fromhex(uuid), prepared.order.name)
+            name = prepared.order.name
+            others = [other for other in self.station.nodes.all_named(name) if other != bytes.fromhex(uuid)]
+            if others:
+                self.wrong(line, f"node {others[0].hex()} has the name {name!r} already")
         if self.count == before and prepared is not None:
             digest = hashlib.sha256("\0".join(cells).encode()).hexdigest()
             number = len(self.rows) + 1
@@ -297,11 +300,6 @@ class _Reading:
         other = self._seen.setdefault((what, value), line)
         if other != line and not (what == "name" and ("{uuid}" in value or "{n}" in value)):
             self.wrong(line, f"the {what} {value} stands in line {other} too")
-
-    def _name_is_free(self, line: int, uuid: bytes, name: str) -> None:
-        others = [other for other in self.station.nodes.all_named(name) if other != uuid]
-        if others:
-            self.wrong(line, f"node {others[0].hex()} has the name {name!r} already")
 
     def _order(self, line: int, values: dict[str, str]) -> Prepared | None:
         file = values.get("calibration") or None
@@ -443,10 +441,9 @@ class Progress:
             if row.means(uuid, fingerprint) or (row.by_order and self.board_of(row) == uuid.hex()):
                 return row
         rows = [row for row in self.open if row.by_order and row.number not in busy]
-        return min(rows, key=self._lateness, default=None)
-
-    def _lateness(self, row: Row) -> tuple[bool, bool]:
-        return self.rows[row.number].uuid is not None, row.number in self._tried
+        return min(
+            rows, key=lambda row: (self.rows[row.number].uuid is not None, row.number in self._tried), default=None
+        )
 
     def board_of(self, row: Row) -> str | None:
         """The board that has the row, or was turned away from it in this run; None where there was none."""

@@ -229,9 +229,9 @@ def compose(
     warnings: tuple[str, ...] = ()
     if calibrations is None:
         calibrations, warnings = _kept_calibrations(order, has, profile)
-    kept = order.name or name or (_known_name(station, uuid) if as_known else None)
-    made = _made(profile, uuid, calibrations, kept, edition)
-    digest, record = digest_of(profile), station.nodes.get(uuid)
+    record = station.nodes.get(uuid)
+    kept = order.name or name or (record.name if as_known and record is not None else None)
+    made, digest = _made(profile, uuid, calibrations, kept, edition), digest_of(profile)
     before = record.profile_digest if record is not None and record.profile == wanted else None
     changed = order.profile is None and before is not None and before != digest
     if changed:
@@ -251,11 +251,6 @@ def digest_of(profile: Profile) -> str:
 def _whole(profile: str | None) -> str | None:
     """A name as it is, a path from the root on: the next command may stand in another folder."""
     return profile if profile is None or is_profile_name(profile) else str(Path(profile).absolute())
-
-
-def _known_name(station: Station, uuid: bytes) -> str | None:
-    record = station.nodes.get(uuid)
-    return record.name if record is not None else None
 
 
 def _kept_calibrations(

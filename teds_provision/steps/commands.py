@@ -221,13 +221,9 @@ def _one(station: Station, node: Conversation, add: bool) -> Found:
     with station.durable("identify"):
         station.nodes.remember(who.uuid, **facts)
         station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
-    return _found(node, who, listed=entry is not None, channels=described.channels, name=name)
-
-
-def _found(node: Conversation, who: Identified, *, listed: bool, channels: int, name: str | None) -> Found:
     charging = node.contact.charging.to_json() if node.contact.charging else None
     ble = node.contact.ble.text if node.contact.ble else None
-    return Found(who, node.identity, listed, channels, name, charging, ble)
+    return Found(who, node.identity, entry is not None, described.channels, name, charging, ble)
 
 
 # -- agree, address ----------------------------------------------------------------------------------------------------

@@ -96,13 +96,13 @@ def verify_files(
     workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
     work = _Work(remember(station), tell, files)
     if len(files) <= _FEW or workers <= 1:
-        yield from (work.done(range(at, at + 1)) for at in range(len(files)))
+        yield from (work.judge(range(at, at + 1)) for at in range(len(files)))
         return
-    yield work.done(range(1))  # what is loaded late is there before there are more processes
+    yield work.judge(range(1))  # what is loaded late is there before there are more processes
     size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
     context = multiprocessing.get_context("fork")  # what is remembered is simply there
-    with context.Pool(workers, initializer=_begin, initargs=(work,)) as pool:
-        yield from pool.imap(_done, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
+    with context.Pool(workers, initializer=_init_worker, initargs=(work,)) as pool:
+        yield from pool.imap(_judge_chunk, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class _Work:
     tell: Tell
     files: Sequence[str]
 
-    def done(self, places: range) -> tuple[list[str], Totals]:
+    def judge(self, places: range) -> tuple[list[str], Totals]:
         """Judge the files at these places of the list, which every process has."""
         lines, totals = [], Totals()
         for some in _some([Path(self.files[place]) for place in places]):
@@ -126,15 +126,15 @@ class _Work:
 _work: _Work | None = None
 
 
-def _begin(work: _Work) -> None:
+def _init_worker(work: _Work) -> None:
     global _work  # noqa: PLW0603 - set once, in a process of its own
     _work = work
     gc.freeze()  # the whole program is there before the first image: not looked through again for each few of them
 
 
-def _done(places: range) -> tuple[list[str], Totals]:
+def _judge_chunk(places: range) -> tuple[list[str], Totals]:
     assert _work is not None
-    return _work.done(places)
+    return _work.judge(places)
 
 
 _Read = tuple[Path, Image | TedsProvisionError]

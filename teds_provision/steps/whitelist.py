@@ -239,12 +239,8 @@ def _refuse_long(text: str, separator: str, file: str, what: str) -> None:
         at = end + 1 if end >= 0 else len(text)
 
 
-def _local(name: str) -> str:
-    return name.rpartition(":")[2].lower()
-
-
 def _field_name(name: str) -> str:
-    local = _local(name)
+    local = name.rpartition(":")[2].lower()
     return _ALIASES.get(local, local)
 
 

@@ -107,7 +107,7 @@ class AuditLog:
 
     def append(self, act: str, uuid: bytes | None, outcome: str, detail: Mapping[str, Any] | None = None) -> None:
         """Add one entry; ``detail`` holds JSON values only and never a secret. Raises StoreFailure."""
-        text = _canonical(dict(detail or {}))
+        text = _encode(dict(detail or {}))
         with self._database.together():
             last = self._database.one(_END)
             count, previous, noted = last or (0, self._root, self._noted())
@@ -265,10 +265,6 @@ def _like(text: str) -> str:
     for sign in "!%_":
         plain = plain.replace(sign, f"!{sign}")
     return "'%" + plain.replace("'", "''").replace("\0", "") + "%'"
-
-
-def _canonical(value: dict[str, Any]) -> str:
-    return _encode(value)
 
 
 @cache

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from teds_provision.errors import AddressConflict
@@ -145,15 +146,13 @@ class Arrivals:
                 found = news
             elif self._is_news(*news):
                 yield news
-        settled = settle(found, self._ask_again, until=time.monotonic() + _LONGEST_SECONDS)
+        ask_again = partial(self._port.identify, seconds=_UNCLEAR_SECONDS)
+        settled = settle(found, ask_again, until=time.monotonic() + _LONGEST_SECONDS)
         clashing |= settled.conflicts
         for address in found.conflicts | found.unfinished:
             identity = settled.identities.get(address)
             if identity is not None and self._is_news(address, identity):
                 yield address, identity
-
-    def _ask_again(self, address: int) -> Identity | None:
-        return self._port.identify(address, seconds=_UNCLEAR_SECONDS)
 
     def _is_news(self, address: int, identity: Identity) -> bool:
         """New, back after silence, or reset to factory state. A new address alone is no news."""

@@ -207,7 +207,8 @@ class Bus:
             if message.arbitration_id & _BUS_OFF:
                 self._bus_off()
             return None
-        if message.is_remote_frame or not message.is_extended_id or self._is_own(message):
+        own = self._marks_own and not message.is_rx
+        if message.is_remote_frame or not message.is_extended_id or own:
             return None
         frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, self._arrival(message.timestamp))
         return None if self._echoes and self._echoes.take(frame) else frame
@@ -216,9 +217,6 @@ class Bus:
         """Time of arrival on the monotonic clock: taken back by the age of a time stamp of this machine's clock."""
         age = time.time() - timestamp if self._clock_is_ours else 0.0
         return time.monotonic() - (age if 0.0 < age < _LATEST_SECONDS else 0.0)
-
-    def _is_own(self, message: can.Message) -> bool:
-        return self._marks_own and not message.is_rx
 
     def _next(self, seconds: float) -> can.Message | None:
         import can

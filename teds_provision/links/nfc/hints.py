@@ -97,15 +97,12 @@ def _status_fields(payload: bytes) -> Iterator[tuple[str, int]]:
     octets = iter(payload[1:])
     second = 0
     flags = payload[0] if payload else 0
-    for (name, signed), octet in zip(_announced(flags), octets, strict=False):
+    announced = [(name, signed) for bit, name, signed in _STATUS_FIELDS if flags & bit]
+    for (name, signed), octet in zip(announced, octets, strict=False):
         second = octet if name == "second_control" else second
         if name != "battery_percent" or octet <= 100:
             yield name, _signed(octet) if signed else octet
     yield from zip([name for bit, name in _SECOND_FIELDS if second & bit], octets, strict=False)
-
-
-def _announced(flags: int) -> list[tuple[str, bool]]:
-    return [(name, signed) for bit, name, signed in _STATUS_FIELDS if flags & bit]
 
 
 def _signed(octet: int) -> int:

@@ -177,7 +177,8 @@ class NfcPort:
                 notice(waiting)
                 here = None
             if seen is None:
-                stop.wait(_pause(gone_at))
+                # Short where nodes are being changed, so that none is waited for.
+                stop.wait(_SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE)
                 continue
             if isinstance(seen, Foreign):
                 told = _tell(seen, told, notice)
@@ -393,11 +394,6 @@ def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
         if text != told:
             notice(Notice("waiting", text))
     return text
-
-
-def _pause(gone_at: float) -> float:
-    """Seconds until the next look: short where nodes are being changed, so that none is waited for."""
-    return _SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE
 
 
 def _has_left(here: bytes | None, seen: Visit | Foreign | None, gone_at: float) -> TypeGuard[bytes]:

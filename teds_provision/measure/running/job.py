@@ -157,7 +157,8 @@ class Job:
             try:
                 self.ended = self.run(buses, self._stop, watcher=watcher)
                 self.error = self.ended.error
-                if self._over():
+                if self.kept.ends is not None and self.kept.ends <= time.time():
+                    self.station.measurements.forget(self.kept.id)
                     return
             except TedsProvisionError as error:
                 self.error = error
@@ -166,12 +167,6 @@ class Job:
             self._stop.wait(pause)
             pause = min(2 * pause, LONGEST)
             self.sinks = self._new_sinks()
-
-    def _over(self) -> bool:
-        if self.kept.ends is None or self.kept.ends > time.time():
-            return False
-        self.station.measurements.forget(self.kept.id)
-        return True
 
     def _began(self, duration: float | None) -> None:
         """Its end is known from its first value on, and stands in the store, so that a restart does not move it."""
