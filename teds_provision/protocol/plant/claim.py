@@ -7,7 +7,6 @@ for and nothing of the order in which chains arrived: the greatest key, the last
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Final
 
@@ -42,10 +41,46 @@ class Claim:
     groups: dict[str, tuple[bool, str]] = field(default_factory=dict)
 
     def take(self, event: Event) -> None:
-        """Add the next event of the station's chain about this node."""
-        gather = _GATHER.get(event.act)
-        if gather is not None:
-            gather(self, event)
+        """Add the next event of the station's chain about this node.
+
+        Signed and vouched digests, statements and liftings are sets of the whole plant, kept beside the claims.
+        """
+        said = event.members
+        match event.act:
+            case "pinned":
+                self.pin = said["fingerprint"], said["assurance"]
+            case "unpinned":
+                self.pin = None
+            case "agreed":
+                agreed = said["epoch"], said["key_id"], said["fingerprint"]
+                if self.agreed is None or agreed[:2] >= self.agreed[:2]:
+                    self.agreed = agreed
+            case "took":
+                took = said["epoch"], said["key_id"]
+                self.took = took if self.took is None else max(self.took, took)
+            case "written":
+                written = (
+                    said["sequence"], said["teds_sha256"], said["epoch"],
+                    said["profile"], said["profile_sha256"], said["due"],
+                )  # fmt: skip
+                if self.written is None or written[:2] >= self.written[:2]:
+                    self.written = written
+            case "gave":
+                self.gave.add((said["bundle"], said["peer"], said["epoch"], said["key_id"], said["mode"]))
+            case "undone":
+                self.undone.add(said["bundle"])
+            case "refused":
+                self.refused.add((said["bundle"], said["peer"], said["why"]))
+            case "forgot":
+                self.forgot = max(self.forgot, said["epoch"])
+            case "reset":
+                proven = reset_proven(event)
+                if proven is not None:
+                    self.resets.add((proven, said["epoch"]))
+            case "named":
+                self.name = said["name"], event.at
+            case "grouped":
+                self.groups[said["group"]] = said["member"], event.at
 
     def key(self) -> Key | None:
         """The greatest key that it agreed or took."""
@@ -73,67 +108,3 @@ class Claim:
         claim.undone = set(kept.get("undone", ()))
         claim.groups = {group: (member, at) for group, (member, at) in kept.get("groups", {}).items()}
         return claim
-
-
-def _pinned(claim: Claim, event: Event) -> None:
-    claim.pin = event.members["fingerprint"], event.members["assurance"]
-
-
-def _unpinned(claim: Claim, event: Event) -> None:
-    claim.pin = None
-
-
-def _agreed(claim: Claim, event: Event) -> None:
-    new = event.members["epoch"], event.members["key_id"], event.members["fingerprint"]
-    if claim.agreed is None or new[:2] >= claim.agreed[:2]:
-        claim.agreed = new
-
-
-def _took(claim: Claim, event: Event) -> None:
-    new = event.members["epoch"], event.members["key_id"]
-    claim.took = new if claim.took is None else max(claim.took, new)
-
-
-def _written(claim: Claim, event: Event) -> None:
-    told = event.members
-    new = told["sequence"], told["teds_sha256"], told["epoch"], told["profile"], told["profile_sha256"], told["due"]
-    if claim.written is None or new[:2] >= claim.written[:2]:
-        claim.written = new
-
-
-def _gave(claim: Claim, event: Event) -> None:
-    told = event.members
-    claim.gave.add((told["bundle"], told["peer"], told["epoch"], told["key_id"], told["mode"]))
-
-
-def _undone(claim: Claim, event: Event) -> None:
-    claim.undone.add(event.members["bundle"])
-
-
-def _refused(claim: Claim, event: Event) -> None:
-    claim.refused.add((event.members["bundle"], event.members["peer"], event.members["why"]))
-
-
-def _forgot(claim: Claim, event: Event) -> None:
-    claim.forgot = max(claim.forgot, event.members["epoch"])
-
-
-def _reset(claim: Claim, event: Event) -> None:
-    proven = reset_proven(event)
-    if proven is not None:
-        claim.resets.add((proven, event.members["epoch"]))
-
-
-def _named(claim: Claim, event: Event) -> None:
-    claim.name = event.members["name"], event.at
-
-
-def _grouped(claim: Claim, event: Event) -> None:
-    claim.groups[event.members["group"]] = event.members["member"], event.at
-
-
-_GATHER: Final[dict[str, Callable[[Claim, Event], None]]] = {
-    "pinned": _pinned, "unpinned": _unpinned, "agreed": _agreed, "took": _took, "written": _written, "gave": _gave,
-    "undone": _undone, "refused": _refused, "forgot": _forgot, "reset": _reset, "named": _named, "grouped": _grouped,
-}  # fmt: skip
-"""Signed and vouched digests, statements and liftings are sets of the whole plant, kept beside the claims."""
