@@ -93,7 +93,8 @@ def export_keys(
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
     order = handover.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
-        station.unlock()
+        station.unlock()  # now: nobody is asked for a passphrase while the store is held
+    state = station.version()  # before the plan: what changes while it is made is not overlooked either
     shown = handover.outgoing.plan_exports(station, order)
     outputs = handover.outgoing.outputs_of(output, len(shown)) if output is not None else []
     if dry_run:
@@ -101,10 +102,10 @@ def export_keys(
         id_ = None if shown[0].earlier is None else shown[0].id
         app.emit({**told, "id": id_, "plan": True}, _plan_text(shown, station))
         return
-    state = station.version()
     app.note(_plan_text(shown, station))
     app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
     with station.lock("export-keys", app.note):
+        # A person may have taken minutes to answer. What they said yes to is done, or nothing is.
         plans = shown if station.version() == state else handover.outgoing.plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         told = _exported(plans, outputs, station)

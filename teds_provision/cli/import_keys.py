@@ -81,8 +81,8 @@ def import_keys(
     with _bundle_file(file) as bundle:
         receipt = receipt or file.with_name(file.name + ".receipt")
         station.unlock()
+        state = station.version()  # before the plan: what changes while it is made is not overlooked either
         shown = handover.incoming.plan_import(station, bundle)
-        state = station.version()
         if dry_run:
             app.emit({**_import_plan(shown), "receipt": None, "plan": True}, _import_text(station, shown))
             return

@@ -99,7 +99,8 @@ def _emit_change(
     app.confirm("Sign this roster?", yes=yes)
     station.unlock()
     with station.lock("registry", app.note):
-        if station.plant.roster != before:
+        held = station.plant.roster
+        if held is None or draft.previous != held.hash:  # two rosters of one version would be an alarm everywhere
             raise PolicyRefused("Another command changed the roster meanwhile.", hint="Run this again.")
         signed = plant.owner.signed(station, draft)
         if output is not None:

@@ -185,6 +185,33 @@ def test_it_asks_and_nobody_answers(homes: Homes) -> None:
     homes.refused(6, "import-keys", output)
 
 
+@pytest.mark.parametrize("way", ["export", "import"])
+def test_what_another_command_changes_while_a_plan_is_made_is_not_overlooked(
+    homes: Homes, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    from teds_provision import handover
+
+    path = homes.export("--all") if way == "import" else homes.folder / "keys.jwe"
+    home = homes.south if way == "import" else homes.north
+    room, name = (handover.incoming, "plan_import") if way == "import" else (handover.outgoing, "plan_exports")
+    plan, planned = getattr(room, name), []
+
+    def and_another_revokes(station: object, *what: object, **more: object) -> object:
+        planned.append(plan(station, *what, **more))
+        if len(planned) == 1:
+            other = open_station(home)
+            handover.life.revoke(other, bytes.fromhex(UUIDS[0]), "stolen")
+            other.close()
+        return planned[-1]
+
+    monkeypatch.setattr(room, name, and_another_revokes)
+    words = ["import-keys", path] if way == "import" else ["export-keys", "--to", "south", "--all", "--output", path]
+    done = homes.run(home, *words, "--yes")
+    assert (done.code, len(planned)) == (6, 2)
+    assert "Another command changed the plan" in done.json["error"]["message"]
+    assert path.exists() == (way == "import")
+
+
 def test_undo_by_the_first_digits_of_the_id(homes: Homes) -> None:
     homes.export(UUIDS[0], "--mode", "move")
     (row,) = homes.run(homes.north, "handover", "list").json["handovers"]

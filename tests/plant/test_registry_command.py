@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from teds_provision import plant
 from tests.bench import PASSPHRASE
-from tests.cli.shell import Outcome, spawn
+from tests.cli.shell import Outcome, call, spawn
 from tests.plant.stations import certified, owner
 
 UUID = "8d4d9da65281f7000000"
@@ -155,6 +157,30 @@ def test_a_station_of_another_ca_is_not_added(desk: Desk, tmp_path: Path) -> Non
     done = desk.run("north", "registry", "add", asked, "--role", "base", "--yes")
     assert done.code == 6
     assert "not certified" in done.err
+
+
+def test_two_commands_at_once_never_sign_two_rosters_of_one_version(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk.ask("north", "registry", "create", "--name", "plant Augsburg", "--yes")
+    asked = {name: desk.folder / f"{name}.request" for name in ("south", "west")}
+    for name, file in asked.items():
+        desk.ask(name, "registry", "request", "--output", file)
+    add = plant.owner.add
+
+    def and_another_adds(*what: Any) -> object:
+        draft = add(*what)
+        monkeypatch.undo()
+        desk.ask("north", "registry", "add", asked["west"], "--role", "line", "--yes")
+        return draft
+
+    monkeypatch.setattr(plant.owner, "add", and_another_adds)
+    done = call(desk.folder / "north", "--json", "registry", "add", asked["south"], "--role", "base", "--yes")
+    assert (done.code, "Another command changed the roster" in done.json["error"]["message"]) == (6, True)
+    desk.ask("north", "registry", "add", asked["south"], "--role", "base", "--yes")
+    desk.ask("north", "registry", "connect", "--files", desk.stick, "--yes")
+    desk.sync("north")
+    assert desk.ask("south", "registry", "connect", "--files", desk.stick, "--yes")["version"] == 3
 
 
 def test_a_second_request_is_the_same_and_a_plan_changes_nothing(desk: Desk) -> None:
