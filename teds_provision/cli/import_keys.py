@@ -92,7 +92,11 @@ def import_keys(
             app.confirm(f"Import {count_of(len(shown.taken))}?", yes=yes)
         with station.lock("import-keys", app.note):
             plan = shown if station.version() == state else handover.incoming.plan_import(station, bundle)
-            done = _take_in(station, plan, shown)
+            _require_as_shown(plan, shown)
+            if isinstance(plan, handover.incoming.Imported):  # before, or meanwhile by another command
+                done = plan
+            else:
+                done = handover.incoming.import_bundle(station, plan)
             if not holds(receipt, done.receipt + b"\n"):  # the same bundle once more: its receipt may lie there
                 write_new(receipt, done.receipt + b"\n")
     outcomes: list[dict[str, Any]] = []
@@ -125,7 +129,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
         app.confirm("Import this parcel?", yes=yes)
         with station.lock("import-keys", app.note):
             plan = handover.incoming.plan_import(station, octets)
-            require_same(type(plan) is type(shown))
+            _require_as_shown(plan, shown)
             done = plant.parcels.import_parcel(station, row, plan)
         one["fresh"] = done.fresh
     count = f"{len(told)} parcel{'s' * (len(told) != 1)}"
@@ -157,12 +161,10 @@ def _is_sealed(file: BinaryIO) -> bool:
     return _CIPHERTEXT in before
 
 
-def _take_in(station: Station, plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> Imported:
-    """Import what was ``shown``, under the lock; nothing to do where it was taken in before."""
-    if isinstance(plan, handover.incoming.Imported):
-        return plan
-    require_same(not isinstance(shown, handover.incoming.Imported) and plan.nodes == shown.nodes)
-    return handover.incoming.import_bundle(station, plan)
+def _require_as_shown(plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> None:
+    """Raise PolicyRefused where another command changed what becomes of a node; taken in meanwhile is fine."""
+    if not isinstance(plan, handover.incoming.Imported):
+        require_same(not isinstance(shown, handover.incoming.Imported) and plan.nodes == shown.nodes)
 
 
 def _import_plan(plan: ImportPlan | Imported) -> dict[str, Any]:

@@ -6,15 +6,19 @@ import os
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from teds_provision.handover import outgoing
+from teds_provision.handover import incoming, life, outgoing
 from teds_provision.plant import asking, parcels
 from teds_provision.plant.post import Parcel
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import CONTENT_TYPE
+from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
-from teds_provision.store.tables.parcels import ParcelKind
+from tests.cli.shell import call
 from tests.plant.handing import Plant, board_of
 
 ROLES = {"north": "keeper sign line base", "south": "base", "west": "line"}
@@ -127,15 +131,16 @@ def test_answers_that_nobody_asks_for_any_more_do_not_keep_jobs_out(plant: Plant
     plant.roster(ROLES)
     north, west = plant["north"], plant["west"]
 
-    def send(kind: document.Kind, name: ParcelKind, n: int) -> None:
+    def send(kind: document.Kind, n: int) -> None:
         members = {"format": kind.format, "id": f"6f1c0a52-6f0e-4c1b-8a55-{n:012d}"}
-        parcels.enqueue(north, name, west.fingerprint, document.seal(members, north.vault.identity(), kind), days=60)
-        sync(plant, "north")
+        signed = document.seal(members, north.vault.identity(), kind)
+        sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)
+        plant.post.send(Parcel(f"{kind.typ} {n}", west.fingerprint, sealed, time_text(now(60)), north.fingerprint))
 
     for n in range(64):
-        send(document.SIGNED, "signed", n)
+        send(document.SIGNED, n)
     sync(plant, "west")
-    send(document.JOB, "job", 0)
+    send(document.JOB, 0)
     sync(plant, "west", at=now(30))
     assert parcels.received(west, "job") == []
     sync(plant, "west", at=now(32))
@@ -143,6 +148,36 @@ def test_answers_that_nobody_asks_for_any_more_do_not_keep_jobs_out(plant: Plant
     assert parcels.received(west, "signed") == []
     sync(plant, "west", at=now(90))
     assert len(parcels.received(west, "job")) == 1
+
+
+def test_a_person_takes_in_what_waits_and_nothing_else_than_was_shown(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.roster(ROLES)
+    one, other = (board_of(plant["west"], os.urandom(10)).uuid for _ in range(2))
+    west, south = plant["west"], plant["south"]
+    with west.lock("test"):
+        parcels.send_export(west, outgoing.plan_export(west, outgoing.ExportOrder(("south",), (one, other))), now())
+    sync(plant, "west", "south")
+    shown = call(tmp_path / "south", "--json", "import-keys", "--received", "--dry-run").json
+    assert ([parcel["count"] for parcel in shown["received"]], shown["plan"]) == ([2], True)
+
+    planned = incoming.plan_import
+
+    def and_another_revokes(*what: Any) -> object:
+        plan = planned(*what)
+        monkeypatch.undo()
+        life.revoke(south, one, "stolen")
+        return plan
+
+    monkeypatch.setattr(incoming, "plan_import", and_another_revokes)
+    done = call(tmp_path / "south", "--json", "import-keys", "--received", "--yes")
+    assert (done.code, "changed the plan" in done.out) == (6, True)
+    assert (holds(south, one), holds(south, other)) == ([], [])
+    done = call(tmp_path / "south", "--json", "import-keys", "--received", "--yes")
+    assert (done.code, [parcel["imported"] for parcel in done.json["received"]]) == (0, [[other.hex()]])
+    assert (holds(south, one), holds(south, other)) == ([], [(1, "import")])
+    assert call(tmp_path / "south", "--json", "import-keys", "--received").json["received"] == []
 
 
 def test_a_move_waits_for_a_person_whatever_the_roster_shares(plant: Plant) -> None:
