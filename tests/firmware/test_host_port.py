@@ -144,7 +144,7 @@ def test_an_actuator_is_set_held_and_goes_safe(desk: Desk, station: Station, nod
     )
     done = station.provision("can", "--profile", "gripper", "--calibration", calibration)
     assert done["verdict"] == "authentic"
-    held = station.start("set", node.uuid, "1", "20", "--unit", "mm", "--dead-man", "500", "--hold", "60", *links)
+    held = station.start("set", node.uuid, "1", "20", "--unit", "mm", "--dead-man", "5000", "--hold", "60", *links)
     rival = [*links[:-1], f"{links[-1]}&source=0xf2"]
 
     def state() -> set[str]:
