@@ -17,7 +17,7 @@ from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, WholeNumber
 from teds_provision.cli.rendering import local_time, moment, print_table
 from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
 from teds_provision.files import json_files
-from teds_provision.teds.profile.load import default_folders, find_profile
+from teds_provision.teds.profile.load import default_folders, find_profile, load_profile
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -91,6 +91,7 @@ def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
     if (told["count"] is None) == (told["listed"] is None):
         raise UsageFailure("A job is for a number of boards or for a list.", hint="Use one of --count and --list.")
     path = find_profile(told["profile"], default_folders(station.home))
+    load_profile(path, default_folders(station.home)).build(bytes(10))  # else nobody could work on the job
     boards = _boards(told["listed"]) if told["listed"] is not None else {}
     total = told["count"] or len(boards)
     sign = told["sign"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import time
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -14,7 +15,15 @@ from typing import Final
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProvisionError
 from teds_provision.plant.asking import Inbox, name_of, send
-from teds_provision.plant.jobs import now_of, profile_file, read_job, require_adopted, require_open, roster_of
+from teds_provision.plant.jobs import (
+    digest_of_file,
+    now_of,
+    profile_file,
+    read_job,
+    require_adopted,
+    require_open,
+    roster_of,
+)
 from teds_provision.plant.post import Post
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.fingerprints import same_key
@@ -213,8 +222,7 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
 def _built(station: Station, job: Job, request: SignRequest) -> Image:
     """The datasheet as this office makes it, with the read-only TEDS that the job lists; raises _Refused."""
     try:
-        path = profile_file(station, job)
-        profile = _loaded(str(path), path.stat().st_mtime_ns, station.home)
+        profile = _profile(station, job)
         calibrations = _calibrations(job, request, profile)
         check_name(request.name)
         built = profile.build(request.uuid, calibration=calibrations, name=request.name)
@@ -285,7 +293,17 @@ def _text_of(octets: bytes) -> tuple[str, str]:
     return text, "calibration.toml"
 
 
+def _profile(station: Station, job: Job) -> Profile:
+    path = profile_file(station, job)
+    seen = path.stat()
+    state = seen.st_mtime_ns, seen.st_ino, seen.st_size
+    profile = _loaded(str(path), state, int(time.monotonic()), station.home)
+    if digest_of_file(path) != job.profile_sha256:
+        raise PolicyRefused(f"The profile {path} changed while it was read.")
+    return profile
+
+
 @lru_cache(maxsize=16)
-def _loaded(path: str, _changed: int, home: Path) -> Profile:
-    """A profile that every board of a job is built from, read once while its file stays as it is."""
+def _loaded(path: str, _state: tuple[int, ...], _second: int, home: Path) -> Profile:
+    """A profile that a job's boards are built from; read again each second, as those that it extends may change."""
     return load_profile(Path(path), default_folders(home))

@@ -162,6 +162,16 @@ def test_a_job_and_what_it_says_are_not_both_named(owner: Station) -> None:
     owner.refuses("job", "new", "--title", "x", "--profile", ANGLE, "--station", "owner", *ENDS, code=2)
 
 
+def test_no_job_is_made_of_a_profile_that_nobody_can_build(owner: Station) -> None:
+    folder = owner.home / "profiles"
+    folder.mkdir(exist_ok=True)
+    (folder / "broken.toml").write_text('title = "Broken"\nextends = "smart-sensor"\nchannels = 3\n')
+    more = ("--title", "x", "--station", "owner", "--count", 1, *ENDS)
+    assert "no channel" in owner.refuses("job", "new", "--profile", "broken", *more, code=8)["message"]
+    assert "only a base" in owner.refuses("job", "new", "--profile", "smart-sensor", *more, code=8)["message"]
+    assert owner.ask("job", "list")["jobs"] == []
+
+
 def test_a_killed_line_gives_no_unit_twice(desk: Desk, owner: Station) -> None:
     """Killed when each step has ended, in turn; the same command carries on."""
     job = new_job(owner, "--count", 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
-from teds_provision.plant import jobs
+from teds_provision.plant import jobs, office
 from teds_provision.plant.asking import NotAnswered, PostOffice, Refused, send
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import take_job
@@ -36,9 +37,10 @@ from teds_provision.store import Revocation
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile.load import find_profile
 from tests.bench import Board
 
-from .owner import NOW, job_of
+from .owner import ANGLE, NOW, job_of
 from .stations import Plant
 from .test_jobs import board, build
 
@@ -158,6 +160,23 @@ def test_calibrations_come_along_and_are_fitted_by_the_office(desk: Desk, tmp_pa
     request = desk.at_hand.asked[-1]
     other = proven(request, desk.line, one, nonce=bytes(16), calibration=b"raw, value\n0, 0\n16384, 7\n")
     assert desk.asks(other).refused == "job"
+
+
+def test_an_office_notices_that_what_its_profile_extends_was_edited(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The profile was kept for as long as its own file stayed as it was."""
+    seconds = itertools.count(100.0, 2.0)
+    monkeypatch.setattr(office.time, "monotonic", lambda: next(seconds))
+    folder = desk.office.home / "profiles"
+    folder.mkdir(exist_ok=True)
+    for name in (ANGLE, "smart-sensor"):
+        (folder / f"{name}.toml").write_bytes(find_profile(name).read_bytes())
+    base = folder / "smart-sensor.toml"
+    assert build(desk.run(), board(1)).verified.verdict == "authentic"
+    base.write_text(base.read_text().replace('operation-timeout = "500 ms"', 'operation-timeout = "400 ms"'))
+    with pytest.raises(Refused, match=r"\(differs\)"):
+        build(desk.run(), board(2))
 
 
 def _meta(image: Image) -> Image:
