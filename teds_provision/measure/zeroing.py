@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.errors import BadData, PolicyRefused
 from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
+from teds_provision.measure.held_actuator import unit_for
 from teds_provision.measure.settled import Settled, reference_for, require_still, settle
 from teds_provision.measure.sources import beside
 from teds_provision.measure.trusting import Trusted, operation, trusted_from
@@ -35,6 +36,7 @@ from teds_provision.teds.channel import TURN, Channel, wrapped
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import diff_blocks
 from teds_provision.teds.image import Image
+from teds_provision.teds.units import format_value
 
 if TYPE_CHECKING:
     import numpy as np
@@ -178,9 +180,10 @@ class _Zeroing:
         if not channel.full_turn:
             slack = max(channel.stated_uncertainty, 0.0) if math.isfinite(channel.stated_uncertainty) else 0.0
             if si < channel.low - slack or si > channel.high + slack:
-                limits = f"{channel.show(channel.low)} to {channel.show(channel.high)}"
+                said = unit_for(channel, order.unit) if order.unit is not None else channel.shown
+                asked, low, high = (format_value(each, said) for each in (si, channel.low, channel.high))
                 raise PolicyRefused(
-                    f"{channel.show(si)} is beyond the limits of channel {channel.number}, {limits}.",
+                    f"{asked} is beyond the limits of channel {channel.number}, {low} to {high}.",
                     hint="The limits of the signed datasheet are kept.",
                 )
         return own.unit.from_si(si)
