@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.links import Notice
+    from teds_provision.station.summary import Summary
     from teds_provision.steps.adopting import Brought
     from teds_provision.steps.batch import Boards, Plan, Questions, Request
     from teds_provision.steps.batch_sheet import Board, Row
@@ -329,7 +330,8 @@ def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = Non
     """Tell one node's end; ``error`` ends the command, ``more`` stands on the line of one of many."""
     for warning in done.warnings:
         app.warn(warning)
-    summary = station.summary.summarise(done.image)
+    units = station.shown_units.shown_units(app.station(), done.who.uuid)
+    summary = station.summary.summarise(done.image, units)
     result = {
         "uuid": done.who.uuid.hex(),
         "fingerprint": done.who.fingerprint,
@@ -341,7 +343,7 @@ def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = Non
         "warnings": list(done.warnings),
         **{name: value for name, value in more.items() if value is not None},
     }
-    app.conclude(result, lambda console: _summary(console, done, more), error)
+    app.conclude(result, lambda console: _summary(console, done, summary, more), error)
 
 
 def _tell_board(app: App, board: Board, **line: Any) -> None:
@@ -389,11 +391,10 @@ def _tell_totals(app: App, boards: Boards) -> None:
     app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in total.{steps}")
 
 
-def _summary(console: Console, done: Provisioned, more: Mapping[str, object]) -> None:
+def _summary(console: Console, done: Provisioned, summary: Summary, more: Mapping[str, object]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    summary = station.summary.summarise(done.image)
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("node", f"[bold]{escape(summary.name or '(no name)')}[/]")
     table.add_row("UUID", done.who.uuid.hex())

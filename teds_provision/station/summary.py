@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 from teds_provision import teds
 from teds_provision.sanitize import printable
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
-from teds_provision.teds.sheet import described
+from teds_provision.teds.sheet import channel_of
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,15 @@ class Summary:
     channels: tuple[ChannelSummary, ...]
 
 
-def summarise(image: Image) -> Summary:
-    """Decode what a person wants to see; never raises on any octets."""
-    channels = [_channel(image, channel) for channel, code in image if code == AccessCode.CHANNEL]
+def summarise(image: Image, units: Mapping[int, str] | None = None) -> Summary:
+    """Decode what a person wants to see; never raises on any octets.
+
+    ``units``: in which ones the values of channels are shown, where that is not for the datasheet to say.
+    """
+    shown = units or {}
+    channels = [
+        _channel(image, channel, shown.get(channel, "")) for channel, code in image if code == AccessCode.CHANNEL
+    ]
     return Summary(_name(image, 0), tuple(channels))
 
 
@@ -42,11 +49,11 @@ def _name(image: Image, channel: int) -> str | None:
     return printable(found) if isinstance(found, str) else None
 
 
-def _channel(image: Image, number: int) -> ChannelSummary:
-    channel = described(number, image.blocks)
+def _channel(image: Image, number: int, display: str) -> ChannelSummary:
+    channel = replace(channel_of(number, image.blocks), display=display)
     unit = text = ""
     if channel.units_stated and channel.has_range:
-        unit, text = channel.unit.text, f"{channel.show(channel.low)} to {channel.show(channel.high)}"
+        unit, text = channel.shown.text, f"{channel.show(channel.low)} to {channel.show(channel.high)}"
     return ChannelSummary(
         number, _name(image, number) or "", unit, text, (number, AccessCode.CALIBRATION) in image.blocks
     )

@@ -212,3 +212,17 @@ def test_a_fresh_home_needs_only_init(desk: Desk, tmp_path: Path) -> None:
     assert station.provision("nfc", "--profile", ANGLE)["verdict"] == "authentic"
     (told,) = station.ask("nodes")["nodes"]
     assert (told["uuid"], told["verdict"], told["state"]) == (node.uuid, "authentic", "provisioned")
+
+
+def test_the_summary_tells_limits_and_readings_in_one_unit(station: Station, desk: Desk, tmp_path: Path) -> None:
+    node = desk.node("hand", type_="gripper").start()
+    file = tmp_path / "hand.csv"
+    file.write_text("channel,raw,value [mm]\n" + "".join(f"{n},0,0\n{n},4095,110\n" for n in (1, 2)))
+    done = station.run(
+        "provision", "--profile", "gripper", "--calibration", file, "--yes", *station.desk.links.over("nfc")
+    )
+    assert done.code == 0, done.err
+    line = next(line for line in done.out.splitlines() if line.startswith("channel 2"))
+    assert "0 mm to 110 mm, calibrated, reads " in line
+    assert line.endswith(" mm")
+    assert node.uuid in done.out
