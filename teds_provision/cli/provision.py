@@ -162,7 +162,9 @@ def provision(
     boards = steps_room.batch.Boards(base, links, request, reporter, line=line)
     for warning in boards.warnings:
         app.warn(warning)
-    if dry_run:
+    if dry_run and everything:
+        _tell_plans(app, boards)
+    elif dry_run:
         _tell_plan(app, boards.plan())
     elif request.several:
         boards.unlock()  # asked for before the screen says what to do
@@ -324,6 +326,21 @@ def _tell_plan(app: App, plan: Plan) -> None:
         "warnings": list(plan.warnings),
     }
     app.emit(told, text)
+
+
+def _tell_plans(app: App, boards: Boards) -> None:
+    """A plan for each node of the bus that is meant, at last how many they are; the worst refusal ends the command."""
+    planned = 0
+    for one in boards.plans():
+        if isinstance(one, steps_room.batch.Plan):
+            planned += 1
+            _tell_plan(app, one)
+        else:
+            _tell_board(app, one)
+    nodes = "1 node" if planned == 1 else f"{planned or 'No'} nodes"
+    app.emit({"totals": {"planned": planned, "failed": boards.ended}}, f"{nodes} would be provisioned.")
+    if boards.worst is not None:
+        raise click.exceptions.Exit(boards.worst.exit_code)
 
 
 def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = None, **more: object) -> None:

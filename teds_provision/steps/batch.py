@@ -170,20 +170,23 @@ class Boards:
     def plan(self) -> Plan:
         """Look at the one node, plainly, and say what would be done; changes nothing anywhere."""
         with meet(self._station, self._links, self.node, self._reporter) as node:
-            who = examine(self._station, node)
-            steps = ["identify"]
-            steps += [] if who.whitelisted else ["whitelist"]
-            steps += ["agree"] if who.state == NodeState.FACTORY or not self._station.keys.held(who.uuid) else []
-            found = survey(node, initial=who.security_teds)
-            named = named_for(self._station, who.uuid, self._for(who))
-            if named.order.adopt and found.identity.state != NodeState.PROVISIONED:
-                brought = brought_by(self._station, found.image, name=named.order.name)
-                return Plan(who.uuid, who.state, (*steps, *_AFTER), (), (*brought.errors, *brought.warnings))
-            proposal = propose(self._station, named, found, record=False)
-            changes = tuple(change.text for change in proposal.changes)
-            other = () if named.order.retype else differences(found.image.blocks, proposal.image)
-            steps += _AFTER
-            return Plan(who.uuid, who.state, tuple(steps), changes, merged((*proposal.warnings, *other)))
+            return self._plan_for(node)
+
+    def _plan_for(self, node: Conversation) -> Plan:
+        who = examine(self._station, node)
+        steps = ["identify"]
+        steps += [] if who.whitelisted else ["whitelist"]
+        steps += ["agree"] if who.state == NodeState.FACTORY or not self._station.keys.held(who.uuid) else []
+        found = survey(node, initial=who.security_teds)
+        named = named_for(self._station, who.uuid, self._for(who))
+        if named.order.adopt and found.identity.state != NodeState.PROVISIONED:
+            brought = brought_by(self._station, found.image, name=named.order.name)
+            return Plan(who.uuid, who.state, (*steps, *_AFTER), (), (*brought.errors, *brought.warnings))
+        proposal = propose(self._station, named, found, record=False)
+        changes = tuple(change.text for change in proposal.changes)
+        other = () if named.order.retype else differences(found.image.blocks, proposal.image)
+        steps += _AFTER
+        return Plan(who.uuid, who.state, tuple(steps), changes, merged((*proposal.warnings, *other)))
 
     # -- many ------------------------------------------------------------------------------------------------------
 
@@ -208,6 +211,14 @@ class Boards:
         return len(self._boards)
 
     @property
+    def worst(self) -> TedsProvisionError | None:
+        """What a person should hear of first, of the boards of this run."""
+        found: TedsProvisionError | None = None
+        for board in self._boards:
+            found = worse(found, board.failure)
+        return found
+
+    @property
     def of_a_job(self) -> bool:
         """Whether a job counts the boards, and no sheet."""
         return self.line is not None and self.line.total > 0
@@ -225,6 +236,25 @@ class Boards:
         """The row of the sheet with that number, from 1."""
         assert self.progress is not None
         return self.progress.sheet.rows[number - 1]
+
+    def plans(self) -> Iterator[Plan | Board]:
+        """The plan of every node of the bus that is meant, one after the other; a board that was refused says why."""
+        port = open_port(self._links)
+        try:
+            for contact in self._on_the_bus(port)[1]:
+                began, uuid = time.monotonic(), contact.identity.uuid
+                try:
+                    with Conversation(contact, notice=self._reporter.notice) as node:
+                        yield self._plan_for(node)
+                    continue
+                except SessionLost as lost:
+                    error = lost.cause
+                except TedsProvisionError as failure:
+                    error = failure
+                self._boards.append(Board(uuid, time.monotonic() - began, None, error, None, port.place))
+                yield self._boards[-1]
+        finally:
+            port.close()
 
     def many(self, questions: Questions) -> Iterator[Board]:
         """Provision board after board, or all at once; one that fails does not end it. At the end comes the report."""
@@ -252,13 +282,10 @@ class Boards:
             return self.progress.totals()
         results = [board.result for board in self._boards]
         steps = [{step.name: step.seconds for step in board.done.steps} for board in self._boards if board.done]
-        worst: TedsProvisionError | None = None
-        for board in self._boards:
-            worst = worse(worst, board.failure)
         passed, seconds = results.count("passed"), round(time.monotonic() - self._began, 3)
         share = round(passed / len(results), 4) if results else None
         skipped = results.count("skipped")
-        return Totals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), worst)
+        return Totals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), self.worst)
 
     def _as_they_come(self, questions: Questions) -> Iterator[Board]:
         for arrival in watch_nodes(
@@ -275,20 +302,23 @@ class Boards:
     def _all_at_once(self, questions: Questions) -> Iterator[Board]:
         port = open_port(self._links)
         try:
-            if not port.capabilities.many:
-                raise UsageFailure("--all is for a bus: a reader sees one node.", hint="Use --watch, tap after tap.")
-            everyone = port.everyone(
-                seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen
-            )
-            found = without_twins(everyone, self._reporter.notice)
-            contacts = [contact for contact in found if self._is_meant(contact)]
-            if not contacts:
-                self._require_known(found)
+            everyone, contacts = self._on_the_bus(port)
             yield from self._side_by_side(port, contacts, questions)
             if not self.stop.is_set():
                 refuse_twins(everyone)  # the others are done, and what is not done is not passed over
         finally:
             port.close()
+
+    def _on_the_bus(self, port: Port) -> tuple[list[Contact], list[Contact]]:
+        """All that answer, and those of them that are meant."""
+        if not port.capabilities.many:
+            raise UsageFailure("--all is for a bus: a reader sees one node.", hint="Use --watch, tap after tap.")
+        everyone = port.everyone(seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen)
+        found = without_twins(everyone, self._reporter.notice)
+        contacts = [contact for contact in found if self._is_meant(contact)]
+        if not contacts:
+            self._require_known(found)
+        return everyone, contacts
 
     def _side_by_side(self, port: Port, contacts: list[Contact], questions: Questions) -> Iterator[Board]:
         """Each of these nodes in a thread, as many at a time as the bus and the token bear, until ``stop`` is set."""

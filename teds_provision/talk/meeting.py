@@ -232,9 +232,13 @@ def the_one(station: Station, contacts: list[Contact]) -> Contact:
     for choice in (contacts, unfinished):
         if len(choice) == 1:
             return choice[0]
-    listed = ", ".join(f"{c.identity.uuid.hex()} at 0x{c.address or 0:02x}" for c in (unfinished or contacts)[:_SHOWN])
+    meant = unfinished or contacts
+    listed = ", ".join(f"{each.identity.uuid.hex()} at 0x{each.address or 0:02x}" for each in meant[:_SHOWN])
+    which = f"{len(meant)} of them not finished" if len(meant) < len(contacts) else ""
     raise UsageFailure(
-        f"{len(contacts)} nodes answer on the bus: {listed}.", hint="Name one by its UUID, or by node=ADDRESS in --can."
+        f"{len(contacts)} nodes answer on the bus{', ' if which else ''}{which}: {listed}"
+        f"{', …' if len(meant) > _SHOWN else ''}.",
+        hint="Name one by its UUID, or by node=ADDRESS in --can.",
     )
 
 

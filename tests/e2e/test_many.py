@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
 
 from .desk import ANGLE, Desk, Node, Station, results
@@ -67,6 +70,27 @@ def test_the_same_command_twice_at_once_provisions_once(station: Station, bus: l
     assert written == ["done", "nothing to do"]
     assert bus[0].flash["epoch"] == 1
     assert station.keys(UUIDS[0]) == [("active", 1)]
+
+
+def test_a_dry_run_plans_every_node_of_the_bus_that_is_meant(station: Station, bus: list[Node], tmp_path: Path) -> None:
+    links = station.desk.links.over("can")
+    station.ask("provision", UUIDS[0], "--profile", ANGLE, "--yes", *links)
+    station.ask("whitelist", "add", UUIDS[1])
+    said = station.refuses("provision", *links, code=2)["message"]
+    assert said.startswith("3 nodes answer on the bus, 2 of them not finished: ")
+    flashes, store = [node.octets for node in bus], station.tables()
+    done = station.run("--json", "provision", "--all", "--profile", ANGLE, "--dry-run", *links)
+    told = [json.loads(line) for line in done.out.splitlines()]
+    assert (done.code, told.pop()) == (0, {"totals": {"planned": 2, "failed": 0}})  # the first lacks its calibration
+    plans = {one["uuid"]: one["plan"] for one in told}
+    rest = ["build", "sign", "write", "verify", "check"]
+    assert plans == {UUIDS[0]: ["identify", *rest], UUIDS[1]: ["identify", "agree", *rest]}
+    sheet = tmp_path / "boards.csv"
+    sheet.write_text(f"uuid,profile\n{UUIDS[1]},{ANGLE}\n{UUIDS[2]},{ANGLE}\n")
+    done = station.run("provision", "--all", "--batch", sheet, "--dry-run", *links)
+    assert (done.code, done.out.count("Plan for")) == (0, 2), done.err
+    assert done.out.endswith("2 nodes would be provisioned.\n")
+    assert ([node.octets for node in bus], station.tables()) == (flashes, store)
 
 
 @pytest.mark.needs("a slow chip")
