@@ -75,7 +75,7 @@ def _counters(twins: Twins) -> list[int]:
 
 BOUNDS = {
     "TEDS_MAX_MESSAGE": (512, 4094),
-    "TEDS_STAGING": (1024, 60000),
+    "TEDS_STAGING": (512, 60000),
     "TEDS_CAN_LINES": (1, 7),
     "TEDS_CAN_BLOCK": (0, 255),
     "TEDS_CAN_STMIN": (0, 0xF9),

@@ -111,8 +111,8 @@
 #if TEDS_SESSIONS < 2 || TEDS_REPLIES <= TEDS_SESSIONS || TEDS_REPLIES > 127
 #error "two sessions at least, and a stored reply more than sessions, at most 127"
 #endif
-#if TEDS_STAGING < 1024 || TEDS_STAGING > 60000
-#error "TEDS_STAGING is 1024 to 60000"
+#if TEDS_STAGING < 512 || TEDS_STAGING > 60000
+#error "TEDS_STAGING is 512 to 60000"
 #endif
 #if TEDS_CAN_LINES < 1 || TEDS_CAN_LINES > 7
 #error "one to seven lines: there are no more stations"

@@ -7,13 +7,17 @@
 #include <string.h>
 #include <zephyr/kernel.h>
 
+/* An APDU, and in which activation it came: what was said to another is nobody's. */
 typedef struct said {
-    uint8_t event; /* 0 field gone, 1 activated, 2 an APDU */
     uint16_t length;
+    atomic_val_t activation;
     uint8_t octets[264];
 } said;
 
-K_MSGQ_DEFINE(teds_said, sizeof(said), 4, 4);
+/* The field's coming and going is never queued: while a command runs a reader may try more often than a queue has room. */
+K_MSGQ_DEFINE(teds_said, sizeof(said), 4, sizeof(atomic_val_t));
+static atomic_t activations = ATOMIC_INIT(0), gone = ATOMIC_INIT(0);
+static atomic_val_t known; /* the activation that the node has been told of */
 static uint8_t response[TEDS_T4T_OCTETS]; /* the library reads it until the reader has it */
 
 static void on_nfc(void *context, nfc_t4t_event_t event, const uint8_t *data, size_t length, uint32_t flags)
@@ -23,10 +27,13 @@ static void on_nfc(void *context, nfc_t4t_event_t event, const uint8_t *data, si
     const bool more = (flags & NFC_T4T_DI_FLAG_MORE) != 0;
     (void)context;
     if (event == NFC_T4T_EVENT_FIELD_ON || event == NFC_T4T_EVENT_FIELD_OFF) {
-        whole.event = event == NFC_T4T_EVENT_FIELD_ON;
+        if (event == NFC_T4T_EVENT_FIELD_ON) {
+            (void)atomic_inc(&activations);
+        } else {
+            atomic_set(&gone, 1);
+        }
         whole.length = 0;
         too_long = false;
-        (void)k_msgq_put(&teds_said, &whole, K_NO_WAIT);
     } else if (event == NFC_T4T_EVENT_DATA_IND) {
         too_long = too_long || length > sizeof whole.octets - whole.length;
         if (!too_long) {
@@ -37,7 +44,7 @@ static void on_nfc(void *context, nfc_t4t_event_t event, const uint8_t *data, si
             return;
         }
         if (!too_long) {
-            whole.event = 2;
+            whole.activation = atomic_get(&activations);
             (void)k_msgq_put(&teds_said, &whole, K_NO_WAIT);
         }
         whole.length = 0;
@@ -55,11 +62,18 @@ int teds_zephyr_nfc_start(void)
 bool teds_zephyr_nfc_work(teds_node *node)
 {
     said one;
-    bool moved = false;
+    bool moved = atomic_cas(&gone, 1, 0);
+    if (moved) {
+        teds_nfc_field(node, false);
+    }
+    if (atomic_get(&activations) != known) {
+        known = atomic_get(&activations);
+        teds_nfc_field(node, true);
+        moved = true;
+    }
     while (k_msgq_get(&teds_said, &one, K_NO_WAIT) == 0) {
         moved = true;
-        if (one.event < 2) {
-            teds_nfc_field(node, one.event == 1);
+        if (one.activation != known) {
             continue;
         }
         (void)nfc_t4t_response_pdu_send(response, teds_t4t_apdu(node, one.octets, one.length, response));

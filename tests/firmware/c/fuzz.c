@@ -3,7 +3,8 @@
  * All of a node is one object, so a sanitizer does not see one array of it run into the next: what says how far each is
  * filled is looked at after each step (holds_together).
  *
- * The first octet of an input says where it goes: CAN frames (length, then id and data), or whole commands. With
+ * The first octet of an input says where it goes: CAN frames (length, then id and data), whole commands, a reader, a
+ * session that measures, a connection. With
  * -DTEDS_FUZZ_ALONE it is a program that runs the files named to it, for machines without libFuzzer. */
 #include "inside.h"
 #include "memory.h"
@@ -13,10 +14,14 @@
 
 int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length);
 
+/* The port's functions that fail now, by bit. */
+enum { RANDOM = 1, POINTS = 2, MACS = 4, SEALS = 8, FLASH = 16 };
+static unsigned failing;
+
 static int draw(char kind, uint8_t *out, size_t length)
 {
     memset(out, kind == 'n' ? 0 : 1, length);
-    return 0;
+    return failing & RANDOM ? -1 : 0;
 }
 
 /* -- cryptography that says yes ------------------------------------------------------------------------------------------ */
@@ -27,7 +32,7 @@ static int make(void *user, int use, teds_key_ref *key, uint8_t point[65])
     memset(key, use + 1, sizeof *key);
     memset(point, use + 1, 65);
     point[0] = 4;
-    return 0;
+    return failing & POINTS ? -1 : 0;
 }
 
 static bool good(void *user, const uint8_t point[65])
@@ -41,7 +46,7 @@ static int ecdh(void *user, const teds_key_ref *key, const uint8_t peer[65], uin
     (void)user;
     (void)key;
     memcpy(out, peer, 32);
-    return 0;
+    return failing & POINTS ? -1 : 0;
 }
 
 static int sign(void *user, const teds_key_ref *key, const uint8_t hash[32], uint8_t out[64])
@@ -50,7 +55,7 @@ static int sign(void *user, const teds_key_ref *key, const uint8_t hash[32], uin
     (void)key;
     memcpy(out, hash, 32);
     memset(out + 32, 1, 32);
-    return 0;
+    return failing & POINTS ? -1 : 0;
 }
 
 static bool verify(void *user, const uint8_t point[65], const uint8_t hash[32], const uint8_t signature[64])
@@ -71,7 +76,7 @@ static int hmac(void *user, const uint8_t *key, size_t key_length, const teds_pa
     (void)parts;
     (void)count;
     memset(out, 0, 32);
-    return 0;
+    return failing & MACS ? -1 : 0;
 }
 
 static void start(void *user, teds_sha256 *state)
@@ -103,7 +108,7 @@ static int seal(void *user, const uint8_t key[16], const uint8_t nonce[13], cons
     (void)nonce;
     memmove(out, in, length);
     memset(out + length, 0, tag_length);
-    return 0;
+    return failing & SEALS ? -1 : 0;
 }
 
 static bool open_sealed(void *user, const uint8_t key[16], const uint8_t nonce[13], const uint8_t *in, size_t length,
@@ -117,9 +122,25 @@ static bool open_sealed(void *user, const uint8_t key[16], const uint8_t nonce[1
     return true;
 }
 
+/* Channel TEDS of the three channels, as memory_put takes them: each fits what the firmware says. */
+static size_t channel_teds(const memory_board *own, uint8_t *out)
+{
+    uint8_t *at = out;
+    for (size_t i = 0; i < own->port.channel_count; i++) {
+        const teds_channel *each = &own->channels[i];
+        const uint8_t teds[23] = {0, 0, 0, 19, 3, 4, 0, 3, 1, 1, 11, 1, each->kind, 18, 6, 40, 1, 0, 41, 1, each->octets};
+        const uint8_t head[4] = {each->number, 3, 0, sizeof teds};
+        memcpy(at, head, sizeof head);
+        memcpy(at + sizeof head, teds, sizeof teds);
+        at += sizeof head + sizeof teds;
+    }
+    return (size_t)(at - out);
+}
+
 static memory_board *board(bool keyed)
 {
     static const uint8_t uuid[10] = {1}, key[16] = {2}, point[65] = {4};
+    uint8_t teds[128];
     memory_board *own = memory_new(uuid, 8, 0xFF, draw);
     teds_port *port = &own->port;
     port->p256_make = make;
@@ -135,9 +156,11 @@ static memory_board *board(bool keyed)
     port->ccm_open = open_sealed;
     memory_channel(own, 1, TEDS_SENSOR, 0, 2, 1000);
     memory_channel(own, 2, TEDS_ACTUATOR, 0, 4, 1000);
+    memory_channel(own, 3, TEDS_EVENT_SENSOR, 0, 2, 1000);
     memory_nfc(own, 4, 15, 200);
+    failing = 0;
     if (memory_start(own) != 0 ||
-        memory_put(own, keyed ? 1 : 0, 0x21, 1, 1, key, point, point, (const uint8_t *)"", 0) != 0) {
+        memory_put(own, keyed ? 1 : 0, 0x21, 1, 1, key, point, point, teds, channel_teds(own, teds)) != 0) {
         abort();
     }
     return own;
@@ -275,14 +298,136 @@ static void taps(memory_board *own, const uint8_t *octets, size_t length)
     memory_nfc_field(own, false);
 }
 
+/* -- a session that measures, over a connection or the bus ------------------------------------------------------------ */
+
+/* `count` octets of what is left, as a copy of their own. */
+static uint8_t *piece(const uint8_t **octets, size_t *length, size_t *count)
+{
+    uint8_t *copy;
+    *count = *count < *length ? *count : *length;
+    copy = malloc(*count > 0 ? *count : 1);
+    if (copy == NULL) {
+        abort();
+    }
+    memcpy(copy, *octets, *count);
+    *octets += *count;
+    *length -= *count;
+    return copy;
+}
+
+static void one_command(memory_board *own, const uint8_t *frame, size_t length, bool air)
+{
+    static uint8_t reply[TEDS_MAX_MESSAGE];
+    if (memory_handle(own, air ? TEDS_LINK_BLE : 0xF1, air ? TEDS_AT_BLE : TEDS_CAN, false, frame, length, reply) >
+        sizeof reply) {
+        abort();
+    }
+}
+
+static void inner(memory_board *own, uint32_t counter, const uint8_t *command, size_t length, bool air)
+{
+    uint8_t frame[6 + 4 + 256 + 32] = {0, 0, TEDS_CLASS_SECURITY, TEDS_SEALED};
+    const size_t padding = 16 - length % 16, whole = 4 + length + padding + 16;
+    teds_put16(frame + 4, (uint16_t)whole);
+    teds_put32(frame + 6, counter);
+    memcpy(frame + 10, command, length);
+    memset(frame + 10 + length, (int)padding, padding);
+    one_command(own, frame, 6 + whole, air);
+}
+
+/* Open, every channel claimed, a stream and a Drive: what a fuzzer does not find by itself. */
+static uint32_t begin_measuring(memory_board *own, bool air)
+{
+    static const uint8_t operate[] = {0, 0, 4, 1, 0, 17, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 60};
+    static const uint8_t drive[] = {0, 0, TEDS_CLASS_SECURITY, TEDS_DRIVE, 0, 1, 2};
+    static const uint8_t subscribe[] = {0, 0, TEDS_CLASS_SECURITY, TEDS_SUBSCRIBE, 0, 22, 0, 0, 5, 0, 100, 0, 0, 0, 0, 0,
+                                        0x0F, 0x42, 0x40, 0, 0, 0, 0, 0, 0, 0, 0, 1};
+    uint8_t open[6 + 89] = {0, 0, TEDS_CLASS_SECURITY, TEDS_OPEN, 0, 89}, acts[25] = {0, 2, 4, 1, 0, 19};
+    memset(open + 14, 7, 65);
+    open[14] = 4;
+    acts[22] = 60;
+    teds_put16(acts + 23, 10000);
+    one_command(own, open, sizeof open, air);
+    inner(own, 1, operate, sizeof operate, air);
+    inner(own, 2, acts, sizeof acts, air);
+    inner(own, 3, drive, sizeof drive, air);
+    inner(own, 4, subscribe, sizeof subscribe, air);
+    memory_reply_left(own, air ? TEDS_LINK_BLE : 0xF1);
+    return 4;
+}
+
+static void leave(memory_board *own, bool air)
+{
+    uint32_t identifier;
+    uint8_t data[512], place;
+    bool fd;
+    (void)memory_poll(own);
+    holds_together(own);
+    if (memory_can_tx(own, &identifier, data, &fd) > 64) {
+        abort();
+    }
+    while (air && memory_ble_notify(own, 0, data) > 0) {
+    }
+    if (memory_ble_data(own, &place, data) > TEDS_BLE_DATA) {
+        abort();
+    }
+}
+
+/* Steps: what (a time, a command, a Drive frame, a trigger, an event, failures, frames of a connection), how much. */
+static void measures(memory_board *own, const uint8_t *octets, size_t length, bool air)
+{
+    uint64_t now = 1000000;
+    uint32_t counter;
+    memory_at(own, now);
+    if (air) {
+        memory_ble_connected(own, 0, 247);
+        memory_ble_hears(own, 0, true);
+    }
+    counter = begin_measuring(own, air);
+    while (length >= 2) {
+        const uint8_t what = octets[0];
+        size_t count = octets[1];
+        uint8_t *copy;
+        octets += 2;
+        length -= 2;
+        now += (uint64_t)count << (what >> 3);
+        memory_at(own, now);
+        count = (what & 7) == 0 ? 0 : count;
+        copy = piece(&octets, &length, &count);
+        switch (what & 7) {
+        case 1: inner(own, ++counter, copy, count, air); break;
+        case 2: memory_can_rx(own, 0x18EF21F1, copy, (uint8_t)(count < 64 ? count : 64), (what & 8) != 0); break;
+        case 3: memory_can_rx(own, 0x18FF00F1, copy, (uint8_t)(count < 8 ? count : 8), false); break;
+        case 4: memory_event(own, 3, now, (const uint8_t *)"\x12\x34", true); break;
+        case 5:
+            failing = count > 0 ? copy[0] : 0;
+            memory_fails(own, (failing & FLASH) != 0);
+            break;
+        case 6: memory_ble_written(own, 0, copy, count); break;
+        case 7: (what & 8 ? memory_ble_driven : memory_ble_written)(own, what >> 4 & 3, copy, count); break;
+        default: break;
+        }
+        free(copy);
+        memory_reply_left(own, air ? TEDS_LINK_BLE : 0xF1);
+        leave(own, air);
+    }
+    failing = 0;
+    if (air) {
+        memory_ble_disconnected(own, 0);
+    }
+    leave(own, air);
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length)
 {
     memory_board *own;
     if (length < 2) {
         return 0;
     }
-    own = board((octets[0] & 2) != 0);
-    if (octets[0] & 4) {
+    own = board((octets[0] & 10) != 0);
+    if (octets[0] & 8) {
+        measures(own, octets + 1, length - 1, (octets[0] & 16) != 0);
+    } else if (octets[0] & 4) {
         taps(own, octets + 1, length - 1);
     } else if (octets[0] & 1) {
         frames(own, octets + 1, length - 1);
