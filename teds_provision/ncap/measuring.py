@@ -504,7 +504,7 @@ class Measuring:
                 one.uuids = tuple(uuid.hex() for uuid in meant)
                 one.kept = replace(one.kept, match=None, uuids=tuple(meant), actuators=False)
                 return
-            self._say(one, "waiting", "no node that is known here is meant")
+            self._say(one, "waiting", "no known node matches")
             one.stop.wait(1.0)
 
     def _run_open(self, one: Running) -> None:
@@ -650,7 +650,10 @@ def _state_of_open(one: Running, job: Job) -> tuple[str, str]:
         return "running", ""
     if job.error is not None:
         return "waiting", job.error.message
-    return "waiting", "no node that is meant is there"
+    taken = one.newcomers.taken if one.newcomers is not None else 0
+    if taken:
+        return "waiting", f"{taken} matching node{'s are' if taken > 1 else ' is'} measured by another measurement"
+    return "waiting", "no matching node is present"
 
 
 def _state_of(one: Running, job: Job) -> tuple[str, str]:

@@ -108,6 +108,7 @@ class Newcomers:
         self._busy: dict[str, float] = {}  # who is worked with by somebody else, and when to look again
         self._waits: dict[str, _Waits] = {}
         self._lost: dict[str, _Lost] = {}
+        self._others: set[str] = set()  # who is meant, and was another measurement's when it answered
         self._places: dict[str, Sighting] = {}  # where each was measured, or was to be
         self._version: object = None
         self._welcomed, self._followed = -WELCOMING, -FOLLOWING
@@ -124,9 +125,18 @@ class Newcomers:
             waits = self._waits.get(uuid)
         if known or (waits is not None and (waits.room is not None or self._says_factory(uuid))):
             return
-        if self._why_not(uuid) or self._elsewhere(uuid):
+        if self._why_not(uuid):
             return
+        if self._elsewhere(uuid):
+            self._others.add(uuid)
+            return
+        self._others.discard(uuid)
         self._arrive(uuid)
+
+    @property
+    def taken(self) -> int:
+        """How many nodes that are meant and there are another measurement's."""
+        return sum(self._roster.seen(uuid).present and self._elsewhere(uuid) for uuid in list(self._others))
 
     def _says_factory(self, uuid: str) -> bool:
         """Whether it says that it has no key: one that was refused here a moment ago is left to whoever adopts it.
@@ -232,6 +242,7 @@ class Newcomers:
             return
         self._anew.clear()
         self._version, self._followed = version, now
+        self._others.clear()  # whoever is still meant is seen again below
         for uuid, member in list(self._members.items()):
             why = self._why_not(uuid)
             if why and member.keeper is not None:

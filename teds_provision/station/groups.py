@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 from teds_provision.errors import Frozen, NotFound, UsageFailure
 from teds_provision.files import open_lock
@@ -20,6 +21,8 @@ _LIKE_A_UUID = re.compile(r"(0x)?[0-9a-fA-F]{4,}\Z")
 LONGEST = 64
 ALL = "all"
 """Means every node that comes (``ncap run --measure all``): no group is called so."""
+_SHOWN: Final = 10
+_CREATE: Final = "teds-provision group create NAME UUID …"
 
 
 class Groups:
@@ -39,8 +42,10 @@ class Groups:
         """One group; raises NotFound."""
         found = self._store.group(name)
         if found is None:
-            known = ", ".join(group.name for group in self.all()) or "none"
-            raise NotFound(f"There is no group {name!r}.", hint=f"There is: {known}.")
+            known = [group.name for group in self.all()]
+            more = ", …" if len(known) > _SHOWN else ""
+            hint = f"Groups: {', '.join(known[:_SHOWN])}{more}." if known else f"Create it: {_CREATE}"
+            raise NotFound(f"There is no group {name!r}.", hint=hint)
         return found
 
     def find(self, name: str) -> Group | None:

@@ -47,7 +47,7 @@ class Measurements:
         if found is None:
             raise NotFound(
                 f"There is no measurement {measurement_id!r}.",
-                hint=f"There is: {', '.join(one.id for one in self.all()) or 'none'}.",
+                hint=f"Measurements: {', '.join(one.id for one in self.all()) or 'none'}.",
             )
         return found
 

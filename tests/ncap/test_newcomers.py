@@ -334,6 +334,25 @@ def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> 
     station.ask("group", "delete", "arm")
 
 
+def test_a_measurement_whose_nodes_are_anothers_says_so(lab: Lab) -> None:
+    left, right = lab.nodes
+    lab.start()
+    lab.comes(left)
+    lab.comes(right)
+    with lab.service.client() as asked:
+        first = asked.measure(match="all")["id"]
+
+        def why(of: str) -> str:
+            return next(str(one["why"]) for one in asked.measurements() if one["id"] == of)
+
+        until(lambda: why(first) == "2 matching nodes are measured by another measurement")
+        nobody = asked.measure(match="name:nobody*")["id"]
+        until(lambda: why(nobody) == "no matching node is present")
+        asked.end_measurement(nobody)
+        asked.end_measurement(first)
+    lab.service.end()
+
+
 def test_one_that_finds_no_room_on_the_bus_waits_until_another_one_leaves(lab: Lab) -> None:
     """50 Hz of one node take half of a bus of 5 kbit/s: two do not fit, and the first is not slowed."""
     left, right = lab.nodes
