@@ -260,7 +260,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}", markup=False)
     for one in found.get("measurements", ()):
         what = f" of {one['match']}" if one.get("match") else ""
-        console.print(f"measurement {one['id']}{what}: {one['state']}", markup=False)
+        why = f": {one['why']}" if one["why"] else ""
+        console.print(f"measurement {one['id']}{what}: {one['state']}{why}", markup=False)
         for node in one["nodes"] if what else ():
             why = f": {node['why']}" if node["why"] else ""
             console.print(f"  {node['uuid']} {node['state']}{why}", markup=False)

@@ -295,7 +295,7 @@ class NodeKeeper:
         notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
         self._patience.has_run()
-        self._say("running", why="; ".join(notes))
+        self._say("running", why="; ".join(note.removesuffix(".") for note in notes))
         self.ready.set()
 
     def _actuators(self, trusted: Trusted) -> list[Channel]:

@@ -376,6 +376,8 @@ def _joined(head: str, numbers: list[int], rest: str) -> str:
         return f"{head} {numbers[0]}{rest}"
     whole = numbers == list(range(numbers[0], numbers[-1] + 1))
     told = f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
+    if rest.startswith(" has "):
+        rest = f" have {rest.removeprefix(' has ')}"
     return f"{head}s {told}{rest}"
 
 

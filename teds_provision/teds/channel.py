@@ -203,7 +203,7 @@ class Channel:
             return f"The samples of channel {self.number} cannot be read: {self.sample.problem}."
         if self.calibration is None and not self._speaks_for_itself(self.sample.model):
             unit = self.unit.text
-            return f"Channel {self.number} has no calibration: its raw values cannot be turned into {unit}."
+            return f"Channel {self.number} has no calibration: raw values cannot be turned into {unit}."
         return ""
 
     def _speaks_for_itself(self, model: int) -> bool:

@@ -346,6 +346,8 @@ def test_a_measurement_whose_nodes_are_anothers_says_so(lab: Lab) -> None:
             return next(str(one["why"]) for one in asked.measurements() if one["id"] == of)
 
         until(lambda: why(first) == "2 matching nodes are measured by another measurement")
+        shown = lab.service.station.run("ncap", "status").out
+        assert f"measurement {first} of all: waiting: 2 matching nodes are measured" in shown
         nobody = asked.measure(match="name:nobody*")["id"]
         until(lambda: why(nobody) == "no matching node is present")
         asked.end_measurement(nobody)

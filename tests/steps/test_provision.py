@@ -22,7 +22,7 @@ from teds_provision.protocol.messages.frames import Command, Function, Reason, R
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.build import BuildOrder, merged
 from teds_provision.steps.identify import Identified
 from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.steps.write import write
@@ -300,3 +300,9 @@ def test_nothing_is_read_twice_that_says_nothing_new(station: Station, board: Bo
     run(station, board, order=BuildOrder())
     assert asked.count((128, Function.IDENTIFY, b"")) == 1, asked
     assert asked.count((1, TedsFunction.READ, bytes([128]))) == 2, asked
+
+
+def test_what_is_said_of_several_channels_is_one_sentence() -> None:
+    each = [f"Channel {number} has no calibration: raw values cannot be turned into N." for number in (1, 2, 3)]
+    assert merged(each) == ("Channels 1 to 3 have no calibration: raw values cannot be turned into N.",)
+    assert merged(each[::2]) == ("Channels 1, 3 have no calibration: raw values cannot be turned into N.",)
