@@ -120,7 +120,7 @@ def create(
         profile=profile,
         folders=teds_room.profile.default_folders(app.home),
     )
-    flash = made.load()
+    flash = made.load()  # what lies there: the same command once more finds the node that it made
     print_of_key = protocol.keys.fingerprint(flash.node_key)
     channels = [
         {

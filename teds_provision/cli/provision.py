@@ -235,6 +235,7 @@ def _many(app: App, boards: Boards, questions: Questions, screen: Screen, *, tot
 
 def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = False) -> Questions:
     """Whom to ask; ``strangers`` False: a yes on the command line does not add nodes that nobody named."""
+    # A board comes onto the whitelist when it has its key: one that was lost before is not asked about twice.
     accepted: set[tuple[bytes, str]] = set()
     turn = threading.Lock()  # one question at a time, however many readers there are
 
@@ -273,7 +274,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
             app.confirm(question, yes=yes)
 
     def take_over(question: str) -> None:
-        with turn:
+        with turn:  # whatever --yes says: it locks another station out, and no option of this command names that
             if not app.ask(question):
                 raise steps_room.batch_sheet.Declined("Cancelled. The node keeps its key; nothing was changed.")
 

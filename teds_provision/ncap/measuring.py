@@ -224,6 +224,7 @@ class Measuring:
             dead_man=self._dead_man if dead_man is None else dead_man,
             scalar_rate=scalar_rate,
         )
+        # What can never be measured is refused before it is kept: it would be tried for ever, after each restart too.
         nodes = self._station.measurements.nodes_of(kept)
         if not nodes and match is None:
             raise UsageFailure(f"Group {group!r} is empty.", hint="Add a node to it first.")
@@ -508,14 +509,18 @@ class Measuring:
             one.stop.wait(1.0)
 
     def _run_open(self, one: Running) -> None:
-        """Measure whoever comes until it is stopped."""
+        """Measure whoever comes until it is stopped.
+
+        One measurement whose nodes come and go, so that its recordings and topics go on: one for each node would make
+        a file each, and have no budget in common.
+        """
         assert one.kept.match is not None
 
         def joined(uuid: str) -> None:
             with self._guard:
                 one.uuids = (*one.uuids, uuid)
             self._roster.note(uuid, measurement=one.kept.id)
-            if unverified:
+            if unverified:  # signed later, it is measured on by the other of the two that unverified() begins
                 self._adopted.add(bytes.fromhex(uuid))
 
         def left(uuid: str) -> None:
@@ -532,7 +537,7 @@ class Measuring:
         try:
             unverified = one.kept.id == Unsigned.text
             job = one.job = self._new_job(one, unverified=unverified)
-            live = [sink for sink in job.sinks if not sink.recorder]
+            live = [sink for sink in job.sinks if not sink.recorder]  # a file takes what comes: no budget is for it
             newcomers = Newcomers(
                 self._station,
                 self._roster,

@@ -113,14 +113,17 @@ def sign(
     """
     _require_whole(image)
     if sequence is None:
+        # What says the same is not signed anew, so a run that is repeated leaves the node as it is. A signature that
+        # never arrived is good while its sequence is above the node's: the node takes no other.
         for octets in filter(None, (on_node, *earlier)):
             number = _sequence_if_the_same(station, keys, image, octets, epoch)
             if number is not None and (octets == on_node or number > node_sequence):
                 return Signed(image.with_block(SECURITY, octets), number, reused=True)
     station.plant.require_role("sign", "signs no datasheet", "Have it signed by one that has: sign --by OFFICE")
-    credentials = station.credentials(keys.uuid)
+    credentials = station.credentials(keys.uuid)  # may ask for the passphrase: not while the store is held
     with station.durable("sign"):
         known = station.nodes.get(keys.uuid)
+        # The store knows of signatures that never reached the node, the node of those by other stations.
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
         if number > LAST_SEQUENCE:
             raise PolicyRefused("The sequence of this node is used up.")

@@ -106,7 +106,8 @@ class Provisioning:
             before = self._runs.get(uuid)
             if before is not None and before.state in ("waiting", "running"):
                 raise UsageFailure(f"Node {uuid} is already being provisioned.", hint="Cancel that first.")
-            run = self._runs[uuid] = Run(uuid)
+            run = self._runs[uuid] = Run(uuid)  # at once: a second request meanwhile is refused
+        # The text of a calibration, as the file that the steps read; it is there until the run has ended.
         folder = tempfile.TemporaryDirectory(prefix="ncap-")
         try:
             order = BuildOrder(
