@@ -39,7 +39,7 @@ from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
-from teds_provision.store import Measurement
+from teds_provision.store import KeptMeasurement
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.image import Image
@@ -118,7 +118,7 @@ class Bench:
         """Measure so many nodes; they are switched on while the measurement waits for them."""
         uuids = tuple(self.nodes)[:count]
         file = self.folder / f"run-{count}-{time.monotonic_ns()}.csv"
-        kept = Measurement("", uuids=uuids, rate=RATE, sinks=(str(file),), lasting=False)
+        kept = KeptMeasurement("", uuids=uuids, rate=RATE, sinks=(str(file),), lasting=False)
         job = Job(self.station, kept, request=MeasurementRequest(timeout=60.0))
         came: list[tuple[int, Block]] = []
         stop, port = threading.Event(), CanPort(self.can)

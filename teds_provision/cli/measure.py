@@ -21,7 +21,7 @@ from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings, ble, can
-from teds_provision.store import Measurement
+from teds_provision.store import KeptMeasurement
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view
@@ -130,9 +130,9 @@ def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
         raise UsageFailure("--trigger needs a CAN bus.", hint="Omit --trigger over Bluetooth.")
 
 
-def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Mapping[str, Any]) -> Measurement:
+def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Mapping[str, Any]) -> KeptMeasurement:
     """What the command line asks for, as a group keeps it."""
-    return Measurement(
+    return KeptMeasurement(
         "",
         group=group or None,
         uuids=() if group else tuple(uuids),
@@ -177,10 +177,10 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
     return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
 
 
-def _carried_on(app: App, station: Station, asked: Measurement) -> Measurement:
+def _carried_on(app: App, station: Station, asked: KeptMeasurement) -> KeptMeasurement:
     """What is kept of the group, where nothing else was asked for; else what was asked for."""
     kept = station.measurements.of_group(asked.group or "")
-    plain = replace(Measurement("", group=asked.group, lasting=False), created=asked.created)
+    plain = replace(KeptMeasurement("", group=asked.group, lasting=False), created=asked.created)
     if kept is None or asked != plain:
         return asked
     rate = f"{kept.rate:g} Hz" if kept.rate else "the datasheets' rates"

@@ -41,7 +41,7 @@ from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.station import Station
-from teds_provision.store import Measurement
+from teds_provision.store import KeptMeasurement
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 
@@ -57,7 +57,7 @@ SCALAR_RATE: Final = 10.0
 class Running:
     """One measurement that runs, or tries to."""
 
-    kept: Measurement
+    kept: KeptMeasurement
     uuids: tuple[str, ...]  # of one that takes in whoever comes: those that are in
     newcomers: Newcomers | None = None
     job: Job | None = None
@@ -123,7 +123,7 @@ class Measuring:
         same = (expression, rate, frozen)
         if any((one.match, one.rate, one.frozen) == same for one in self._station.measurements.due()):
             return  # it is kept already
-        self._begin(Measurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
+        self._begin(KeptMeasurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
 
     def unverified(self, *, rate: float | None = None) -> None:
         """Measure every node that describes itself by what nobody has signed, marked so (``--adopt --unverified``).
@@ -132,7 +132,7 @@ class Measuring:
         """
         self._unverified = Unsigned()
         for name in (self._unverified.text, _ADOPTED):
-            self._begin(Measurement(name, match=name, rate=rate, dead_man=self._dead_man))
+            self._begin(KeptMeasurement(name, match=name, rate=rate, dead_man=self._dead_man))
 
     @contextmanager
     def apart(self, uuid: str, why: str) -> Iterator[None]:
@@ -209,7 +209,7 @@ class Measuring:
                 raise UsageFailure(
                     "Nodes that come one by one cannot begin together.", hint="Leave the trigger out, or freeze it."
                 )
-        kept = Measurement(
+        kept = KeptMeasurement(
             "",
             group=group,
             uuids=tuple(bytes.fromhex(uuid) for uuid in dict.fromkeys(uuids)),
@@ -244,7 +244,7 @@ class Measuring:
             )
         return self._json(self._begin(kept))
 
-    def _require_plan(self, uuid: bytes, kept: Measurement) -> None:
+    def _require_plan(self, uuid: bytes, kept: KeptMeasurement) -> None:
         """Raise BadData or PolicyRefused where the datasheet that is known says that it can never be measured so."""
         why = why_not_measured(self._station, uuid)
         if why:
@@ -429,7 +429,7 @@ class Measuring:
 
     # -- running -----------------------------------------------------------------------------------------------------
 
-    def _begin(self, kept: Measurement) -> Running:
+    def _begin(self, kept: KeptMeasurement) -> Running:
         uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
         one = Running(kept, uuids)
         comes = kept.match is not None and not kept.frozen
@@ -465,7 +465,7 @@ class Measuring:
                 self._turns.give(uuid)
                 self._roster.note(uuid, "idle", measurement=None, report=None)
 
-    def _who(self, kept: Measurement) -> Match | Unsigned | Of:
+    def _who(self, kept: KeptMeasurement) -> Match | Unsigned | Of:
         if self._unverified is not None and kept.id in (Unsigned.text, _ADOPTED):
             return self._unverified if kept.id == Unsigned.text else Of(self._adopted)
         return Match.parse(kept.match or "")

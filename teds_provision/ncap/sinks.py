@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.sinks import FILES, CommandTaker, Sink, open_sink
-from teds_provision.store import Measurement
+from teds_provision.store import KeptMeasurement
 
 RECORDINGS: Final = "recordings"
 STARTED: Final = "mqtt"
@@ -76,7 +76,7 @@ class DaemonSinks:
             )
         return open_sink(self._brokers.get(spec, spec), take)
 
-    def more(self, kept: Measurement, take: CommandTaker | None) -> list[Sink]:
+    def more(self, kept: KeptMeasurement, take: CommandTaker | None) -> list[Sink]:
         """The daemon's own sinks for one run of a measurement, without those that it names itself.
 
         ``take`` takes set points of topics.
@@ -89,7 +89,7 @@ class DaemonSinks:
             specs.append(str(self._folder() / f"{name}-{stamp}.csv"))
         return [open_sink(spec, take) for spec in specs]
 
-    def moves(self, kept: Measurement) -> bool:
+    def moves(self, kept: KeptMeasurement) -> bool:
         """Whether set points may come for this measurement: it allows it, so does the daemon, and a ROS carries it."""
         return self.actuators and kept.actuators and bool(_ROS & {*self._specs, *kept.sinks})
 

@@ -103,7 +103,7 @@ def send(station: Station, post: Post, to: str, document: bytes, name: str) -> N
 
 
 @dataclass(frozen=True)
-class Arrival:
+class Delivery:
     """A document of a line that came for this station; ``drop`` throws its parcel away."""
 
     document: bytes
@@ -123,7 +123,7 @@ class Inbox:
         self._listener: postgres.Registry | None = None
         self._hears = isinstance(post, postgres.PostgresPost)
 
-    def take(self) -> list[Arrival]:
+    def take(self) -> list[Delivery]:
         """What came since; raises LinkFailure."""
         station, own = self._station, self._station.identity.fingerprint
         tables = station.plant.parcels
@@ -131,12 +131,12 @@ class Inbox:
         for row, document in parcels.received(station, parcels.OF_A_LINE[self._kind.typ]):
             if row.id not in self._known:
                 self._known.add(row.id)
-                found.append(Arrival(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
+                found.append(Delivery(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
         for parcel in self._post.new_parcels(own, self._known):
             self._known.add(parcel.id)
             opened = self._opened(parcel.octets)
             if opened is not None:
-                found.append(Arrival(opened, partial(self._drop, parcel.id, self._post.drop, own)))
+                found.append(Delivery(opened, partial(self._drop, parcel.id, self._post.drop, own)))
         return found
 
     def _drop(self, parcel: str, drop: Callable[[str, Any], object], of: str) -> None:
@@ -219,7 +219,7 @@ class PostOffice:
         self.station, self.post, self.timeout = station, post, timeout
         self._inbox = Inbox(station, post, SIGNED)
         self._news = threading.Condition()
-        self._came: dict[tuple[str, str], Arrival] = {}
+        self._came: dict[tuple[str, str], Delivery] = {}
         self._looking = False
 
     def ask(self, request: SignRequest) -> bytes | None:
@@ -236,7 +236,7 @@ class PostOffice:
             if come is not None:
                 come.drop()
                 return come.document
-            found: list[Arrival] = []
+            found: list[Delivery] = []
             try:
                 found = self._inbox.take()
                 if not found:

@@ -19,7 +19,7 @@ from teds_provision.errors import Frozen, NotFound, PolicyRefused, UsageFailure
 from teds_provision.station.groups import Groups
 from teds_provision.store import Store
 from teds_provision.store.lock import Mark, Taken
-from teds_provision.store.records import DetectionMode, Measurement
+from teds_provision.store.records import DetectionMode, KeptMeasurement
 
 FOLDER = "measuring"  # of the home: who measures what now
 
@@ -33,15 +33,15 @@ class Measurements:
     def __init__(self, store: Store, groups: Groups, home: Path) -> None:
         self._store, self._groups, self._home = store, groups, home
 
-    def all(self) -> list[Measurement]:
+    def all(self) -> list[KeptMeasurement]:
         """Every one that is kept, oldest first."""
         return self._store.measurements()
 
-    def due(self) -> list[Measurement]:
+    def due(self) -> list[KeptMeasurement]:
         """Those to carry on now: kept, not past their end."""
         return [one for one in self.all() if one.ends is None or one.ends > time.time()]
 
-    def get(self, measurement_id: str) -> Measurement:
+    def get(self, measurement_id: str) -> KeptMeasurement:
         """One of them; raises NotFound."""
         found = self._store.measurement(measurement_id)
         if found is None:
@@ -51,15 +51,15 @@ class Measurements:
             )
         return found
 
-    def of_group(self, group: str) -> Measurement | None:
+    def of_group(self, group: str) -> KeptMeasurement | None:
         """The one of a group that was cut off, or lasts: what `measure GROUP` carries on; None where there is none."""
         return next((one for one in reversed(self.due()) if one.group == group), None)
 
-    def nodes_of(self, measurement: Measurement) -> tuple[bytes, ...]:
+    def nodes_of(self, measurement: KeptMeasurement) -> tuple[bytes, ...]:
         """UUIDs of its nodes, 10 octets each; raises NotFound where its group is gone."""
         return measurement.uuids if measurement.group is None else self._groups.get(measurement.group).uuids
 
-    def keep(self, measurement: Measurement) -> Measurement:
+    def keep(self, measurement: KeptMeasurement) -> KeptMeasurement:
         """Keep it, durable when this returns; one with id "" gets one. Raises NotFound (its group), BadData."""
         if measurement.group is not None:
             self._groups.get(measurement.group)
@@ -67,7 +67,7 @@ class Measurements:
         self._store.put_measurement(kept)
         return kept
 
-    def begin(self, measurement: Measurement) -> Measurement:
+    def begin(self, measurement: KeptMeasurement) -> KeptMeasurement:
         """Keep one that begins now; what was cut off before of the same group is not carried on any more."""
         with self._store.transaction():
             for one in self.all():

@@ -248,7 +248,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Measurement:
+class KeptMeasurement:
     """What the station measures after every start (operation.md section 7): a group, or nodes by UUID.
 
     ``channels`` empty: every sensor. ``rate`` in Hz, None for what the datasheets say; ``kind`` None: as each channel

@@ -10,7 +10,7 @@ from teds_provision.cli.configuration import brokers_of
 from teds_provision.client import ApiError
 from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
 from teds_provision.ncap.sinks import DaemonSinks, for_readers
-from teds_provision.store import Measurement
+from teds_provision.store import KeptMeasurement
 from tests.e2e.desk import Desk
 from tests.ncap.service import Service, virtual
 from tests.places import free_tcp_port
@@ -43,9 +43,9 @@ def test_a_request_names_a_sink_and_never_says_where_it_is(tmp_path: Path) -> No
 def test_a_name_stands_for_its_url_when_it_is_opened_and_is_told_where_it_is_gone(tmp_path: Path) -> None:
     sinks = DaemonSinks(tmp_path, ("mqtt://own",), actuators=True, brokers={"lab": LAB})
     assert (sinks.open("lab").name, sinks.open("mqtt").name) == ("mqtts://broker.lab", "mqtt://own")
-    kept = Measurement("m", sinks=("mqtt",))
+    kept = KeptMeasurement("m", sinks=("mqtt",))
     assert sinks.more(kept, None) == [], "the daemon's own broker is not served twice"
-    assert [sink.name for sink in sinks.more(Measurement("m", sinks=("lab",)), None)] == ["mqtt://own"]
+    assert [sink.name for sink in sinks.more(KeptMeasurement("m", sinks=("lab",)), None)] == ["mqtt://own"]
     with pytest.raises(UsageFailure, match="'lab' is no longer configured"):
         DaemonSinks(tmp_path, actuators=True).open("lab")
 

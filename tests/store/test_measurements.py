@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
-from teds_provision.store import Group, Measurement, Store
+from teds_provision.store import Group, KeptMeasurement, Store
 
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))
 
@@ -32,9 +32,9 @@ def test_a_node_is_added_to_no_group_that_is_not_there(store: Store) -> None:
 
 def test_with_a_group_go_its_measurements(store: Store) -> None:
     store.put_group(Group("hand", (ONE,)))
-    wanted = Measurement("m1", "hand", rate=1000.0, sinks=("file.mcap",))
+    wanted = KeptMeasurement("m1", "hand", rate=1000.0, sinks=("file.mcap",))
     store.put_measurement(wanted)
-    store.put_measurement(Measurement("m2", uuids=(ONE, TWO), kind="event", trigger=True))
+    store.put_measurement(KeptMeasurement("m2", uuids=(ONE, TWO), kind="event", trigger=True))
     assert store.measurement("m1") == wanted
     assert [one.id for one in store.measurements()] == ["m1", "m2"]
     assert store.remove_group("hand")
@@ -42,14 +42,14 @@ def test_with_a_group_go_its_measurements(store: Store) -> None:
     assert not store.remove_group("hand")
 
 
-@pytest.mark.parametrize("wrong", [Measurement("m"), Measurement("m", "hand", (ONE,))])
-def test_a_measurement_names_a_group_or_nodes(store: Store, wrong: Measurement) -> None:
+@pytest.mark.parametrize("wrong", [KeptMeasurement("m"), KeptMeasurement("m", "hand", (ONE,))])
+def test_a_measurement_names_a_group_or_nodes(store: Store, wrong: KeptMeasurement) -> None:
     with pytest.raises(BadData):
         store.put_measurement(wrong)
 
 
 def test_a_measurement_comes_back_as_it_was_kept(store: Store) -> None:
-    wanted = Measurement(
+    wanted = KeptMeasurement(
         "m3", uuids=(ONE,), channels=(1, 4), kind=None, trigger=True, actuators=True, dead_man=200,
         scalar_rate=0.5, sinks=("/r/run.csv", "ros1"), lasting=False, ends=1.5e9, test_pattern=True,
         unsigned=True, require="[angle]\n",

@@ -2,7 +2,7 @@
 
 The way of `measure` and of `ncap run` alike:
 
-* ``station.measurements.keep(Measurement(...))`` says what is measured; ``due()`` what is to be carried on after a
+* ``station.measurements.keep(KeptMeasurement(...))`` says what is measured; ``due()`` what is to be carried on after a
   start, ``of_group(NAME)`` what `measure NAME` carries on; ``forget(ID)`` deletes.
 * ``Buses(ports)`` hears the buses of the process, once for all measurements.
 * ``Job(station, kept)`` makes its sinks; ``run(buses, stop)`` measures on this thread until ``stop`` is set, or
@@ -31,7 +31,7 @@ from teds_provision.measure.sinks.wide import WIDE
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
-from teds_provision.store.records import Measurement as Kept
+from teds_provision.store.records import KeptMeasurement
 from teds_provision.teds.fits import parse_require
 
 AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole is begun again
@@ -59,7 +59,7 @@ class Job:
     def __init__(
         self,
         station: Station,
-        kept: Kept,
+        kept: KeptMeasurement,
         *,
         more: Callable[[CommandTaker | None], Sequence[Sink]] = lambda _take: (),
         request: MeasurementRequest | None = None,
@@ -197,7 +197,7 @@ class Job:
             self._commands(command)
 
 
-def request_of(kept: Kept, more: MeasurementRequest) -> MeasurementRequest:
+def request_of(kept: KeptMeasurement, more: MeasurementRequest) -> MeasurementRequest:
     """What is asked of each node; ``more`` has what is not kept: patience, time-out, lease."""
     return replace(
         more,

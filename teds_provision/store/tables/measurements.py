@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from teds_provision.errors import BadData
 from teds_provision.store.database import Database, places
-from teds_provision.store.records import DetectionMode, Group, Measurement
+from teds_provision.store.records import DetectionMode, Group, KeptMeasurement
 
 
 class MeasurementTables:
@@ -60,15 +60,15 @@ class MeasurementTables:
         """Delete a group, and the measurements of it; False if there is none."""
         return self._database.change("DELETE FROM groups WHERE name = ?", (name,)) > 0
 
-    def measurements(self) -> list[Measurement]:
+    def measurements(self) -> list[KeptMeasurement]:
         """Return what the station measures, oldest first."""
         return self._database.read(_measurement, "SELECT * FROM measurements ORDER BY created, id")
 
-    def measurement(self, measurement_id: str) -> Measurement | None:
+    def measurement(self, measurement_id: str) -> KeptMeasurement | None:
         """Return one measurement, None if there is none."""
         return self._database.read_one(_measurement, "SELECT * FROM measurements WHERE id = ?", (measurement_id,))
 
-    def put_measurement(self, measurement: Measurement) -> None:
+    def put_measurement(self, measurement: KeptMeasurement) -> None:
         """Keep what the station measures from now on; raises BadData where it names none, or two, of what it may."""
         one = measurement
         if sum((one.group is not None, bool(one.uuids), one.match is not None)) != 1:
@@ -139,8 +139,8 @@ class MeasurementTables:
         self._database.execute("INSERT OR REPLACE INTO detection VALUES(1, ?)", (mode,))
 
 
-def _measurement(*row: Any) -> Measurement:
-    one = Measurement(*row)
+def _measurement(*row: Any) -> KeptMeasurement:
+    one = KeptMeasurement(*row)
     return replace(
         one,
         uuids=tuple(bytes.fromhex(uuid) for uuid in json.loads(row[2])),
