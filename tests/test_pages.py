@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -53,3 +54,78 @@ def test_a_page_that_is_not_there_would_be_found() -> None:
     assert has_section("profile.md", "Key agreement")
     assert not has_section("profile.md", "Key agreements")
     assert not has_section("operation.md", "99. ")
+
+
+# -- names in pages and docstrings -------------------------------------------------------------------------------------
+
+PACKAGE = ROOT / "teds_provision"
+ROLE = re.compile(r":(mod|func|class|meth|data|attr|exc):`~?([^`]+)`")
+
+
+def defined(path: Path) -> set[str]:
+    """Functions, classes and constants that a file makes."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                found.add(name)
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                found.add(name)
+    return found
+
+
+def missing_on_the_way(text: str) -> list[str]:
+    """Files and functions of "file `name`, `name` -> file ..." that are not there."""
+    wrong, here, path = [], set[str](), ""
+    for match in re.finditer(r"`([a-z_0-9/]+\.py)`|`([A-Za-z_]+)`", text):
+        if match[1] is not None:
+            path = match[1]
+            here = defined(PACKAGE / path) if (PACKAGE / path).is_file() else set()
+            wrong += [] if here else [path]
+        elif path and here and match[2] not in here:
+            wrong.append(f"{path} {match[2]}")
+    return wrong
+
+
+def test_the_ways_through_the_code_are_as_the_page_says() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    section = page.partition("## Seven ways through the code")[2].partition("\n## ")[0]
+    ways = re.split(r"\n[1-9]\. ", section)[1:]
+    assert len(ways) == 7
+    wrong = [one for way in ways for one in missing_on_the_way(way)]
+    assert wrong == []
+    assert missing_on_the_way("`steps/verify.py` `judge`, `jugde` → `steps/verifi.py` `judge`") == [
+        "steps/verify.py jugde",
+        "steps/verifi.py",
+    ]
+
+
+def unknown_roles(path: Path, text: str, every: set[str]) -> list[str]:
+    """References such as :func:`name` to what neither the file knows nor, with a dot, the package."""
+    known = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)} | defined(path)
+    for node in ast.walk(ast.parse(text)):
+        match node:
+            case ast.Attribute(attr=name) | ast.arg(arg=name):
+                known.add(name)
+            case ast.alias(name=name, asname=other):
+                known.add((other or name).rpartition(".")[2])
+    wrong = []
+    for role, target in ROLE.findall(text):
+        if role == "mod":
+            whole = PACKAGE.parent.joinpath(*target.split("."))
+            near = path.parent.joinpath(*target.lstrip(".").split("."))
+            there = any(one.with_suffix(".py").is_file() or one.is_dir() for one in (whole, near))
+        else:
+            head, _, last = target.rpartition(".")
+            there = last in (every if head else known)
+        if not there:
+            wrong.append(f"{path.relative_to(ROOT)}: :{role}:`{target}`")
+    return wrong
+
+
+def test_what_docstrings_refer_to_exists() -> None:
+    files = sorted(PACKAGE.rglob("*.py"))
+    every = set().union(*map(defined, files))
+    assert [one for path in files for one in unknown_roles(path, path.read_text(encoding="utf-8"), every)] == []
+    here = PACKAGE / "limits.py"
+    assert len(unknown_roles(here, "x = 1  # :func:`gone` :mod:`.gone` :func:`x`", every)) == 2

@@ -55,10 +55,6 @@ else:  # numpy and what measuring needs are loaded when the demo gets there
     )
 
 
-# The last part of the demo: the station that now holds the key measures two nodes and moves a gripper.
-
-# The second half of the demo: the key goes to another station, first as a copy, then for good.
-
 # What the demo works on: its folder, its links, the node, and the look at it from one station.
 
 
@@ -103,6 +99,9 @@ def verify_from(demo: Demo, station: Station, what: str) -> None:
         if verified.verdict != "authentic":
             raise NotAuthentic(f"The demo's node is {verified.verdict} as seen from {station.name}.")
         step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
+
+
+# The second half of the demo: the key goes to another station, first as a copy, then for good.
 
 
 def hand_over(demo: Demo, first: Station, second: Station) -> None:
@@ -150,6 +149,9 @@ RATE = 100.0
 SECONDS = 1.0
 OPENING = 40.0
 _HALF_WAY = 0.5
+
+
+# The last part of the demo: the station that now holds the key measures two nodes and moves a gripper.
 
 
 def calibrations(folder: Path) -> dict[str, Path]:

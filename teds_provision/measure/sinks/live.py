@@ -11,7 +11,7 @@ messages per second and says when that is more than what one process bears.
 | ``/<station>/joint_states`` | the same of all joints, for ros2_control | each row, where there is a joint |
 | ``/<station>/joint_commands`` | the same, subscribed | where there is a joint that may be moved |
 | ``/<station>/<node>/array`` and ``/age`` | the same of one node, where nodes come and go | each row of its grid |
-| ``/<station>/<node>/<channel>`` | by :mod:`meaning` | at the scalar rate |
+| ``/<station>/<node>/<channel>`` | by :func:`meaning_of` | at the scalar rate |
 | ``/<station>/<node>/imu`` and the like | by :mod:`vectors` | at the scalar rate |
 | ``/<station>/<node>/teds`` | std_msgs/String, JSON, latched | when the facts are known |
 | ``/<station>/<node>/<channel>/cmd`` | std_msgs/Float64, subscribed | actuators only |

@@ -388,7 +388,7 @@ def _shown(value: object) -> str:
 
 
 # Keys as JSON Web Keys: public P-256 points and link keys (RFC 7517, RFC 7518 sections 6.2 and 6.4).
-
+#
 # P-256, SP 800-186 section 3.2.1.3: y^2 = x^3 - 3x + b over the field of _P elements; the cofactor is 1.
 _P = 0xFFFFFFFF00000001000000000000000000000000FFFFFFFFFFFFFFFFFFFFFFFF
 _B = 0x5AC635D8AA3A93E7B3EBBD55769886BC651D06B0CC53B0F63BCE3C3E27D2604B

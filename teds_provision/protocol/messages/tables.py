@@ -337,7 +337,7 @@ def describe_reply(reply: Reply) -> str:
 
 
 def describe_request(command: Command) -> str:
-    """As :func:`named`, and of a TEDS command which TEDS and where: "Read (1.2), 5 octets: TEDS 5 of channel 1 …"."""
+    """As :func:`describe_command`, and which TEDS a command is about: "Read (1.2), 5 octets: TEDS 5 of channel 1 …"."""
     text = describe_command(command)
     payload = command.payload
     if command.command_class != COMMON or not payload or command.function not in {int(each) for each in TedsFunction}:

@@ -249,13 +249,13 @@ class Tim:
             self._permission.check(command, origin)
             if length != len(command.payload):
                 raise Refused(Reason.BAD_FORM)
-            return self._known(command, origin)
+            return self._dispatch(command, origin)
         except Refused as refused:
             return refusal(refused.reason)
         except (FlashFailure, ChipFailure):
             return refusal(Reason.FLASH_FAILURE)
 
-    def _known(self, command: Command, origin: Origin) -> Reply:
+    def _dispatch(self, command: Command, origin: Origin) -> Reply:
         """Run a command that is permitted and whose length is right."""
         if of_teds(command):
             return self._common(command, origin)

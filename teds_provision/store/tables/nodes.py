@@ -269,7 +269,7 @@ class Batch:
     holders: Sequence[Holder] = ()
     tombstones: Sequence[Tombstone] = ()
     marks: Mapping[bytes, Mapping[str, Any]] = field(default_factory=dict)
-    """Changes of marks (names and values of :class:`Marks`), by UUID; the caller of ``put_batch`` makes them."""
+    """Changes of marks (names, values of :class:`records.Marks`), by UUID; the caller of ``put_batch`` makes them."""
 
 
 class BulkTables:

@@ -1,7 +1,7 @@
 """Field tables of every TEDS class, one per access code, open to inspection (teds.md, "Access codes").
 
-The rows stand in ``standard`` (Meta, TransducerChannel, names), ``phy_text_security`` (PHY, text-based, security) and
-the data file ``calibration_fields.toml``, whose numbers nobody has checked against the standard.
+The rows stand here, but for those of the Calibration TEDS: the data file ``calibration_fields.toml`` has them, whose
+numbers nobody has checked against the standard.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from teds_provision.teds.codec.model import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
-
-# Rows of the Meta-TEDS, the TransducerChannel TEDS and the transducer name TEDS (teds.md, "Access codes").
 
 # What a field table is made of, and the names of the TEDS classes (teds.md, "Access codes").
 
@@ -203,6 +201,8 @@ EVENT_OPTION: Final = {
     2: "changeable, inconsistencies detected",
     3: "changeable, inconsistencies not detected",
 }
+
+# Rows of the Meta-TEDS, the TransducerChannel TEDS and the transducer name TEDS (teds.md, "Access codes").
 
 _UNIT_ROWS: Final = tuple(
     FieldSpec(number, name, "u8", enumeration=INTERPRETATIONS if number == 50 else {}, enumeration_confidence="H")
