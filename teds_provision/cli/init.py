@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import click
@@ -114,7 +115,8 @@ def _request(app: App, name: str | None, keystore: str | None, path: Path) -> No
         {**told, "ca": None},
         f"Certificate request of station {asked.name}: {path}.\n"
         f"Compare by voice:\n  {handover.trust.spoken(digits)}\n"
-        f"On the station with the CA key: teds-provision trust ca sign {path.name} --output {path.stem}.cert",
+        f"On the station with the CA key: teds-provision trust ca sign {quote(path.name)}"
+        f" --output {quote(path.stem + '.cert')}",
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -172,7 +173,9 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
     """The group's name ("" where nodes are named) and the UUIDs."""
     if len(what) == 1 and (group := station.groups.find(what[0])) is not None:
         if not group.uuids:
-            raise UsageFailure(f"Group {group.name!r} has no nodes.", hint=f"Add one: group add {group.name} UUID")
+            raise UsageFailure(
+                f"Group {group.name!r} has no nodes.", hint=f"Add one: group add {quote(group.name)} UUID"
+            )
         return group.name, list(group.uuids)
     return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
 

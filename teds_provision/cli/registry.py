@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -193,8 +194,8 @@ def request(app: App, output: Path) -> None:
     login = plant.schema.role_of(station.fingerprint)
     app.emit(
         {"request": str(output), "fingerprint": station.fingerprint, "role": login},
-        f"Request of {station.name}: {output}\n{station.fingerprint}\nThere: teds-provision registry add {output.name}"
-        " --role base",
+        f"Request of {station.name}: {output}\n{station.fingerprint}\n"
+        f"There: teds-provision registry add {quote(output.name)} --role base",
     )
 
 
@@ -344,7 +345,8 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
         with station.lock("registry sign", app.note):
             plant.folding.take_rosters(station, [signed.octets])
     app.emit(
-        _to_json(signed), f"Signed: {output}. Bring it: registry sync --files DIR, or connect --roster {output.name}"
+        _to_json(signed),
+        f"Signed: {output}. Bring it: registry sync --files DIR, or connect --roster {quote(output.name)}",
     )
 
 

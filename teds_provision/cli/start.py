@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -150,20 +151,20 @@ def _next(found: dict[str, Any]) -> str:
     down = [link for link in found["links"] if link["state"] == "down"] or mute
     if down:
         kind, _, where = str(down[0]["place"]).partition(":")
-        return f"teds-provision doctor --{kind} '{where}'"
+        return f"teds-provision doctor --{kind} {quote(where)}"
     for node in found["nodes"]:
-        over = f" --can '{str(node['link']).partition(':')[2]}'" if str(node["link"]).startswith("can:") else ""
+        over = f" --can {quote(str(node['link']).partition(':')[2])}" if str(node["link"]).startswith("can:") else ""
         if not node["whitelisted"]:
             return f"teds-provision identify --add{over}"
         if node["state"] == "factory":
             return f"teds-provision provision --profile PROFILE{over}"
         if node["verdict"] != "authentic":
-            return f"teds-provision verify {node['name'] or node['uuid']}{over}"
+            return f"teds-provision verify {quote(node['name'] or node['uuid'])}{over}"
     if "ncap" in found:
         return "teds-provision ncap open"
     if found["nodes"]:
         first = found["nodes"][0]
-        return f"teds-provision measure {first['name'] or first['uuid']}"
+        return f"teds-provision measure {quote(first['name'] or first['uuid'])}"
     if found["links"] and all(link["place"].startswith("nfc:") for link in found["links"]):
         return "teds-provision provision --profile PROFILE"
     if not found["links"]:

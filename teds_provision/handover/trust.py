@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from teds_provision import vault as vaults
@@ -279,7 +280,7 @@ def _is_listed(station: Station, wanted: TrustRecord) -> bool:
         if (old.role, old.point) != (wanted.role, wanted.point):
             raise PolicyRefused(
                 f"The name {wanted.name!r} already stands for the {old.role} {old.fingerprint[:16]}.",
-                hint=f"Choose another name, or run teds-provision trust remove {wanted.name} first.",
+                hint=f"Choose another name, or run teds-provision trust remove {quote(wanted.name)} first.",
             )
     return bool(named)
 
@@ -390,7 +391,7 @@ def _by_file(known: list[TrustRecord], file: str) -> TrustRecord:
             return record
     raise PolicyRefused(
         f"The key {fingerprint(point)[:16]} of {file} is not trusted here.",
-        hint=f"Compare its fingerprint by voice, then: teds-provision trust add NAME {file}",
+        hint=f"Compare its fingerprint by voice, then: teds-provision trust add NAME {quote(str(file))}",
     )
 
 

@@ -9,6 +9,7 @@ import secrets
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, UsageFailure
@@ -148,7 +149,7 @@ class FlashFile:
                 raise
             raise NotFound(
                 f"There is no virtual node in {self.path.parent}.",
-                hint=f"Make one: teds-provision node create {self.path.parent}",
+                hint=f"Make one: teds-provision node create {quote(str(self.path.parent))}",
             ) from None
         try:
             document = load_json(octets, "the flash", octets=_MOST_OCTETS)

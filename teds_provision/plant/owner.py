@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
+from shlex import quote
 from typing import Any
 from uuid import uuid4
 
@@ -131,7 +132,7 @@ def with_roles(station: Station, name: str, roles: frozenset[Role], last: Place 
     if "keeper" in member.roles and "keeper" not in roles:
         raise PolicyRefused(
             f"{member.name} is a keeper, and that is taken by a removal alone: else its bans would end in silence.",
-            hint=f"registry remove {member.name} --retired",
+            hint=f"registry remove {quote(member.name)} --retired",
         )
     place = member.signed
     if "sign" in roles:

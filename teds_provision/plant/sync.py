@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from shlex import quote
 from typing import Final
 
 from teds_provision.errors import Fork, NotAuthentic, NotMember, PolicyRefused, TedsProvisionError
@@ -150,7 +151,7 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
         alarm(station, "junk", station.fingerprint, junk[0], f"{post.where} has pages that our key did not sign")
         raise NotAuthentic(
             f"{post.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
-            hint=f"Take them off there: registry sql --mend {roster.name_of(station.fingerprint)} {junk[0]}",
+            hint=f"Take them off there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
         )
     if junk:
         done.told.append(f"{post.where}: {len(junk)} files in this station's place that it did not sign; passed over")

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 from teds_provision.errors import Frozen, NotFound, UsageFailure
@@ -61,7 +62,9 @@ class Groups:
             )
         present = self._store.group(name)
         if present is not None and set(present.uuids) != set(uuids):
-            raise UsageFailure(f"There is a group {name!r} already.", hint=f"Add nodes to it: group add {name} UUID …")
+            raise UsageFailure(
+                f"There is a group {name!r} already.", hint=f"Add nodes to it: group add {quote(name)} UUID …"
+            )
         if present is None:
             with self._store.together():
                 self._store.put_group(Group(name, tuple(dict.fromkeys(uuids))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 import pytest
@@ -11,6 +12,9 @@ from tests.places import free_bus
 from .desk import ANGLE, Desk, Node, Station
 
 pytestmark = [pytest.mark.link, pytest.mark.both_nodes]
+
+
+ARM = "slew's $(arm)"
 
 
 def alone(station: Station) -> Any:
@@ -31,19 +35,19 @@ def test_a_node_is_found_where_it_was_met_last_and_the_program_alone_says_who_is
     assert [(one["uuid"], one["link"], one["whitelisted"]) for one in said["nodes"]] == [(node.uuid, at, False)]
     assert said["next"].startswith("teds-provision identify --add")
     station.ask("config", "unset", "can")
-    station.provision("can", "--profile", ANGLE, "--name", "arm")
+    station.provision("can", "--profile", ANGLE, "--name", ARM)
     said = alone(station)
-    assert [(one["name"], one["verdict"]) for one in said["nodes"]] == [("arm", "authentic")], "by its last bus"
-    assert said["next"] == "teds-provision measure arm"
-    assert station.ask("verify", "arm")["verdict"] == "authentic", "no link is named"
+    assert [(one["name"], one["verdict"]) for one in said["nodes"]] == [(ARM, "authentic")], "by its last bus"
+    assert shlex.split(said["next"]) == ["teds-provision", "measure", ARM], "as it would be typed"
+    assert station.ask("verify", ARM)["verdict"] == "authentic", "no link is named"
     # the bus that somebody names goes before the one that is remembered, and is remembered from then on
     node.stop()
     desk.links = type(desk.links)(desk.links.nfc, free_bus())
     node.start(nfc=False, can=True)
-    refused = station.refuses("verify", "arm", "--timeout", "2", code=5)
+    refused = station.refuses("verify", ARM, "--timeout", "2", code=5)
     assert f"did not answer on {at.removeprefix('can:')} within 2 s" in refused["message"]
-    assert station.ask("verify", "arm", "--can", desk.links.can)["verdict"] == "authentic", "without --via can"
-    assert station.ask("verify", "arm")["verdict"] == "authentic"
+    assert station.ask("verify", ARM, "--can", desk.links.can)["verdict"] == "authentic", "without --via can"
+    assert station.ask("verify", ARM)["verdict"] == "authentic"
 
 
 def test_a_remembered_bus_keeps_nobody_from_a_tap(desk: Desk, station: Station, node: Node) -> None:

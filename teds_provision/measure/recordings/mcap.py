@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -76,7 +77,8 @@ class McapRecording(Recording):
 
     def _bad(self, why: str) -> BadData:
         return BadData(
-            f"{self.path}: {why}.", hint=f"See what of it is whole: teds-provision measure recover {self.path}"
+            f"{self.path}: {why}.",
+            hint=f"See what of it is whole: teds-provision measure recover {quote(str(self.path))}",
         )
 
     def _records(self, *, chunks: bool = True) -> Iterator[tuple[int, bytes]]:

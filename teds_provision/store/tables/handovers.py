@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from shlex import quote
 from typing import Any
 
 from teds_provision.errors import PolicyRefused, UsageFailure
@@ -34,7 +35,7 @@ class HandoverTables:
             if row and row != (record.fingerprint, record.role):
                 raise PolicyRefused(
                     f"The name {record.name!r} already stands for the {row[1]} {row[0][:16]}.",
-                    hint=f"Choose another name, or run teds-provision trust remove {record.name} first.",
+                    hint=f"Choose another name, or run teds-provision trust remove {quote(record.name)} first.",
                 )
             self._database.execute(
                 "DELETE FROM trust WHERE fingerprint = ? AND role = ?", (record.fingerprint, record.role)

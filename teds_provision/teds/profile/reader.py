@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 from teds_provision import files
@@ -233,7 +234,9 @@ class Problems:
         errors = self.errors
         if errors:
             more = f" ({len(errors) - 1} more)" if len(errors) > 1 else ""
-            raise BadData(f"{errors[0]}{more}", hint=f"See all of them with: teds-provision profile check {name}")
+            raise BadData(
+                f"{errors[0]}{more}", hint=f"See all of them with: teds-provision profile check {quote(name)}"
+            )
 
 
 class Section:
