@@ -76,7 +76,9 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
     if not roster.has(station.identity.fingerprint, "keeper"):
         raise PolicyRefused("This station is not a keeper: nobody would take its job.", hint="Ask a keeper.")
     drafted = _drafted(station, roster, told)
-    if not dry_run:
+    if dry_run:  # what nobody would take is refused in a plan too
+        protocol.plant.job.seal_job(drafted, protocol.keys.SoftwareKey.generate())
+    else:
         station.unlock()
         octets = protocol.plant.job.seal_job(drafted, station.credentials().key)
         drafted = plant.jobs.take_job(station, octets)
@@ -107,7 +109,7 @@ def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
         boards,
         _time(begins) if begins is not None else datetime.now(UTC).replace(microsecond=0),
         _time(told["ends"]),
-        dict(_allotment(roster, text, total) for text in told["stations"]),
+        _allotments(roster, told["stations"], total),
         told["assurance"],
         sign if sign == "station" else _office(roster, sign),
         not told["no_evidence"],
@@ -132,7 +134,8 @@ def _boards(path: Path) -> dict[bytes, str]:
 def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
     given = [name for name in ("calibration", "calibrations", "calibration_age") if told[name] is not None]
     if len(given) > 1:
-        raise UsageFailure("A job has one rule for calibrations.", hint=f"Use one of --{' and --'.join(given)}.")
+        named = " and ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise UsageFailure("A job has one rule for calibrations.", hint=f"Use one of {named}.")
     rule = protocol.plant.job.CalibrationRule
     if told["calibration"] is not None:
         return rule("one", plant.jobs.digest_of_file(told["calibration"]))
@@ -150,13 +153,23 @@ def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
     return rule("list", by_uuid=by_uuid)
 
 
+def _allotments(roster: Roster, texts: Sequence[str], total: int) -> dict[str, int]:
+    allotted: dict[str, int] = {}
+    for text in texts:
+        station, number = _allotment(roster, text, total)
+        if station in allotted:
+            raise UsageFailure(f"Station {roster.name_of(station)} is named twice.", hint="Give each one allotment.")
+        allotted[station] = number
+    return allotted
+
+
 def _allotment(roster: Roster, text: str, total: int) -> tuple[str, int]:
     name, _, number = text.rpartition("=") if "=" in text else (text, "", str(total))
     found = roster.named(name)
     if found is None or roster.member(found.fingerprint) is None:
         raise NotFound(f"The roster has no member {name!r}.", hint="See: teds-provision registry status")
-    if not number.isdecimal() or not 1 <= int(number) <= total:
-        raise UsageFailure(f"{text!r}: an allotment is a number of 1 to {total}.")
+    if not number.isdecimal() or not int(number) >= 1:
+        raise UsageFailure(f"{text!r}: an allotment is a number from 1 on.")
     return found.fingerprint, int(number)
 
 

@@ -89,6 +89,12 @@ def _emit_change(
 ) -> None:
     """Show what a new version changes, ask, sign it, and have it count here; ``file``: only write it as a draft."""
     before = station.plant.roster
+    if before is not None and plant.owner.says_the_same(before, draft):
+        if output is not None and not dry_run:
+            _write_once(output, before.octets + b"\n")
+        plan = {"plan": dry_run, "draft": None} if dry_run or file is not None else {}
+        app.emit({**_to_json(before), **plan}, f"Nothing to do: roster {before.version} says so already.")
+        return
     said = "\n".join(plant.owner.changes(before, draft))
     if dry_run or file is not None:
         if file is not None and not dry_run:
@@ -108,6 +114,12 @@ def _emit_change(
             write_new(output, signed.octets + b"\n", mode=SHARED)
         plant.folding.put_roster(station, signed)
     app.emit(_to_json(signed), f"Roster {signed.version} counts here. To tell the others: teds-provision registry sync")
+
+
+def _write_once(path: Path, octets: bytes) -> None:
+    """Write a new file; one that holds just this is left as it is."""
+    if not (path.is_file() and read_file(path) == octets):
+        write_new(path, octets, mode=SHARED)
 
 
 def _to_json(one: Roster) -> dict[str, Any]:
@@ -190,7 +202,7 @@ def request(app: App, output: Path) -> None:
     station.unlock()
     with station.lock("registry request", app.note):
         octets = plant.membership.request(station)
-    write_new(output, octets + b"\n", mode=SHARED)
+    _write_once(output, octets + b"\n")
     login = plant.schema.role_of(station.fingerprint)
     app.emit(
         {"request": str(output), "fingerprint": station.fingerprint, "role": login},
@@ -276,21 +288,23 @@ def _what(every: bool, group: str | None, profile: str | None) -> Any:
 
 @command("teds-provision registry remove west --lost --last 88", name="remove")
 @click.argument("name")
-@click.option("--retired", "why", flag_value="retired", help="It went out of service in order.")
-@click.option("--lost", "why", flag_value="lost", help="Nobody knows where it is.")
-@click.option("--stolen", "why", flag_value="stolen", help="Somebody else has it.")
+@click.option("--retired", is_flag=True, help="It went out of service in order.")
+@click.option("--lost", is_flag=True, help="Nobody knows where it is.")
+@click.option("--stolen", is_flag=True, help="Somebody else has it.")
 @click.option("--last", type=WholeNumber(0, 1 << 31), metavar="N", help="The last page of it that counts.")
 @_change_options
 @pass_app
-def remove(app: App, /, name: str, why: roster.Why | None, last: int | None, **how: Any) -> None:
+def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
     """Remove a station. Its key never comes back; what it said on pages up to the last one stays."""
-    if why is None:
+    reasons: tuple[roster.Why, ...] = ("retired", "lost", "stolen")
+    given = [one for one in reasons if how[one]]
+    if len(given) != 1:
         raise click.UsageError("Give one of --retired, --lost and --stolen.")
+    (why,) = given
     station = app.station()
-    held = plant.folding.require_roster(station)
-    member = plant.owner.require_member(held, name)
-    pages = plant.status.page_list(station, member.fingerprint)
-    if last is None and why != "retired":
+    member = plant.folding.require_roster(station).named(name)
+    if isinstance(member, roster.Member) and last is None and why != "retired":
+        pages = plant.status.page_list(station, member.fingerprint)
         listed = "\n".join(f"  {n:>6}  {local_time(created)}  {hash[:16]}" for n, hash, created in pages)
         app.note(f"The newest pages of {member.name}:\n{listed or '  none'}")
     _emit_change(app, station, plant.owner.without(station, name, why, last), **_named(how))
@@ -608,7 +622,7 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
         if found is None:
             raise NotFound(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
         of = found.fingerprint
-    uuid = None if node is None else station.nodes.resolve(node)
+    uuid = None if node is None else plant.status.resolve(station, node)
     said = plant.status.log(station, uuid=uuid, of=of, since=moment(since) if since else None)
     if app.json:
         more = ((one, {"fingerprint_of_station": one.station, "page": one.n, "counts": one.counts}) for one in said)
@@ -621,7 +635,8 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
 
 
 def _members(event: dict[str, Any]) -> str:
-    shown = {name: value for name, value in event.items() if name not in ("act", "id", "at", "statement", "proof")}
+    hidden = ("act", "id", "at", "statement", "proof")
+    shown = {name: value for name, value in event.items() if name not in hidden and value is not None}
     return " ".join(f"{name}={str(value)[:20]}" for name, value in shown.items())
 
 

@@ -239,6 +239,12 @@ def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, coun
                 station.plant.tables.put_ban(hash, chain.chain, counts=counts, uuid=one.uuid, statement=text)
 
 
+def counted_places(station: Station, roster: Roster, chain: Chain) -> frozenset[tuple[int, str]]:
+    """Number and H of the pages of a chain that count; of another history none above where the two part."""
+    names = station.plant.tables.page_names(chain.chain)
+    return frozenset(counting(names, last=_last(roster, chain.station), accepted=chain.accepted).pages)
+
+
 def octets_of(row: PageRow) -> bytes:
     """The octets of a page, as they came."""
     return join(row.header, row.content, row.signature)

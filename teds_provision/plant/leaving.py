@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Final
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.plant.folding import views
+from teds_provision.plant.folding import counted_places, views
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim, Key
@@ -150,13 +150,17 @@ def _had(one: Removed, key: Key, said: Mapping[str, Claim]) -> bool:
 
 
 def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], set[str]]:
-    """Keys (UUID, epoch, key id) that who left names on pages beyond its last one that counts."""
+    """Keys (UUID, epoch, key id) that who left names on pages that do not count: later ones, and another history's."""
     found: dict[tuple[bytes, int, str], set[str]] = {}
     for one in roster.removed:
         chain = station.plant.tables.chains().get(one.fingerprint)
         if chain is None:
             continue
-        for page in station.plant.tables.each_page(chain.chain, after=chain.counted[0]):
+        counted = counted_places(station, roster, chain)
+        for n, hash, _ in station.plant.tables.page_names(chain.chain):
+            page = None if (n, hash) in counted else station.plant.tables.page(chain.chain, n, hash)
+            if page is None:
+                continue
             for value in load_exact(page.content, "A page").get("events", ()):
                 read = event.read(value)
                 if isinstance(read, event.Event) and read.uuid is not None and "key_id" in read.members:

@@ -119,6 +119,8 @@ def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Ros
         )
     member = Member(request.name, request.point, request.certificate, roles)
     if there is not None:
+        if replace(there, signed=None) == member:
+            return following(station)
         raise PolicyRefused(f"{there.name} is a member already.", hint="Change its roles: registry role")
     if any(one.name == request.name for one in own.members):
         raise PolicyRefused(f"Another member is called {request.name!r}.", hint="Choose another name: --name")
@@ -149,6 +151,9 @@ def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
     For a retired one that is the newest page here unless said; for a lost or stolen one it must be said.
     """
     own = require_roster(station)
+    gone = own.named(name)
+    if isinstance(gone, Removed) and gone.why == why and last in (None, gone.last[0]):
+        return following(station)
     member = require_member(own, name)
     chain = station.plant.tables.chain(member.fingerprint)
     if last is None and why != "retired":
@@ -193,17 +198,14 @@ def shared(station: Station, share: Share) -> Roster:
 
 
 def unshared(station: Station, what: tuple[str, str]) -> Roster:
-    """Draft a roster that shares these nodes no more; raises NotFound where they were not."""
+    """Draft a roster that shares these nodes no more."""
     own = require_roster(station)
-    kept = tuple(one for one in own.share if one.what != what)
-    if len(kept) == len(own.share):
-        raise NotFound("The roster has no such share.", hint="See: teds-provision registry status")
-    return following(station, share=kept)
+    return following(station, share=tuple(one for one in own.share if one.what != what))
 
 
 def renewed(station: Station, days: timedelta) -> Roster:
     """Draft the same roster with a new end."""
-    return following(station, expires=_whole(now()) + days)
+    return following(station, expires=max(_whole(now()), require_roster(station).created) + days)
 
 
 def require_member(roster: Roster, name: str) -> Member:
@@ -213,6 +215,13 @@ def require_member(roster: Roster, name: str) -> Member:
         known = ", ".join(one.name for one in roster.members)
         raise NotFound(f"{name!r} is no member of {roster.name}.", hint=f"Members: {known}.")
     return found
+
+
+def says_the_same(before: Roster | None, after: Roster) -> bool:
+    """Whether a version would change nothing: who belongs, who left, what is shared, until when."""
+    return before is not None and all(
+        getattr(before, what) == getattr(after, what) for what in ("members", "removed", "share", "expires")
+    )
 
 
 def write_draft(draft: Roster) -> bytes:

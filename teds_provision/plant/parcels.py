@@ -72,7 +72,7 @@ def take_in(station: Station, post: Post, views: Views, now: datetime) -> Receiv
         if done is not None:
             post.drop(parcel.id, station.fingerprint)
             taken += done
-    return Received(taken, len(station.plant.parcels.parcels("in", "waiting", "later")))
+    return Received(taken, sum(row.kind == "bundle" for row in station.plant.parcels.parcels("in", "waiting", "later")))
 
 
 def _drop_outlived(station: Station, now: datetime) -> None:
@@ -212,8 +212,15 @@ class _Reader:
         return True
 
     def _keep_document(self, parcel: Parcel, typ: str, inner: bytes) -> bool | None:
-        """Keep a job, a request or an answer for the command that it is for; a member signed it."""
+        """Keep a job, a request or an answer for the command that it is for; a member signed it.
+
+        An answer that came twice, or to what nobody asked, is for no command: it would wait here in vain.
+        """
         document = open_document(inner, self._member, _KINDS[typ])
+        if _KINDS[typ] is SIGNED:
+            asked = self.station.plant.line.sign_request(str(document.members.get("of")), "out")
+            if asked is None or asked.answer is not None or asked.peer != document.signer:
+                return True
         row = replace(self._row(parcel, OF_A_LINE[typ]), peer=document.signer, about=document.hash, state="waiting")
         with self.station.durable(_COMMAND):
             return self._keep(row, replace(parcel, octets=inner))

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final
 
-from teds_provision.plant.folding import AT_ONCE, heads_digest, now, views
+from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.plant.folding import AT_ONCE, counted_places, heads_digest, now, require_roster, views
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
@@ -16,6 +17,8 @@ from teds_provision.store.tables.plant import Alarm, Chain, PlantRecord
 
 SILENT: Final = timedelta(days=7)
 """A station whose newest page that counts is older than this is silent."""
+SHORTEST: Final = 4
+"""So many digits of a UUID name a node."""
 
 
 @dataclass(frozen=True)
@@ -118,17 +121,42 @@ def log(
     station: Station, *, uuid: bytes | None = None, of: str | None = None, since: str | None = None
 ) -> Iterator[Said]:
     """What stations said, chain by chain in the order of their pages: verified when the page came in."""
+    roster = require_roster(station)
     for one, chain in sorted(station.plant.tables.chains().items()):
         if of is not None and one != of:
             continue
-        counted = chain.counted
+        counted = counted_places(station, roster, chain)
         for page in station.plant.tables.each_page(chain.chain):
             if since is not None and page.created < since:
                 continue
             for value in load_exact(page.content, "A page").get("events", ()):
                 read = event.read(value)
                 if isinstance(read, event.Event) and uuid in (None, read.uuid):
-                    yield Said(one, page.n, page.n <= counted[0], dict(read.members))
+                    yield Said(one, page.n, (page.n, page.hash) in counted, dict(read.members))
+
+
+def resolve(station: Station, text: str) -> bytes:
+    """The UUID that ``text`` means: in the own store first, else among the nodes that stations of the plant name.
+
+    Raises NotFound, UsageFailure where several fit.
+    """
+    try:
+        return station.nodes.resolve(text)
+    except NotFound:
+        name = text.strip()
+        digits = name.lower().removeprefix("0x")
+        found = [
+            node["uuid"]
+            for node in nodes(station, require_roster(station), name)
+            if (len(digits) >= SHORTEST and node["uuid"].startswith(digits)) or node["name"] == name
+        ]
+        if not found:
+            raise
+    if len(found) > 1:
+        raise UsageFailure(
+            f"{text!r} fits {len(found)} nodes: {', '.join(found[:5])}.", hint="Give more digits of the UUID."
+        )
+    return bytes.fromhex(found[0])
 
 
 def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator[dict[str, Any]]:
@@ -137,11 +165,12 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
     ``text`` is the beginning of a UUID, or a part of the name.
     """
     after, wanted = b"", (text or "").lower()
+    digits = wanted.removeprefix("0x")
     while uuids := station.plant.tables.claimed_nodes(after, AT_ONCE):
         after = uuids[-1]
         for uuid, seen in views(station, roster, uuids).items():
             name = seen.name or ""
-            if wanted and not uuid.hex().startswith(wanted) and wanted not in name.lower():
+            if wanted and not uuid.hex().startswith(digits) and wanted not in name.lower():
                 continue
             holders = {} if seen.holder is None else seen.holder[1]
             newest = max(((w[0], roster.name_of(one), w[2]) for one, w in seen.written.items()), default=None)

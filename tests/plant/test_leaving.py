@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -124,6 +125,33 @@ def test_a_stolen_one_that_says_it_forgot_is_not_believed(scene: Scene) -> None:
     scene.sync(scene.south, scene.north)
     scene.remove(scene.south, "stolen")
     assert scene.marks(scene.north) == [uuid]
+
+
+def test_a_key_that_a_thief_names_on_another_history_is_rotated_too(scene: Scene, tmp_path: Path) -> None:
+    """The roster's ``last`` is page 2 of one branch; the copy said on its own page 2 that it had the key."""
+    board = board_of(scene.north, os.urandom(10))
+    (key,) = scene.north.keys.of(board.uuid)
+    scene.plant.change(plant.owner.unshared(scene.north, ("all", "")))
+    scene.sync(scene.north, scene.west)
+    with scene.west.transaction():
+        scene.west.plant.tell("named", bytes(10), name="one")
+    scene.sync(scene.west)
+    shutil.copytree(scene.west.home, tmp_path / "copy")
+    copy = Station.open(tmp_path / "copy", ask=ask)
+    other = tmp_path / "other stick"
+    other.mkdir()
+    with copy.transaction():
+        copy.plant.tell("agreed", board.uuid, fingerprint="ab" * 32, epoch=key.epoch, key_id=key.key_id)
+    scene.plant.sync(copy, other)
+    copy.close()
+    with scene.west.transaction():
+        scene.west.plant.tell("named", bytes(10), name="two")
+    scene.sync(scene.west, scene.north)
+    scene.plant.sync(scene.north, other)
+    branch = scene.west.plant.tables.chain(scene.west.fingerprint).counted[1]
+    plant.membership.accept(scene.north, scene.west.fingerprint, branch, None)
+    scene.remove(scene.west, "stolen")
+    assert scene.north.keys.rotation_due(board.uuid), "what he says that he has, he has"
 
 
 def test_what_only_the_lost_one_held_is_counted_as_a_tap(scene: Scene) -> None:

@@ -77,7 +77,20 @@ def test_from_an_order_to_boards_with_proof(desk: Desk, owner: Station, tmp_path
     assert "2 of 2 passed" in owner.run("job", "status", job["id"]).out
     assert [one["passed"] for one in owner.ask("job", "list")["jobs"]] == [2]
     assert owner.ask("job", "close", job["id"])["state"] == "closed"
+    assert {one["profile"] for one in owner.ask("nodes", "--profile", ANGLE)["nodes"]} == {ANGLE}
     assert owner.log_is_whole()
+
+
+def test_what_no_reader_would_take_is_refused_when_a_job_is_made(owner: Station) -> None:
+    """Allotments add up to at most the boards: one station's alone, or those of two; a plan says it too."""
+    begin = ("job", "new", "--title", "two angles", "--profile", ANGLE, *ENDS, "--count", 2)
+    for more in (("--station", "owner=3"), ("--station", "owner=3", "--dry-run")):
+        assert "allotments of more than the 2 boards" in owner.refuses(*begin, *more, code=8)["message"]
+    twice = owner.refuses(*begin, "--station", "owner=1", "--station", "owner=1", code=2)
+    assert "named twice" in twice["message"]
+    two_rules = ("--station", "owner", "--calibration-age", 3, "--calibration", __file__)
+    assert "--calibration and --calibration-age" in owner.refuses(*begin, *two_rules, code=2)["hint"]
+    assert owner.ask("job", "list")["jobs"] == []
 
 
 def test_a_bench_goes_on_until_it_is_told_to_stop(desk: Desk, owner: Station) -> None:

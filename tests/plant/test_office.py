@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, tzinfo
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
-from teds_provision.plant import jobs, office
+from teds_provision.plant import jobs, office, parcels
 from teds_provision.plant.asking import NotAnswered, PostOffice, Refused, send
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import take_job
@@ -330,6 +331,25 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
     assert answered is not None
     leave(answered, "88888888")
     assert build(run, one).verified.verdict == "authentic"
+
+
+def test_an_answer_waits_for_the_line_that_asked_and_for_no_person(desk: Desk) -> None:
+    """One that came again, after the board was done, stayed for ever: "1 parcel waits for import-keys --received"."""
+    run, one = desk.run(), board(1)
+    request = desk.request(run, one)
+    post, me = FilesPost(desk.plant.stick), desk.line.identity.fingerprint
+    sealed = answer(desk.office, request.octets)
+    assert sealed is not None
+    send(desk.office, post, me, sealed, str(uuid.uuid4()))
+    done = desk.plant.sync(desk.line)
+    assert (done.parcels_in, done.waiting) == (0, 0)
+    (kept,) = parcels.received(desk.line, "signed")
+    assert kept[1] == sealed
+    desk.line.plant.parcels.drop_parcel(kept[0].id, "in")
+    build(run, one)
+    send(desk.office, post, me, sealed, str(uuid.uuid4()))
+    assert desk.plant.sync(desk.line).waiting == 0
+    assert parcels.received(desk.line, "signed") == []
 
 
 def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: Desk) -> None:

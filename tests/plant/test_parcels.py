@@ -125,7 +125,7 @@ def test_a_copy_that_expired_while_it_waited_makes_room_for_the_next_one(plant: 
     assert waits(plant["south"]) == []
 
 
-def test_answers_that_nobody_asks_for_any_more_do_not_keep_jobs_out(plant: Plant) -> None:
+def test_requests_that_nobody_answers_any_more_do_not_keep_jobs_out(plant: Plant) -> None:
     from teds_provision.protocol.plant import document
 
     plant.roster(ROLES)
@@ -138,14 +138,14 @@ def test_answers_that_nobody_asks_for_any_more_do_not_keep_jobs_out(plant: Plant
         plant.post.send(Parcel(f"{kind.typ} {n}", west.fingerprint, sealed, time_text(now(60)), north.fingerprint))
 
     for n in range(64):
-        send(document.SIGNED, n)
+        send(document.SIGN_REQUEST, n)
     sync(plant, "west")
     send(document.JOB, 0)
     sync(plant, "west", at=now(30))
     assert parcels.received(west, "job") == []
     sync(plant, "west", at=now(32))
     assert len(parcels.received(west, "job")) == 1
-    assert parcels.received(west, "signed") == []
+    assert parcels.received(west, "sign-request") == []
     sync(plant, "west", at=now(90))
     assert len(parcels.received(west, "job")) == 1
 

@@ -200,6 +200,39 @@ def test_leaving_is_asked_for_and_said(desk: Desk) -> None:
     assert desk.ask("south", "registry", "connect", "--files", desk.stick, "--yes")["version"] == 3
 
 
+def test_the_same_again_makes_no_new_roster(desk: Desk) -> None:
+    joined(desk)
+    asked = desk.folder / "west.request"
+    desk.ask("west", "registry", "request", "--output", asked)
+    same = ("registry", "add", asked, "--role", "sign", "--role", "line", "--yes")
+    assert desk.ask("north", *same)["version"] == 3
+    assert desk.ask("north", "registry", "add", asked, "--role", "base", "--yes", code=6)
+    assert desk.ask("north", "registry", "role", "west", "line", "sign", "--yes")["version"] == 3
+    share = ("registry", "share", "--all", "--to", "south", "--yes")
+    assert [desk.ask("north", *share)["version"] for _ in range(2)] == [4, 4]
+    assert [desk.ask("north", "registry", "unshare", "--all", "--yes")["version"] for _ in range(2)] == [5, 5]
+    out = desk.folder / "roster.jws"
+    leaves = ("registry", "remove", "west", "--lost", "--last", 0, "--yes", "--output", out)
+    assert [desk.ask("north", *leaves)["version"] for _ in range(2)] == [6, 6]
+    assert desk.ask("north", "registry", "remove", "west", "--lost", "--retired", code=2)
+    assert desk.ask("north", "registry", "renew", "--yes")["version"] == 7, "a new end is a new version"
+
+
+def test_a_node_that_only_others_met_is_found_by_its_first_digits_and_name(desk: Desk) -> None:
+    joined(desk)
+    desk.ask("north", "whitelist", "add", UUID, "--fingerprint", KEY, "--name", "finger 1")
+    desk.sync("north")
+    asked = desk.folder / "late.request"
+    desk.sync("south")
+    desk.ask("south", "whitelist", "remove", UUID, "--yes")
+    assert asked
+    for word in (UUID[:4], f"0x{UUID[:8].upper()}", "finger 1"):
+        found = desk.ask("south", "registry", "log", word)["events"]
+        assert {one["uuid"] for one in found} == {UUID}, word  # type: ignore[attr-defined]
+        assert desk.ask("south", "nodes", "--plant", word)["nodes"], word
+    desk.ask("south", "registry", "log", "8d4e", code=3)
+
+
 def test_a_fork_stops_the_copy_and_a_person_resumes(desk: Desk) -> None:
     joined(desk)
     desk.sync("west")
@@ -282,6 +315,9 @@ def test_a_person_accepts_one_of_two_histories_and_sees_it_first(desk: Desk, tmp
     assert desk.ask("north", "registry", "status", code=4)["alarms"]
     taken = desk.ask("north", "registry", "accept", "west", "--page", branch, "--yes")
     assert (taken["done"], taken["hash"]) == (1, plan["hash"])
+    told = desk.ask("north", "registry", "log", "--station", "west")
+    said = [one for one in told["events"] if one["act"] == "pinned"]  # type: ignore[attr-defined]
+    assert sorted(one["counts"] for one in said) == [False, True], "of two first pages one counts"
     (node,) = desk.ask("north", "nodes", "--plant")["nodes"]  # type: ignore[misc]
     assert len(node["says"]["pinned_by"]) == 1
 
