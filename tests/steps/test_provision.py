@@ -286,13 +286,13 @@ def test_a_run_writes_as_little_as_its_promises_need(station: Station, board: Bo
 def test_nothing_is_read_twice_that_says_nothing_new(station: Station, board: Board) -> None:
     """Identify is asked once in the session; the Security TEDS is read once before it and once after the commit."""
     asked: list[tuple[int, int, bytes]] = []
-    handle = board.tim._known
+    handle = board.tim._dispatch
 
     def counted(command: Command, origin: Any) -> Reply:
         asked.append((command.command_class, command.function, command.payload[:1]))
         return handle(command, origin)
 
-    board.tim._known = counted  # type: ignore[method-assign]
+    board.tim._dispatch = counted  # type: ignore[method-assign]
     assert run(station, board).verified.verdict == "authentic"
     assert asked.count((128, Function.IDENTIFY, b"")) == 1, asked
     assert asked.count((1, TedsFunction.READ, bytes([128]))) == 2, asked
