@@ -6,6 +6,8 @@ import json
 import math
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -284,6 +286,23 @@ def test_an_actuator_that_nobody_asks_for_again_is_safe_soon(asked: Client, hand
         return time.monotonic() - began
 
     best_of(5, 5, let_go)
+
+
+def test_an_actuator_that_is_held_again_while_it_is_let_go_can_be_let_go(
+    service: Service, asked: Client, hand: str
+) -> None:
+    """A button that is pressed twice: the second hold was forgotten by the end of the first, and moved on for 60 s."""
+    path = f"/nodes/{hand}/channels/1"
+    with service.client() as other, ThreadPoolExecutor(1) as beside:
+        for milliseconds in range(10):
+            asked.request("PUT", path, {"value": 0.05, "hold": 60})
+            letting_go = beside.submit(other.request, "PUT", path, {"hold": 0})
+            time.sleep(milliseconds / 1000)
+            with suppress(ApiError):  # 423: it came before the release, which is meant for it too
+                asked.request("PUT", path, {"value": 0.02, "hold": 60})
+            letting_go.result()
+            if asked.node(hand)["channels"][0]["actuator"]["safe"] is False:
+                assert asked.request("PUT", path, {"hold": 0})["safe"] is not False
 
 
 def test_names_are_given_kept_and_taken_back(asked: Client, hand: str) -> None:

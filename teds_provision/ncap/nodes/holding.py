@@ -52,8 +52,9 @@ class _Held:
     error: TedsProvisionError | None = None
     safe: bool | None = None
     ended: bool = False
-    let_go: bool = False
+    let_go: bool = False  # it is on its way to its safe state: no later order is for this one
     crossed: bool = False
+    before: _Held | None = None  # the same actuator, which is being let go still
 
 
 @dataclass
@@ -125,33 +126,43 @@ class Holding:
                 self._station.audit("set", bytes.fromhex(uuid), error.code, **facts)
             raise
         seconds = HOLD if hold is None else min(hold, LONGEST_HOLD)
-        held, fresh = self._held_for(uuid, channel, value, unit)
+        held, mine = self._ordered(uuid, channel, value, unit, seconds)
         with held.news:
-            held.until = time.monotonic() + seconds + (_STARTING if fresh else 0.0)
-            mine = held.order.number + (not fresh)
-            held.order = _Order(value, unit, mine)
-            held.news.notify_all()
-            if fresh:
-                who = contextvars.copy_context()  # on whose word, for the audit log
-                work = (self._run, held, value, unit)
-                threading.Thread(target=who.run, args=work, name=f"hold {held.uuid[:8]}", daemon=True).start()
             held.news.wait_for(lambda: held.answered >= mine or held.ended, _STARTING)
             return self._answer(held, mine, seconds)
+
+    def _ordered(self, uuid: str, channel: int, value: float, unit: str | None, seconds: float) -> tuple[_Held, int]:
+        """Give the order to the thread of this actuator, a new one where there is none; and its number there."""
+        while True:
+            held, fresh = self._held_for(uuid, channel, value, unit)
+            with held.news:
+                if held.let_go and not fresh:
+                    continue  # since we looked
+                held.until = time.monotonic() + seconds + (_STARTING if fresh else 0.0)
+                held.order = _Order(value, unit, held.order.number + (not fresh))
+                held.news.notify_all()
+                if fresh:
+                    who = contextvars.copy_context()  # on whose word, for the audit log
+                    work = (self._run, held, value, unit)
+                    threading.Thread(target=who.run, args=work, name=f"hold {held.uuid[:8]}", daemon=True).start()
+                return held, held.order.number
 
     def _held_for(self, uuid: str, channel: int, value: float, unit: str | None) -> tuple[_Held, bool]:
         """The actuator as it is held now, or a new one; and whether it is new."""
         key = (uuid, channel)
         with self._guard:
             held = self._held.get(key)
-            if held is not None and not held.ended and not held.let_go:
+            if held is not None and not held.let_go:
                 return held, False
-            held = self._held[key] = _Held(uuid, channel, 0.0, _Order(value, unit, 1))
+            held = self._held[key] = _Held(uuid, channel, 0.0, _Order(value, unit, 1), before=held)
             return held, True
 
     @staticmethod
     def _answer(held: _Held, mine: int, seconds: float) -> dict[str, Any]:
         if held.error is not None and held.answered <= mine:
             raise held.error
+        if held.let_go and held.answered < mine:
+            raise NodeBusy("The actuator was let go before it took this value.", hint="Set it again.")
         if held.answered < mine or held.applied is None:
             raise LinkFailure("The actuator did not answer in time.", hint="Its dead-man takes it to its safe state.")
         held.until = time.monotonic() + seconds
@@ -184,6 +195,7 @@ class Holding:
         try:
             self._station.audit("set", node, "begun", value=value, unit=unit or "", **facts)
             with self._session(held.uuid) as session:
+                self._wait_for_the_one_before(held)
                 self._hold(held, session)
         except SessionLost as lost:
             held.error = LinkFailure(f"The session was lost: {lost.cause.message}", hint="It goes to its safe state.")
@@ -197,9 +209,10 @@ class Holding:
                 self._station.audit("set", node, outcome, safe=held.safe, **asked, **why, **facts)
             self._tell(held, safe=held.safe)
             with self._guard:
-                self._held.pop((held.uuid, held.channel), None)
+                if self._held.get((held.uuid, held.channel)) is held:  # not the one after it
+                    del self._held[held.uuid, held.channel]
             with held.news:
-                held.ended = True
+                held.ended = held.let_go = True
                 held.news.notify_all()
 
     @contextmanager
@@ -240,9 +253,11 @@ class Holding:
         try:
             while True:
                 with held.news:
-                    order, over = held.order, held.let_go or time.monotonic() >= held.until
-                if over and answered >= order.number:
-                    return
+                    order = held.order
+                    if time.monotonic() >= held.until and answered >= order.number:
+                        held.let_go = True
+                    if held.let_go:  # whoever asks from now on has it claimed anew
+                        return
                 with session(held.uuid) as trusted:
                     if trusted is None:
                         raise LinkFailure("The node is not connected now.", hint="Connect it to a bus.")
@@ -260,6 +275,14 @@ class Holding:
                 with session(held.uuid):
                     actuator.__exit__(None, None, None)
                 held.safe = actuator.safe
+
+    @staticmethod
+    def _wait_for_the_one_before(held: _Held) -> None:
+        """Its claim ends first: two of one session cannot have an actuator, and it says that it is safe."""
+        before, held.before = held.before, None
+        if before is not None:
+            with before.news:
+                before.news.wait_for(lambda: before.ended, _STARTING)
 
     @staticmethod
     def _until_there(held: _Held, session: Measured) -> None:
