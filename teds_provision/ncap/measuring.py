@@ -229,20 +229,24 @@ class Measuring:
         if not nodes and match is None:
             raise UsageFailure(f"Group {group!r} is empty.", hint="Add a node to it first.")
         for uuid in nodes:
-            other = self.of(uuid.hex())
-            if other is not None:
-                raise NodeBusy(
-                    f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first."
-                )
+            self._require_unmeasured(uuid)
             self._require_plan(uuid, kept)
         for spec in kept.sinks:
             self._sinks.open(spec)
-        with self._station.durable("measure"):
-            kept = self._station.measurements.keep(kept)
-            self._station.audit(
-                "measure", None, "begun", id=kept.id, group=group or match, nodes=[one.hex() for one in nodes]
-            )
-        return self._json(self._begin(kept))
+        with self._station.lock("measure"):  # of two requests at once for one node, or its group, one is refused
+            for uuid in self._station.measurements.nodes_of(kept):
+                self._require_unmeasured(uuid)
+            with self._station.durable("measure"):
+                kept = self._station.measurements.keep(kept)
+                self._station.audit(
+                    "measure", None, "begun", id=kept.id, group=group or match, nodes=[one.hex() for one in nodes]
+                )
+            return self._json(self._begin(kept))
+
+    def _require_unmeasured(self, uuid: bytes) -> None:
+        other = self.of(uuid.hex())
+        if other is not None:
+            raise NodeBusy(f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first.")
 
     def _require_plan(self, uuid: bytes, kept: KeptMeasurement) -> None:
         """Raise BadData or PolicyRefused where the datasheet that is known says that it can never be measured so."""

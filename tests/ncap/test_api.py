@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import pytest
@@ -249,6 +250,26 @@ def test_a_measurement_that_cannot_be_is_refused(asked: Client, hand: str) -> No
     assert "at most 100 samples" in fast, "what the datasheet rules out is not kept and tried for ever"
     refused(asked, 422, "bad-data", "POST", "/measurements", {"uuids": [hand], "channels": [1]})
     assert asked.request("GET", "/measurements")["measurements"] == []
+
+
+def test_of_requests_at_once_that_measure_one_node_one_is_taken(service: Service, asked: Client, hand: str) -> None:
+    """All of them were: who ended the one that ran saw the next begin, and a restart began them all."""
+    asked.request("POST", "/groups", {"name": "pair", "uuids": [hand]})
+    callers, together = [service.client() for _ in range(4)], Barrier(4)
+
+    def ask(caller: Client, body: dict[str, Any]) -> int:
+        together.wait()
+        try:
+            caller.request("POST", "/measurements", body)
+        except ApiError as error:
+            return error.status
+        return 201
+
+    with ThreadPoolExecutor(4) as pool:
+        for body in ({"uuids": [hand]}, {"group": "pair"}) * 5:
+            assert sorted(pool.map(ask, callers, [body] * 4)) == [201, 423, 423, 423]
+            [one] = asked.request("GET", "/measurements")["measurements"]
+            asked.end_measurement(one["id"])
 
 
 def test_an_actuator_moves_within_its_limits_and_is_let_go(asked: Client, hand: str) -> None:
