@@ -60,6 +60,7 @@ bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.radio
 	$(BIN)/python -m benchmarks.plant
+	$(BIN)/python -m benchmarks.plant --local 120
 	$(BIN)/python -m benchmarks.line
 	$(BIN)/python -m benchmarks.line_readers --pace
 

@@ -1,8 +1,9 @@
 """The registry on a PostgreSQL of its own: 50 stations that push at once, waking, and a sync that finds nothing.
 
 ``python -m benchmarks.plant [--stations 50] [--pages 20] [--events 20]``; ``--history NODES`` alone: a newcomer takes
-in what was told of so many nodes, four events each, in a process of its own. Times are ratios: client and server share
-the machine. The floor beside it is as many empty round trips over the same connections.
+in what was told of so many nodes, four events each, in a process of its own; ``--local BOARDS`` alone: boards in
+memory, provisioned by a station that joined a registry and by one that joined none, in turn. Times are ratios:
+client and server share the machine. The floor beside it is as many empty round trips over the same connections.
 """
 
 from __future__ import annotations
@@ -31,6 +32,11 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.page import Draft, seal_page
 from teds_provision.station.station import Station
+from teds_provision.steps.build import BuildOrder, prepare
+from teds_provision.steps.provision import provision
+from teds_provision.talk.progress import Silent
+from tests.bench import Board, make_station, talk
+from tests.plant.owner import ANGLE, alone
 from tests.plant.stations import Plant, ask
 
 REGISTRY = str(uuid.uuid4())
@@ -78,10 +84,14 @@ def main() -> None:
     asked.add_argument("--pages", type=int, default=20)
     asked.add_argument("--events", type=int, default=20)
     asked.add_argument("--history", type=int, metavar="NODES")
+    asked.add_argument("--local", type=int, metavar="BOARDS")
     asked.add_argument("--take-in", type=Path, metavar="FOLDER", help=argparse.SUPPRESS)
     size = asked.parse_args()
     if size.history or size.take_in:
         _take_in(size.take_in) if size.take_in else _history(size.history)
+        return
+    if size.local:
+        _local(size.local)
         return
     found = cluster.programs()
     if found is None:
@@ -104,6 +114,30 @@ def main() -> None:
             _woken(posts, keys)
             for post in posts:
                 post.close()
+
+
+def _local(boards: int) -> None:
+    """Boards in memory: with both ends, and with every COMMIT; the ratio is the median of the pairs."""
+    with tempfile.TemporaryDirectory(prefix="plant-local-") as folder:
+        stations = make_station(Path(folder, "alone"), "alone"), alone(Path(folder, "joined"))
+        orders = []
+        for station in stations:
+            station.unlock()
+            orders.append(prepare(station, BuildOrder(ANGLE)))
+        spent: list[tuple[float, float, int]] = []
+        for number in range(boards):
+            for place in (0, 1) if number % 2 else (1, 0):
+                board = Board(uuid=(1 + number).to_bytes(10, "big"))
+                wall, used = time.perf_counter(), time.process_time()
+                with talk(board) as node:
+                    provision(stations[place], node, orders[place], accept=lambda who: None, reporter=Silent())
+                spent.append((time.perf_counter() - wall, time.process_time() - used, place))
+        for column, what in enumerate(("by the clock", "of the processor")):
+            without, beside = ([each[column] for each in spent if each[2] == place] for place in (0, 1))
+            ratio = statistics.median(b / a for a, b in zip(without[10:], beside[10:], strict=True))
+            print(f"a board: {1000 * statistics.median(without):.1f} ms {what}, beside a registry {ratio:.2f} ×")
+        for station in stations:
+            station.close()
 
 
 def _history(nodes: int) -> None:
