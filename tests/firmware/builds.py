@@ -66,10 +66,11 @@ def board(name: str) -> Path:
     return BUILD / "boards" / name
 
 
-def library(max_message: int = 1024, staging: int = 4096) -> Path:
+def library(max_message: int = 1024, staging: int = 4096, *, sessions: int = 2, streams: int = 2) -> Path:
     """The node over flash in memory, built for these sizes."""
     need("make", "gcc")
-    path = BUILD / "host" / f"memory-{max_message}-{staging}.so"
+    room = f"-{sessions}-{streams}" if (sessions, streams) != (2, 2) else ""
+    path = BUILD / "host" / f"memory-{max_message}-{staging}{room}.so"
     make(str(path.relative_to(FIRMWARE)))
     return path
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +16,11 @@ from tests.firmware import builds
 NANOSECONDS: Final = 10**9
 _KINDS: Final = {"can": 1, "nfc": 2, "ble": 3}
 _RANDOM: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_char, ctypes.POINTER(ctypes.c_uint8), ctypes.c_size_t)
+_HOOK: Final = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_char, ctypes.c_uint8, ctypes.c_uint64, ctypes.c_void_p, ctypes.c_size_t
+)
+Hook = Callable[[str, int, int, bytes], int | tuple[bytes, int]]
+"""Asked with a word of memory.h, a channel, an argument and octets: what it says, or octets to put there and that."""
 _KEYED, _PROVISIONED = 1, 2
 Draw = Callable[[str, int], bytes]
 """Octets for: ``n`` a nonce, counter or wait; ``i`` the scalar of the identity key; ``o`` that of a one-time key."""
@@ -30,7 +35,7 @@ def _library(path: Path) -> Any:
     library.memory_poll.restype = ctypes.c_uint64
     library.memory_dead.restype = library.memory_misused.restype = library.memory_nfc_written.restype = ctypes.c_bool
     library.memory_ble_advertises.restype = library.memory_ble_drops.restype = ctypes.c_bool
-    library.memory_in_session.restype = ctypes.c_bool
+    library.memory_in_session.restype = library.memory_acts.restype = library.memory_streams.restype = ctypes.c_bool
     library.memory_ble_notify.restype = library.memory_ble_data.restype = ctypes.c_size_t
     library.memory_nfc_message.restype = library.memory_nfc_frame.restype = ctypes.c_size_t
     return library
@@ -59,8 +64,9 @@ class MemoryNode:
         unit: int = 8,
         erased: int = 0xFF,
         library: Path | None = None,
+        sizes: Mapping[str, int] | None = None,
     ) -> None:
-        self._library = _library(library or builds.library(max_message, max_teds + 4))
+        self._library = _library(library or builds.library(max_message, max_teds + 4, **(sizes or {})))
         self._clock, self.max_message = clock, max_message
         self._draw = draw
         self._callback = _RANDOM(self._random)  # kept: the library calls it as long as the node is there
@@ -68,6 +74,20 @@ class MemoryNode:
         self._board = ctypes.c_void_p(
             self._library.memory_new(uuid, ctypes.c_uint8(unit), ctypes.c_uint8(erased), self._callback)
         )
+
+    def hook_up(self, hook: Hook) -> None:
+        """Have its channels in the test's hands; before the start."""
+
+        def ask(what: bytes, channel: int, argument: int, octets: Any, length: int) -> int:
+            given = ctypes.string_at(octets, length) if octets else b""
+            said = hook(what.decode(), channel, argument, given)
+            if isinstance(said, tuple):
+                ctypes.memmove(octets, said[0], length)
+                return int(said[1])
+            return int(said)
+
+        self._hook = _HOOK(ask)  # kept, too
+        self._library.memory_hook_up(self._board, self._hook)
 
     def close(self) -> None:
         """Give its memory back; once, whoever else closes it."""

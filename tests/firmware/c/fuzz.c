@@ -203,7 +203,7 @@ static void holds_together(const memory_board *board)
 {
     const teds_node *node = &board->node;
     bool holds = streams_hold(node) && lines_hold(node) && node->staging_end <= sizeof node->staging &&
-                 node->nfc.length <= TEDS_MAX_NDEF && teds_get16(node->nfc.file) <= TEDS_MAX_NDEF &&
+                 node->nfc.length <= TEDS_MAX_NDEF &&
                  node->events[0].in <= TEDS_EVENTS && node->events[0].out <= TEDS_EVENTS && !memory_misused(board);
     for (size_t i = 0; i < TEDS_REPLIES; i++) {
         holds = holds && node->replies[i].length <= sizeof node->replies[i].octets;

@@ -142,6 +142,101 @@ static void safe(void *user, uint8_t channel)
     memset(board->values[place_of(board, channel)], 0, 8);
 }
 
+/* -- channels in a test's hands --------------------------------------------------------------------------------------- */
+
+static int ask(void *user, char what, uint8_t channel, uint64_t argument, uint8_t *octets_of_it, size_t length)
+{
+    return ((memory_board *)user)->hook(what, channel, argument, octets_of_it, length);
+}
+
+static size_t width(const void *user, uint8_t channel)
+{
+    const memory_board *board = user;
+    return board->channels[place_of(board, channel)].octets;
+}
+
+static bool ask_sample(void *user, uint8_t channel, uint64_t tick, uint8_t *out)
+{
+    return ask(user, 's', channel, tick, out, width(user, channel)) != 0;
+}
+
+static bool ask_bears(void *user, uint8_t channel, const uint8_t *value)
+{
+    uint8_t copy[256];
+    memcpy(copy, value, width(user, channel));
+    return ask(user, 'b', channel, 0, copy, width(user, channel)) != 0;
+}
+
+static void ask_set(void *user, uint8_t channel, const uint8_t *value)
+{
+    uint8_t copy[256];
+    memcpy(copy, value, width(user, channel));
+    (void)ask(user, 'a', channel, 0, copy, width(user, channel));
+}
+
+static void ask_set_point(void *user, uint8_t channel, uint8_t *out)
+{
+    (void)ask(user, 'g', channel, 0, out, width(user, channel));
+}
+
+static void ask_safe(void *user, uint8_t channel)
+{
+    (void)ask(user, 'f', channel, 0, NULL, 0);
+}
+
+static void ask_arm(void *user, uint8_t channel, uint16_t ms)
+{
+    (void)ask(user, 'm', channel, ms, NULL, 0);
+}
+
+static void ask_kick(void *user, uint8_t channel)
+{
+    (void)ask(user, 'k', channel, 0, NULL, 0);
+}
+
+static void ask_self_test(void *user, uint8_t channel)
+{
+    (void)ask(user, 't', channel, 0, NULL, 0);
+}
+
+static bool ask_testing(void *user, uint8_t channel)
+{
+    return ask(user, 'T', channel, 0, NULL, 0) != 0;
+}
+
+static bool ask_fault(void *user, uint8_t channel)
+{
+    return ask(user, 'F', channel, 0, NULL, 0) != 0;
+}
+
+static void ask_power(void *user, teds_power *out)
+{
+    uint8_t said[7] = {0};
+    (void)ask(user, 'p', 0, 0, said, sizeof said);
+    out->flags = said[0];
+    out->level = said[1];
+    out->voltage = teds_get16(said + 2);
+    out->current = (int16_t)teds_get16(said + 4);
+    out->temperature = (int8_t)said[6];
+}
+
+void memory_hook_up(memory_board *board, memory_hook hook)
+{
+    teds_port *port = &board->port;
+    board->hook = hook;
+    port->sample = ask_sample;
+    port->bears = ask_bears;
+    port->set = ask_set;
+    port->set_point = ask_set_point;
+    port->safe = ask_safe;
+    port->arm = ask_arm;
+    port->kick = ask_kick;
+    port->self_test = ask_self_test;
+    port->testing = ask_testing;
+    port->fault = ask_fault;
+    port->power = ask_power;
+}
+
 memory_board *memory_new(const uint8_t uuid[10], uint8_t unit, uint8_t erased, memory_random random)
 {
     memory_board *board = calloc(1, sizeof *board);
@@ -209,6 +304,53 @@ void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t m
     own->shortest = shortest;
 }
 
+void memory_no_channels(memory_board *board)
+{
+    board->port.channel_count = 0;
+}
+
+void memory_halt(memory_board *board, uint8_t number, uint8_t halt)
+{
+    board->channels[place_of(board, number)].halt = halt;
+}
+
+void memory_slow(memory_board *board, bool slow)
+{
+    board->config.quick_points = !slow;
+}
+
+void memory_clock(memory_board *board, uint32_t step, uint16_t drift)
+{
+    board->port.step = step;
+    board->port.drift = drift;
+}
+
+void memory_by_fd(memory_board *board, bool fd)
+{
+    board->fd = fd;
+}
+
+bool memory_acts(const memory_board *board)
+{
+    return teds_actuator_claimed(&board->node);
+}
+
+bool memory_streams(const memory_board *board)
+{
+    return teds_streams_running(&board->node);
+}
+
+void memory_set_run(memory_board *board, uint8_t link, uint16_t run)
+{
+    board->node.sessions[teds_session_on(&board->node, link)].run = run;
+}
+
+void memory_set_counter(memory_board *board, uint32_t counter, uint64_t start)
+{
+    board->node.streams[0].counter = counter;
+    board->node.streams[0].start = start;
+}
+
 void memory_at(memory_board *board, uint64_t now)
 {
     board->now = now;
@@ -258,7 +400,7 @@ void memory_put_flash(memory_board *board, const uint8_t *octets_of_it)
 size_t memory_handle(memory_board *board, uint8_t link, uint8_t kind, bool tapped, const uint8_t *frame,
                      size_t length, uint8_t *reply)
 {
-    const teds_arrival arrival = {kind, tapped, false, board->now};
+    const teds_arrival arrival = {kind, tapped, board->fd, board->now};
     return teds_node_handle(&board->node, link, &arrival, frame, length, reply);
 }
 
@@ -329,10 +471,17 @@ int memory_by_hand(memory_board *board)
 
 void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd)
 {
+    memory_can_rx_at(board, identifier, data, length, fd, board->now);
+}
+
+/* The same, and its end was at `tick`: frames wait in a controller. */
+void memory_can_rx_at(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd,
+                      uint64_t tick)
+{
     teds_can_frame frame = {identifier, length, fd, {0}};
     if (length <= sizeof frame.data) {
         memcpy(frame.data, data, length);
-        teds_can_rx(&board->node, &frame, board->now);
+        teds_can_rx(&board->node, &frame, tick);
     }
 }
 

@@ -11,6 +11,10 @@
 /* `kind` n: octets for a nonce or counter; i, o: the scalar of an identity or one-time key. */
 typedef int (*memory_random)(char kind, uint8_t *out, size_t length);
 
+/* The channels, in a test's hands: `what` s sample, b bears, a set, g set point, f safe, m arm (argument: ms), k kick,
+ * t self-test, T testing, F fault, p power (7 octets as the reply has them). */
+typedef int (*memory_hook)(char what, uint8_t channel, uint64_t argument, uint8_t *octets, size_t length);
+
 typedef struct memory_board {
     teds_bearssl crypto; /* first: the port of BearSSL looks here */
     teds_port port;
@@ -26,6 +30,8 @@ typedef struct memory_board {
     uint8_t values[TEDS_CHANNELS][8];
     teds_fixed fixed[8];
     bool fails;
+    memory_hook hook;
+    bool fd; /* how commands come */
 #if TEDS_NFC
     teds_isodep card;
 #endif
@@ -37,6 +43,17 @@ int memory_start(memory_board *board);
 int memory_start_cut(memory_board *board, long step, bool torn);
 void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t model, uint8_t octets,
                     uint32_t shortest);
+void memory_no_channels(memory_board *board);
+void memory_halt(memory_board *board, uint8_t number, uint8_t halt);
+void memory_hook_up(memory_board *board, memory_hook hook);
+void memory_slow(memory_board *board, bool slow);
+void memory_clock(memory_board *board, uint32_t step, uint16_t drift);
+void memory_by_fd(memory_board *board, bool fd);
+bool memory_acts(const memory_board *board);
+bool memory_streams(const memory_board *board);
+/* What takes a station too long: the last run of a link, the next counter of the one stream and when it began. */
+void memory_set_run(memory_board *board, uint8_t link, uint16_t run);
+void memory_set_counter(memory_board *board, uint32_t counter, uint64_t start);
 void memory_at(memory_board *board, uint64_t now);
 void memory_cut(memory_board *board, long step, bool torn);
 void memory_fails(memory_board *board, bool fails);
@@ -60,6 +77,8 @@ void memory_lost(memory_board *board, uint8_t link);
 void memory_move(memory_board *board, uint8_t address);
 int memory_by_hand(memory_board *board);
 void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd);
+void memory_can_rx_at(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd,
+                      uint64_t tick);
 /* Length of the frame, -1: none. */
 int memory_can_tx(memory_board *board, uint32_t *identifier, uint8_t *data, bool *fd);
 void memory_event(memory_board *board, uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid);

@@ -36,12 +36,24 @@ def times() -> dict[int, int]:
     return known
 
 
+def load_dice(bench: Bench, opens: int, one_time: SoftwareKey) -> None:
+    """What the node draws."""
+    drawn = iter([one_time])
+    bench.tim._sessions._opens = opens
+    bench.tim._sessions._one_time = lambda: next(drawn)
+
+
+def message_key(bench: Bench) -> bytes:
+    """What it derived."""
+    session = bench.tim._sessions.on("can:f1")
+    assert session is not None
+    return session.message_key
+
+
 @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
 def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
     bench, told = Bench(), KAT["open"]
-    drawn = iter([SoftwareKey(int(told["En"]["d"], 16))])
-    bench.tim._sessions._opens = int(told["c"], 16)
-    bench.tim._sessions._one_time = lambda: next(drawn)
+    load_dice(bench, int(told["c"], 16), SoftwareKey(int(told["En"]["d"], 16)))
     bench.ports["can:f1"] = Port("can", "can", 0xF1, fd=fd)
     session = StationSession(K, UUID, one_time=SoftwareKey(int(told["Es"]["d"], 16)))
     opened = bench.tim.handle(bytes.fromhex(told["open_frame"]), link="can:f1", tapped=False)
@@ -73,7 +85,7 @@ def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
         if entry["name"].startswith("Stop 0: self-test"):
             bench.hardware.tests.clear()
         assert reply.hex() == entry["reply"], entry["name"]
-    assert bench.tim._sessions.on("can:f1").message_key == MESSAGE_KEY  # type: ignore[union-attr]
+    assert message_key(bench) == MESSAGE_KEY
 
     form = "can_fd" if fd else "can"
     published = [can_frame(text) for stream in KAT["streams"] for m in stream["messages"] for text in m[form]]
