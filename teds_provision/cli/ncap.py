@@ -257,7 +257,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
     for node in found["nodes"]:
         there = "there" if node["present"] else "away"
         name = shown(node["name"]) or "no name"
-        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}", markup=False)
+        problem = f": {node['problem']['message']}" if node["problem"] else ""
+        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}{problem}", markup=False)
     for one in found.get("measurements", ()):
         what = f" of {one['match']}" if one.get("match") else ""
         why = f": {one['why']}" if one["why"] else ""

@@ -175,14 +175,19 @@ def _named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
     name = name.replace(_UUID, uuid.hex())
     if _COUNT in name:
         name = _numbered(station, uuid, name)
+    require_free_name(station, uuid, name)
+    check_name(name)
+    return replace(prepared, order=replace(prepared.order, name=name))
+
+
+def require_free_name(station: Station, uuid: bytes, name: str) -> None:
+    """Raise PolicyRefused where another node has this name."""
     others = [other for other in station.nodes.all_named(name) if other != uuid]
     if others:
         raise PolicyRefused(
             f"Node {others[0].hex()} has the name {name!r} already.",
             hint="Give this one another name; {uuid} or {n} in --name makes each its own.",
         )
-    check_name(name)
-    return replace(prepared, order=replace(prepared.order, name=name))
 
 
 def _numbered(station: Station, uuid: bytes, pattern: str) -> str:
@@ -491,7 +496,9 @@ def build(
         told = differences(has.blocks, prepared.profile, prepared.calibrations or ())
         if told and not is_remembered(station, uuid, order.profile, factory=False):
             (retype or refuse)(uuid, told)
-    plan = compose(station, uuid, prepared, pending_image(station, uuid, has) or has, edition=edition)
+    pending, draft = pending_image(station, uuid, has), station.nodes.draft(uuid)
+    name = own_name(station, pending, draft.profile) if pending is not None and draft is not None else None
+    plan = compose(station, uuid, prepared, pending or has, name=name, edition=edition)
     image = Image(uuid, dict(plan.blocks))
     warnings = plan.warnings + guard(
         station, image, has, order.accept_calibration, plan.calibrations, plan.profile, record=keep_draft
@@ -504,10 +511,9 @@ def build(
     if not keep_draft:
         return built
     with station.durable("build"):
-        facts = {} if plan.name is None else {"name": plan.name}
         if has is None or not has.unsigned_blocks():  # of a node with a datasheet the store keeps what is on it
-            facts |= {"profile": plan.wanted, "profile_digest": plan.digest}
-        station.nodes.remember(uuid, **facts)
+            facts = {"profile": plan.wanted, "profile_digest": plan.digest, "name": plan.name}
+            station.nodes.remember(uuid, **{fact: value for fact, value in facts.items() if value is not None})
         station.nodes.keep_draft(Draft(uuid, image, "built", plan.wanted))
         station.audit("build", uuid, "done", profile=built.profile, teds=image.digest())
     return built

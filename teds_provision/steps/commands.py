@@ -33,7 +33,7 @@ from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, ResetReceipt, agree, open_session, require_session, reset_node
 from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse, shown_by
-from teds_provision.steps.build import guard, own_name
+from teds_provision.steps.build import guard, own_name, require_free_name
 from teds_provision.steps.identify import Identified, describe, identify
 from teds_provision.steps.provision import add_to_whitelist
 from teds_provision.steps.read import read_identity, read_image, survey
@@ -421,6 +421,9 @@ def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, di
     name = own_name(station, wanted, profile)
     if name is not None:
         facts["name"] = name
+    record = station.nodes.get(uuid)
+    if name is not None and draft is not None and file is None and (record is None or record.name != name):
+        require_free_name(station, uuid, name)
     if wanted.uuid != uuid:
         raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
     if wanted.security is None:

@@ -226,3 +226,29 @@ def test_the_summary_tells_limits_and_readings_in_one_unit(station: Station, des
     assert "0 mm to 110 mm, calibrated, reads " in line
     assert line.endswith(" mm")
     assert node.uuid in done.out
+
+
+def test_a_draft_renames_nobody_until_it_is_written(station: Station, desk: Desk, node: Node) -> None:
+    """`build --name` renamed the node in every list and topic, and it kept that name when the draft was dropped."""
+    node.start(nfc=False, can=True)
+    other = desk.node("other").start(nfc=False, can=True)
+    links = desk.links.over("can")
+
+    def named() -> str:
+        return str(station.ask("nodes", node.uuid)["nodes"][0]["name"])
+
+    station.ask("provision", node.uuid, "--profile", FINGER, "--name", "thumb", "--yes", *links)
+    station.ask("provision", other.uuid, "--profile", FINGER, "--name", "ring", "--yes", *links)
+    station.ask("build", node.uuid, "--name", "index")
+    assert named() == "thumb"
+    assert station.ask("names", "list")["names"][0]["topic"].split("/")[2] in ("thumb", "ring")
+    station.ask("draft", "drop", node.uuid, "--yes")
+    assert station.ask("provision", node.uuid, "--yes", *links)["name"] == "thumb"
+    station.ask("build", node.uuid, "--name", "index")
+    station.ask("build", node.uuid)  # nothing else is asked for: what lies ready keeps its name
+    station.ask("build", other.uuid, "--name", "index")
+    for one in (node, other):
+        station.ask("sign", one.uuid)
+    station.ask("write", node.uuid, *links)
+    assert named() == "index"
+    assert "has the name 'index' already" in station.refuses("write", other.uuid, *links, code=6)["message"]

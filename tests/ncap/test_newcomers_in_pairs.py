@@ -74,6 +74,8 @@ def test_a_node_whose_signature_is_not_good_is_refused_with_why_and_joins_when_i
     assert "not authentic" in whys(lab, right)[-1][1]
     with lab.service.client() as asked:
         assert right.uuid not in asked.measurements()[0]["uuids"]
+    shown = lab.service.station.run("ncap", "status").out.splitlines()
+    assert "not authentic" in next(line for line in shown if line.startswith(right.uuid)).partition(": ")[2]
     right.kill()
     (right.folder / "flash.json").write_bytes(before)
     lab.power(right)
