@@ -62,3 +62,17 @@ def test_a_refusal_that_nobody_vouches_for_is_asked_for_again(board: Board) -> N
     with pytest.raises(NodeRefused, match="no such TEDS"):
         read_block(talk(board, steady), SECURITY)
     assert steady.count == 3
+
+
+def test_an_offset_that_nobody_asked_for_is_asked_again_outside_a_session(board: Board) -> None:
+    """A reply to the command before, whose process was killed, ended the next one (5) on a busy machine."""
+    good = read_block(talk(board, MemoryLink(board)), SECURITY)
+
+    def stale(count: int, reply: bytes) -> bytes:
+        return Reply(True, (99).to_bytes(4, "big") + b"else").encode() if count < 3 else reply
+
+    assert read_block(talk(board, MemoryLink(board, tamper=stale)), SECURITY) == good
+    steady = MemoryLink(board, tamper=lambda _count, _reply: stale(1, b""))
+    with pytest.raises(Garbled, match="another offset"):
+        read_block(talk(board, steady), SECURITY)
+    assert steady.count == 3
