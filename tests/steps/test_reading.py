@@ -47,7 +47,7 @@ def test_noise_on_a_plain_read_is_read_again_and_a_teds_that_is_bad_stays_bad(bo
     bad = MemoryLink(board, tamper=lambda _count, reply: reply[:-1] + bytes([reply[-1] ^ 1]))
     assert read_block(talk(board, bad), SECURITY) == good[:-1] + bytes([good[-1] ^ 1])
 
-    restless = MemoryLink(board, tamper=lambda count, reply: reply[:-1] + bytes([count]))
+    restless = MemoryLink(board, tamper=lambda count, reply: reply[:-1] + bytes([reply[-1] ^ count]))
     with pytest.raises(Garbled, match="noisy"):
         read_block(talk(board, restless), SECURITY)
 
