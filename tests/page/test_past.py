@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from tests.pace import until
 from .lab import Lab, opened
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, Route
 
 pytestmark = pytest.mark.system
 OLDEST = """async (key) => {
@@ -67,3 +68,37 @@ def test_a_node_has_its_history_beside_it(browser: Browser, lab: Lab) -> None:
         rows.filter(has_text="write").first.wait_for()
         rows.filter(has_text="verify").first.wait_for()
         assert all("hand" not in text for text in rows.all_inner_texts())
+
+
+def test_values_that_come_before_their_datasheet_are_shown_in_its_unit(browser: Browser, lab: Lab) -> None:
+    """Metres were shown, and drawn for two minutes, as millimetres: a page that is opened hears values first."""
+    uuid = lab.nodes["hand"].uuid
+    lab.measure("hand", rate=0.25)
+    heard: list[float] = []
+
+    def hear(frame: str | bytes) -> None:
+        message = json.loads(frame)
+        if message["type"] == "values" and f"{uuid}/2" in message["channels"]:
+            heard.extend(message["channels"][f"{uuid}/2"][1])
+
+    held: list[Route] = []
+
+    def keep(route: Route) -> None:
+        if heard:
+            route.continue_()
+        else:
+            held.append(route)
+
+    with opened(browser, lab, route=f"nodes/{uuid}/live") as page:
+        page.on("websocket", lambda socket: socket.on("framereceived", hear))
+        page.route("**/api/v1/nodes", keep)
+        heard.clear()
+        page.reload()
+        while not heard or not held:
+            page.wait_for_timeout(50)
+        for route in held:
+            route.continue_()
+        row = page.locator("table.values tbody tr").nth(1)  # channel 2, in mm
+        figure = row.locator(".figure")
+        figure.filter(has_text=re.compile(r"\d")).wait_for()
+        assert float(figure.inner_text()) in [pytest.approx(1000 * value, abs=0.01) for value in heard]

@@ -1,8 +1,7 @@
 // The last hour of a channel, as the station keeps it: fetched once, then only what is new. A reload loses nothing.
 
 import { get, paths } from "./api.js";
-import { now, ringOf, scaleOf } from "./state.js";
-import { toShown } from "./shapes.js";
+import { now, ringOf } from "./state.js";
 
 const HOUR = 3600; // s
 const FINE = 58; // s of which the station has bins of 10 ms, less what may pass until it answers
@@ -11,18 +10,14 @@ const LIVE = 120; // s that the live curves show
 const NOTHING = { bin: 1, time: [], low: [], high: [], count: [], invalid: [], lost: [], rate: null };
 const LISTS = ["time", "low", "high", "count", "invalid", "lost"];
 
-/** Bins of a channel between two moments, in the unit for people; none where nothing was measured. */
+/** Bins of a channel between two moments, SI; none where nothing was measured. */
 export async function between(uuid, number, from, until, points) {
-  let told;
   try {
-    told = await get(`${paths.past(uuid)}?channel=${number}&from=${from.toFixed(3)}&until=${until.toFixed(3)}&points=${points}`);
+    return await get(`${paths.past(uuid)}?channel=${number}&from=${from.toFixed(3)}&until=${until.toFixed(3)}&points=${points}`);
   } catch (error) {
     if (error.status === 404) return { ...NOTHING };
     throw error;
   }
-  const scale = scaleOf(uuid, number);
-  const [low, high] = [told.low, told.high].map((values) => values.map((value) => toShown(scale, value)));
-  return { ...told, low: scale.factor < 0 ? high : low, high: scale.factor < 0 ? low : high };
 }
 
 /** The hour of one channel, in bins of a second. */

@@ -4,7 +4,8 @@ import { h, fill, text } from "./dom.js";
 import { count, figure, hertz, number } from "./format.js";
 import { between, columnsOf, Hour, seed } from "./past.js";
 import { restless } from "./ring.js";
-import { changed, now, on, ringOf, state } from "./state.js";
+import { toShown } from "./shapes.js";
+import { changed, now, on, ringOf, scaleOf, state, streamedOf } from "./state.js";
 
 const FRAME = 50; // ms between two drawings
 const SHARE = 0.35; // of the time that drawing may take
@@ -204,9 +205,10 @@ export class LivePlot {
       const last = state.values.get(`${channel.uuid}/${channel.number}`);
       const silence = Math.max(0.5, 3 * (last?.period ?? 0));
       const [end, hour] = [from + columns * width, this.hour(channel)];
-      if (this.range) return columnsOf(this.zoomed.get(`${channel.uuid}/${channel.number}`) ?? hour.bins, from, end, columns, 3 / (hour.bins.rate || 10));
-      if (this.window > LIVE) return columnsOf(hour.bins, from, end, columns, 3 / (hour.bins.rate || 10));
-      return ringOf(channel.uuid, channel.number).bins(from, end, columns, silence);
+      const stretch = this.range ? (this.zoomed.get(`${channel.uuid}/${channel.number}`) ?? hour.bins) : this.window > LIVE ? hour.bins : null;
+      const course = stretch ? columnsOf(stretch, from, end, columns, 3 / (hour.bins.rate || 10)) : ringOf(channel.uuid, channel.number).bins(from, end, columns, silence);
+      const scale = scaleOf(channel.uuid, channel.number);
+      return course.map((value) => (typeof value === "number" ? toShown(scale, value) : value)); // null ends a line
     });
     frame.marks = frame.channels.map((channel) => [this.hour(channel).bins, left, right]);
     courses.forEach((course, index) => (frame.chart.series[index + 1].dash = restless(course) ? [] : dash(index)));
@@ -219,7 +221,7 @@ export class LivePlot {
       const place = frame.chart.cursor.left >= 0 ? Math.floor((frame.chart.posToVal(frame.chart.cursor.left, "x") - from) / width) : -1;
       text(frame.when, place >= 0 ? `at ${exact(from + place * width, width)}` : "");
       frame.channels.forEach((channel, index) => {
-        const last = state.values.get(`${channel.uuid}/${channel.number}`);
+        const last = streamedOf(channel.uuid, channel.number);
         const value = frame.values[index];
         text(value, place >= 0 ? there(courses[index], place, channel) : figure(last, channel));
         const hour = this.hour(channel);

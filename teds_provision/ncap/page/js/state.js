@@ -20,8 +20,8 @@ export const state = {
   virtual: [],
   profiles: [],
   names: [],
-  values: new Map(), // "uuid/channel" → {value, time, heard}
-  rings: new Map(), // "uuid/channel" → Ring
+  values: new Map(), // "uuid/channel" → {value, time, period}; SI, for its datasheet may come later than its values
+  rings: new Map(), // "uuid/channel" → Ring, SI
   runs: new Map(), // UUID → what provisioning said so far
   tapped: null, // {uuid, at}
   offset: 0, // station's clock less this one's, s
@@ -63,12 +63,18 @@ export const now = () => Date.now() / 1000 + state.offset;
 
 export const keyOf = (uuid, channel) => `${uuid}/${channel}`;
 
-/** The last value of a channel: what was streamed, or what the station told with the node. */
+/** The last value of a channel, in the unit for people: what was streamed, or what the station told with the node. */
 export function lastOf(uuid, channel) {
-  const streamed = state.values.get(keyOf(uuid, channel.number));
+  const streamed = streamedOf(uuid, channel.number);
   const told = channel.last ?? null;
   if (streamed && (!told || !(told.time > streamed.time))) return streamed;
   return told;
+}
+
+/** The last value of a channel that was streamed, in the unit for people. */
+export function streamedOf(uuid, number) {
+  const streamed = state.values.get(keyOf(uuid, number));
+  return streamed && { ...streamed, value: shapes.toShown(scaleOf(uuid, number), streamed.value) };
 }
 
 /** Whether a value is too old to be taken for the present one. */
@@ -230,12 +236,11 @@ const TAKERS = {
 function takeStream(key, times, values) {
   const [uuid, channel] = key.split("/");
   const ring = ringOf(uuid, channel);
-  const scale = scaleOf(uuid, Number(channel));
-  for (let index = 0; index < times.length; index++) ring.push(times[index], shapes.toShown(scale, values[index]) ?? NaN);
+  for (let index = 0; index < times.length; index++) ring.push(times[index], values[index] ?? NaN);
   state.received += times.length;
   if (!times.length) return;
   const time = times.at(-1);
-  const value = shapes.toShown(scale, values.at(-1));
+  const value = values.at(-1);
   const old = state.values.get(key);
   const period = old && time > old.time ? (time - old.time) / times.length : (old?.period ?? 0);
   state.values.set(key, { value, time, period, valid: value !== null });
