@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from teds_provision.links.can.bus import Bus
+from teds_provision.links.can.isotp import FUNCTIONAL, Frame, single
+from teds_provision.links.can.spec import parse_spec
+from teds_provision.protocol.messages.frames import IDENTIFY
 from tests.bench import make_station
 from tests.e2e.desk import Desk, Running, Station
 from tests.firmware import builds
@@ -94,6 +99,27 @@ def test_a_gripper_moves_and_lets_go_when_its_station_is_gone(desk: Desk) -> Non
     holds.process.kill()
     holds.end()
     until(lambda: servo(board)[-1]["servo"] == "off")
+
+
+def test_a_board_whose_frames_nobody_acknowledges_leaves_the_processor_to_others(desk: Desk) -> None:
+    """Its plug is out: the Announce stays with the controller, and a reply that is due waits behind it."""
+    board = powered(desk, LOAD, 3, TEDS_CAN_DEAF="1")
+    bus = Bus(parse_spec(desk.links.can))
+    try:
+        time.sleep(0.6)  # the Announce
+        bus.send(Frame(FUNCTIONAL | 0xF1, single(b"\x05" + IDENTIFY.encode())))
+        time.sleep(0.2)
+        before = seconds_of(board.process.pid)
+        time.sleep(1.5)
+        assert seconds_of(board.process.pid) - before < 0.5
+    finally:
+        bus.close()
+
+
+def seconds_of(pid: int) -> float:
+    """Of the processor, that a process has had."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def test_the_parts_for_nfc_and_bluetooth_compile() -> None:

@@ -89,6 +89,11 @@ int teds_zephyr_can_start(void)
     return failed < 0 ? failed : can_start(bus);
 }
 
+bool teds_zephyr_can_busy(void)
+{
+    return k_sem_count_get(&controller) == 0;
+}
+
 static bool send_due(teds_node *node)
 {
     bool moved = false;

@@ -16,6 +16,7 @@ static teds_node node;
 #define SECOND 1000000000u
 #define IDLE 1000000u /* ns: a key for the next Request is made where nothing is due before */
 #define LONGEST 500   /* ms between two looks: advertising, connections to drop */
+#define TAKEN 200     /* us between two looks while what is due waits for the controller: its plug may be out */
 
 /* Seconds and the rest apart: cycles × 10^9 would be more than 64 bits after five minutes at 64 MHz. */
 uint64_t teds_zephyr_now(void)
@@ -51,11 +52,23 @@ void teds_zephyr_event(uint8_t channel, uint64_t tick, const uint8_t *octets, bo
     teds_zephyr_wake();
 }
 
+static bool bus_is_taken(void)
+{
+#ifdef CONFIG_TEDS_NODE_CAN
+    return teds_zephyr_can_busy();
+#else
+    return false;
+#endif
+}
+
 static void wait_until(uint64_t due)
 {
     const uint64_t now = teds_zephyr_now();
     uint64_t ns = due <= now ? 0 : due - now;
     if (ns == 0) {
+        if (bus_is_taken()) {
+            (void)k_sem_take(&woken, K_USEC(TAKEN));
+        }
         return;
     }
     ns = ns < (uint64_t)LONGEST * 1000000u ? ns : (uint64_t)LONGEST * 1000000u;

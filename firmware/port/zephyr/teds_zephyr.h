@@ -37,6 +37,8 @@ int teds_zephyr_flash(teds_port *port);
 int teds_zephyr_can_start(void);
 /* Give the node what came and the controller what may leave; true where something moved. */
 bool teds_zephyr_can_work(teds_node *node);
+/* A frame is with the controller, which calls back when it has left. */
+bool teds_zephyr_can_busy(void);
 int teds_zephyr_nfc_start(void);
 bool teds_zephyr_nfc_work(teds_node *node);
 int teds_zephyr_ble_start(teds_config *config); /* and say the address that a tap tells */

@@ -163,6 +163,9 @@ int can_send(const struct device *dev, const struct can_frame *frame, k_timeout_
 {
     teds_can_frame out;
     (void)timeout;
+    if (getenv("TEDS_CAN_DEAF") != NULL) { /* nobody acknowledges: the controller sends it again and again */
+        return 0;
+    }
     memset(&out, 0, sizeof out);
     out.identifier = frame->id;
     out.length = can_dlc_to_bytes(frame->dlc);

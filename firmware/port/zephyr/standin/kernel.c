@@ -86,6 +86,15 @@ void k_sem_give(struct k_sem *sem)
     (void)pthread_mutex_unlock(&sem->lock);
 }
 
+unsigned int k_sem_count_get(struct k_sem *sem)
+{
+    unsigned count;
+    (void)pthread_mutex_lock(&sem->lock);
+    count = sem->count;
+    (void)pthread_mutex_unlock(&sem->lock);
+    return count;
+}
+
 int k_msgq_put(struct k_msgq *queue, const void *data, k_timeout_t timeout)
 {
     int failed = 0;

@@ -54,6 +54,7 @@ struct k_sem {
     struct k_sem name = {PTHREAD_MUTEX_INITIALIZER, PTHREAD_COND_INITIALIZER, initial, most}
 int k_sem_take(struct k_sem *sem, k_timeout_t timeout);
 void k_sem_give(struct k_sem *sem);
+unsigned int k_sem_count_get(struct k_sem *sem);
 
 struct k_msgq {
     pthread_mutex_t lock;
