@@ -1,8 +1,8 @@
 """From a type to its JSON schema (2020-12, as OpenAPI 3.1 takes it), and from JSON to a value of that type.
 
 A value is checked against the schema itself, so that a body is refused exactly where the published description forbids
-it. The subset is what the types of this room need: type, enum, const, pattern, minimum, maximum, minItems, items,
-properties, required, additionalProperties, anyOf, oneOf.
+it. The subset is what the types of this room need: type, enum, const, pattern, minLength, maxLength, minimum, maximum,
+minItems, items, properties, required, additionalProperties, anyOf, oneOf.
 """
 
 from __future__ import annotations
@@ -146,6 +146,9 @@ def fit(schema: Schema, value: Any, where: str = "") -> Any:
         if not least <= value <= most:
             raise BadRequest(f"{where!r} must be between {least:g} and {most:g}, not {_shown(value)}.")
         return int(value) if kind == "integer" else float(value)
+    if kind == "string" and not schema.get("minLength", 0) <= len(value) <= schema.get("maxLength", math.inf):
+        least, most = schema.get("minLength", 0), schema.get("maxLength", math.inf)
+        raise BadRequest(f"{where!r} must have {least} to {most} characters, not {len(value)}.")
     if kind == "string" and not re.search(schema.get("pattern", "").replace("$", r"\Z"), value):
         raise BadRequest(f"{where!r} must match {schema['pattern']}, unlike {_shown(value)}.")
     if kind is None and kinds:

@@ -247,7 +247,7 @@ def _terms(choice: Choice) -> str:
     if choice.uuid is not None:
         terms += f" AND uuid = x'{choice.uuid.hex()}'"
     if choice.act is not None:
-        terms += " AND act = '" + choice.act.replace("'", "''") + "'"
+        terms += " AND act = '" + choice.act.replace("'", "''").replace("\0", "") + "'"
     if choice.text:
         part = _like(choice.text)
         columns = ("act", "outcome", "detail", "who", "lower(hex(uuid))")

@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import json
 import re
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,15 @@ def test_a_body_is_refused_exactly_where_its_published_schema_forbids_it(body: t
     except BadRequest:
         taken = False
     assert taken == published
+
+
+@pytest.mark.parametrize("match", ["", "a", "\u00e4" * 1000, "a" * 1001])
+def test_a_text_is_as_long_as_its_published_schema_lets_it_be(match: str) -> None:
+    published = jsonschema.Draft202012Validator(schema_of(bodies.NewMeasurement, {})).is_valid({"match": match})
+    assert published == (0 < len(match) <= 1000)
+    said = f"'match' must have 1 to 1000 characters, not {len(match)}."
+    with nullcontext() if published else pytest.raises(BadRequest, match=said):
+        assert read(bodies.NewMeasurement, json.dumps({"match": match}).encode()).match == match
 
 
 def test_the_end_of_a_pattern_is_the_end_of_the_text() -> None:

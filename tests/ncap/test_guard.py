@@ -16,10 +16,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from starlette.requests import Request
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from teds_provision.ncap.web.guard import Guard, Message, Receive, Refusal, Scope, Send
+from teds_provision.errors import StoreFailure
+from teds_provision.ncap.web.answers import answer_error
+from teds_provision.ncap.web.guard import CALLER, Caller, Guard, Message, Receive, Refusal, Scope, Send
 from teds_provision.ncap.web.tokens import Tokens
 from tests.e2e.desk import PASSPHRASE, Desk
 from tests.ncap.service import Answer, Service, virtual
@@ -93,6 +96,8 @@ def refusals(port: int) -> list[tuple[str, str, str, dict[str, str | None], Any,
         ("a member twice, deeper", "POST", "/api/v1/groups", JSON,
          '{"name": "x", "uuids": [{"a": 1, "a": 2}]}', 422, "bad-request"),
         ("a number of thousands of digits", "GET", f"/api/v1/log?limit={'1' * 5000}", {}, None, 422, "usage"),
+        ("a moment before all years", "GET", "/api/v1/log?since=0001-01-01T00:00:00%2B23:59", {}, None, 422, "usage"),
+        ("an expression of no length", "POST", "/api/v1/measurements", JSON, '{"match": ""}', 422, "bad-request"),
         ("less than no node", "GET", "/api/v1/nodes?offset=-1", {}, None, 422, "usage"),
         ("more than a thousand nodes", "GET", "/api/v1/nodes?limit=1001", {}, None, 422, "usage"),
         ("the readers over the net", "GET", "/api/v1/lend", {}, None, 422, "refused"),
@@ -172,6 +177,25 @@ def test_a_read_only_token_reads_and_changes_nothing(service: Service) -> None:
     ):
         answer = service.raw(method, path, {**bearer, **JSON}, "{}")
         assert (answer.status, answer.code) == (403, "read-only"), (method, path)
+
+
+def test_an_act_that_nobody_wrote_is_no_failure_of_the_store(service: Service, bearer: dict[str, str | None]) -> None:
+    answer = service.raw("GET", "/api/v1/log?act=%00", bearer)
+    assert (answer.status, answer.json["entries"]) == (200, [])
+
+
+def test_a_read_only_token_learns_no_folder_from_an_error() -> None:
+    error = StoreFailure(
+        "The store /home/me/bench/store.sqlite3 cannot be used: the disk is full.", hint="See /api/v1/x."
+    )
+
+    def told(*, read_only: bool) -> dict[str, str]:
+        scope = {"type": "http", CALLER: Caller("robot", "script", read_only)}
+        return dict(json.loads(bytes(answer_error(Request(scope), error).body))["error"])
+
+    assert "/home/me/bench/" in told(read_only=False)["message"]
+    assert told(read_only=True)["message"] == "The store store.sqlite3 cannot be used: the disk is full."
+    assert told(read_only=True)["hint"] == "See /api/v1/x."
 
 
 def test_a_token_that_is_removed_is_refused_at_once(service: Service) -> None:

@@ -26,7 +26,8 @@ from teds_provision.errors import (
     StoreFailure,
     TedsProvisionError,
 )
-from teds_provision.ncap.web.guard import Refusal
+from teds_provision.ncap.sinks import for_readers
+from teds_provision.ncap.web.guard import CALLER, Caller, Refusal
 from teds_provision.protocol.messages.frames import Reason
 
 Shape = TypeVar("Shape")
@@ -57,11 +58,12 @@ def status_of(error: TedsProvisionError) -> int:
     return next((status for kind, status in _STATUS if isinstance(error, kind)), _OTHERS)
 
 
-def answer_error(_request: Request, error: Exception) -> Response:
+def answer_error(request: Request, error: Exception) -> Response:
     """A TedsProvisionError as an answer, with the words of the command line."""
     assert isinstance(error, TedsProvisionError)
     problem = {"code": error.code, "message": error.message, "hint": error.hint}
-    return JSONResponse({"error": problem}, status_of(error))
+    caller: Caller = request.scope[CALLER]
+    return JSONResponse({"error": for_readers(problem) if caller.read_only else problem}, status_of(error))
 
 
 def answer_refusal(_request: Request, refusal: Exception) -> Response:

@@ -144,7 +144,7 @@ class Resources:
             raise UsageFailure(f"text may have at most {LONGEST_TEXT} characters.")
         failed = words.get("failed", "0") not in ("0", "", "false")
         choice = Choice(act=words.get("act") or None, failed=failed, text=text or None, before=before)
-        since = _moment(words["since"]) if words.get("since") else None
+        since = _moment("since", words["since"]) if words.get("since") else None
         return _shown(request, await reading(self._log, choice, limit, words.get("uuid"), since))
 
     def _log(self, choice: Choice, limit: int, uuid: str | None, since: str | None) -> dict[str, Any]:
@@ -407,16 +407,16 @@ def _unix(request: Request, name: str) -> float | None:
     text = request.query_params.get(name)
     if not text:
         return None
-    return float(text) if _UNIX.fullmatch(text) else datetime.fromisoformat(_moment(text)).timestamp()
+    return float(text) if _UNIX.fullmatch(text) else datetime.fromisoformat(_moment(name, text)).timestamp()
 
 
-def _moment(text: str) -> str:
-    """``since`` as the log writes moments: ISO 8601 with a zone, or unix seconds."""
+def _moment(name: str, text: str) -> str:
+    """A parameter as the log writes moments: ISO 8601 with a zone, or unix seconds."""
     try:
         at = datetime.fromtimestamp(float(text), UTC) if _UNIX.fullmatch(text) else datetime.fromisoformat(text)
+        return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))  # a zone may leave the years that there are
     except (ValueError, OverflowError, OSError):
-        raise UsageFailure("since must be a time such as 2026-11-22T10:00:00Z, or unix seconds.") from None
-    return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))
+        raise UsageFailure(f"{name} must be a time such as 2026-11-22T10:00:00Z, or unix seconds.") from None
 
 
 def _sentence(outcome: str, detail: dict[str, Any]) -> str:
