@@ -90,15 +90,15 @@ def parameter_of(path: str, option: str) -> str:
 def anchored(values: dict[str, Any], folder: Path, above: str = "") -> dict[str, Any]:
     """The values with every path from the root on, relative ones from ``folder``: commands are typed anywhere."""
     return {
-        name: anchored(value, folder, name) if isinstance(value, dict) else _whole(name, value, folder, above)
+        name: anchored(value, folder, name) if isinstance(value, dict) else _anchored_value(name, value, folder, above)
         for name, value in values.items()
     }
 
 
-def _whole(name: str, value: Any, folder: Path, above: str) -> Any:
+def _anchored_value(name: str, value: Any, folder: Path, above: str) -> Any:
     plain = name.replace("_", "-")
     if isinstance(value, list):
-        return [_whole(name, each, folder, above) for each in value]
+        return [_anchored_value(name, each, folder, above) for each in value]
     if not isinstance(value, str) or not value:
         return value
     if above == "brokers":

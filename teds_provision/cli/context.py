@@ -188,7 +188,7 @@ class App:
     def ask(self, question: str) -> bool:
         """Ask a person, yes or no; nothing that a node or a file brought steers the terminal."""
         self.live_line()
-        return click.confirm(_asked(question), err=True)
+        return click.confirm(_as_question(question), err=True)
 
     def asks_retype(self, *, yes: bool) -> Callable[[bytes, tuple[str, ...]], None] | None:
         """Who is asked before a board becomes one of another type: a person at a terminal who answered nothing yet."""
@@ -206,7 +206,7 @@ class App:
         """Ask a person whether a key counts: yes, no, or its digits (32 to 64, or a scanned label), held against it."""
         self.live_line()
         while True:
-            asked = _asked(f"{question} [y/N], or type the first 32 digits of its key")
+            asked = _as_question(f"{question} [y/N], or type the first 32 digits of its key")
             said = click.prompt(asked, default="n", show_default=False, err=True).strip()
             if said.lower() in ("y", "yes", "n", "no"):
                 return said.lower().startswith("y")
@@ -244,7 +244,7 @@ class App:
                 hint=f"Pass it through a file descriptor: {instead}.",
             )
         self.live_line()
-        answer: str = click.prompt(_asked(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
+        answer: str = click.prompt(_as_question(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
         return answer
 
     # -- the station -----------------------------------------------------------------------------------------------
@@ -282,7 +282,7 @@ def say(text: str) -> None:
         sys.stderr.flush()
 
 
-def _asked(question: str) -> str:
+def _as_question(question: str) -> str:
     """A question as it is shown, with room for what click puts behind it."""
     return folded(sanitize(question), sys.stderr, spare=len(_BEHIND))
 

@@ -219,7 +219,7 @@ def run(
 
     Prints one line when the links are up, then one line per actuator change.
     """
-    _check(len(folders), source, **links)
+    _check_options(len(folders), source, **links)
     delays = node_room.virtual.Delays(crypto_delay / 1000, flash_delay / 1000)
     lines, pulse = ActuatorLines(app), node_room.pulse.Pulse()
     make = _boards(app, lines, source, battery)
@@ -248,7 +248,7 @@ def run(
             part.stop()
 
 
-def _check(count: int, source: str, *, nfc: str | None, can: str | None, ble: str | None, **_: Any) -> None:
+def _check_options(count: int, source: str, *, nfc: str | None, can: str | None, ble: str | None, **_: Any) -> None:
     """Raise UsageFailure where the options do not go together."""
     if not nfc and not can and not ble:
         raise UsageFailure(

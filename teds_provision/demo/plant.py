@@ -88,7 +88,7 @@ class _Story:
                 self.server = demo.stack.enter_context(made)
                 step.detail = f"port {self.server.port}, as user {cluster.runs_as()}"
         demo.say("Station north has the owner's CA key and makes the roster; west and south ask to be members.")
-        self._found()
+        self._set_up()
         demo.say("West, on the line, provisions a board; its key is shared with south, which never met the board.")
         demo.uuid = demo.stack.enter_context(_node(demo, "board", PROFILE))
         provision_over(demo, self["west"], "can", demo.uuid, BuildOrder(PROFILE, name="joint 1"))
@@ -112,7 +112,7 @@ class _Story:
 
     # -- parts -------------------------------------------------------------------------------------------------------
 
-    def _found(self) -> None:
+    def _set_up(self) -> None:
         demo = self.demo
         with demo.steps.step("init") as step:
             north, _ = initialise(

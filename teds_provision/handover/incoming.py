@@ -227,7 +227,7 @@ def plan_import(station: Station, source: Source, now: datetime | None = None) -
         return _before(row, content)
     check_times(bundle, now or datetime.now(UTC))
     _check_certified(station, opened)
-    denied, passed_over = _judged(station, opened)
+    denied, passed_over = _new_revocations(station, opened)
     nodes = tuple(_Judge(station, denied, bundle).each(bundle.nodes))
     if nodes and all(node.decision == "refused" for node in nodes):
         raise NothingTaken(bundle, nodes)
@@ -237,7 +237,7 @@ def plan_import(station: Station, source: Source, now: datetime | None = None) -
 _PassedOver = tuple[tuple[Statement, str], ...]
 
 
-def _judged(station: Station, opened: OpenedBundle) -> tuple[tuple[Statement, ...], _PassedOver]:
+def _new_revocations(station: Station, opened: OpenedBundle) -> tuple[tuple[Statement, ...], _PassedOver]:
     """The revocations of the bundle that are new here: those that count, and those that do not, with why."""
     news = [one for one in opened.revocations if station.policy.revocation(one.uuid) is None]
     judged = [(one, why_not(station, one, opened.bundle)) for one in news]

@@ -95,7 +95,7 @@ class HeardStream:
         with self.mapping:
             messages = self.receiver.begin(start)
             blocks = self.interpreter.blocks(messages)
-        self._good(messages, blocks)
+        self._hand_on(messages, blocks)
 
     def flush(self, now: float) -> None:
         """Open and hand on what has waited for GATHER."""
@@ -116,7 +116,7 @@ class HeardStream:
             if messages:
                 self._note_arrival(came, messages)
             blocks = self.interpreter.blocks(messages)
-        self._good(messages, blocks)
+        self._hand_on(messages, blocks)
 
     def _note_arrival(self, came: list[tuple[bytes, int]], messages: list[Message]) -> None:
         """Tell the clock which message came soonest after its samples; of a batch with drops the last one will do."""
@@ -128,7 +128,7 @@ class HeardStream:
                     at, tick, soonest = arrived, message.tick, arrived - message.tick
         self.clock.arrival(tick + self._last_instant, at)
 
-    def _good(self, messages: list[Message], blocks: list[Block]) -> None:
+    def _hand_on(self, messages: list[Message], blocks: list[Block]) -> None:
         """Messages whose tag and time are right."""
         if messages:
             self.heard = time.monotonic()

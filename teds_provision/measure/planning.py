@@ -75,7 +75,7 @@ class BusShare:
         """The bus as one node sees it; ``sharing`` leaves the nodes that are still to come their fair part."""
         used = sum(load for key, load in self.taken.items() if key != uuid)
         if sharing:
-            used += self._kept(uuid, MOST_LOAD - used)
+            used += self._kept_for_others(uuid, MOST_LOAD - used)
         return replace(self.time, taken=used)
 
     def want(self, uuid: bytes, load: float) -> None:
@@ -118,7 +118,7 @@ class BusShare:
             self.taken.pop(uuid, None)
         self.gone(uuid)
 
-    def _kept(self, uuid: bytes, room: float) -> float:
+    def _kept_for_others(self, uuid: bytes, room: float) -> float:
         """What is kept for others of ``room``: whoever wants less than an equal part gets it, the rest share evenly."""
         coming = [self.wanted.get(key, MOST_LOAD) for key in self.expected - {uuid} - self.taken.keys()]
         left, level, kept = room, math.inf, len(coming) + 1

@@ -120,7 +120,7 @@ class TopicActuators:
     def _apply(self, command: Command) -> None:
         actuator = self._actuators[command.channel]
         one = actuator.interpreter
-        self._left(command)
+        self._seconds_left(command)
         value = one.unit.from_si(command.value)
         beyond = one.beyond(value)
         if beyond:
@@ -132,7 +132,7 @@ class TopicActuators:
             self._send(command, actuator, octets)
         self._say(command.channel, actuator, octets)
 
-    def _left(self, command: Command) -> float:
+    def _seconds_left(self, command: Command) -> float:
         """Seconds until a set point is too old; raises LinkFailure where it is."""
         age = time.monotonic() - command.received
         if age > self._dead_man / 1000:
@@ -140,7 +140,7 @@ class TopicActuators:
         return self._dead_man / 1000 - age
 
     def _send(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
-        self._left(command)
+        self._seconds_left(command)
         if self._unsure:
             self._trusted.node.send(CLOCK, "to tell its time", within=self._dead_man / 1000)
             self._unsure = False
@@ -173,7 +173,7 @@ class TopicActuators:
 
     def _write(self, command: Command, octets: bytes) -> None:
         words = write_data_set(command.channel, octets)
-        self._trusted.node.send(words, "to set the actuator", within=self._left(command))
+        self._trusted.node.send(words, "to set the actuator", within=self._seconds_left(command))
 
     def _claim(self, number: int, actuator: _Actuator) -> None:
         actuator.driver = None
@@ -204,7 +204,7 @@ class TopicActuators:
             key = self._trusted.node.message_key
             actuator.driver = Driver(layout, reply, key, dead_man=self._dead_man, after=self._last_drive)
             self._last_drive = reply.run
-        left = round(self._left(command) * 1e9)
+        left = round(self._seconds_left(command) * 1e9)
         with self._mapping:
             now = self._clock.ticks_at(time.monotonic_ns())
         message = actuator.driver.seal((octets,), now, hold=left)

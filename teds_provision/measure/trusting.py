@@ -49,15 +49,15 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         unit=channel.si_unit,
         units=channel.units,
         shown_unit=channel.shown.text,
-        low=_known(channel.low),
-        high=_known(channel.high),
-        uncertainty=_known(channel.stated_uncertainty),
+        low=_if_finite(channel.low),
+        high=_if_finite(channel.high),
+        uncertainty=_if_finite(channel.stated_uncertainty),
         calibrated=calibrated.date().isoformat() if calibrated else None,
         due=due.date().isoformat() if due else None,
         overdue=channel.overdue(datetime.now(UTC)),
         fingerprint=fingerprint,
         sample_form=channel.sample.name if channel.sample else "",
-        own_period=_known(channel.period),
+        own_period=_if_finite(channel.period),
         calibration=channel.calibration,
         period=None if channel.kind == Kind.EVENT_SENSOR else period,
         vector=next((group for group in sheet.meta.vectors if channel.number in group), ()),
@@ -68,10 +68,10 @@ def _deviation(of_type: ChannelProfile | None, channel: Channel) -> float | None
     """Standard deviation in SI units; a profile of another unit than the datasheet's says nothing of it."""
     if of_type is None or of_type.units != channel.units or of_type.calibration.standard_deviation is None:
         return None
-    return _known(of_type.unit.difference_to_si(of_type.calibration.standard_deviation))
+    return _if_finite(of_type.unit.difference_to_si(of_type.calibration.standard_deviation))
 
 
-def _known(number: float) -> float | None:
+def _if_finite(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 

@@ -89,12 +89,12 @@ class Names:
             topics = self._topics if self._made_of == changes else None
         if topics is not None:
             return topics
-        topics = self._made(station_facts(self._station))
+        topics = self._learn_topics(station_facts(self._station))
         with self._guard:
             self._topics, self._made_of = topics, changes
         return topics
 
-    def _made(self, station: StationFacts) -> Topics:
+    def _learn_topics(self, station: StationFacts) -> Topics:
         topics = Topics(station)
         for uuid in self._roster.uuids():
             called, unverified = self._roster.called(uuid)
@@ -111,5 +111,5 @@ class Names:
             return now
         changes, made = self._roster.changes, self._of_running
         if made is None or made[0] is not facts or made[1] != changes:
-            made = self._of_running = (facts, changes, self._made(facts))
+            made = self._of_running = (facts, changes, self._learn_topics(facts))
         return made[2]

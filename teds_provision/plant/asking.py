@@ -312,7 +312,7 @@ def by_office(
     if earlier is not None:
         request = open_request(earlier.request, lambda kid: station.point)
     else:
-        request = _asked(station, node, keys, wanted)
+        request = _new_request(station, node, keys, wanted)
     answer = office.ask(request)
     if answer is None:
         raise NotAnswered(
@@ -392,7 +392,7 @@ def _earlier(station: Station, wanted: Wanted) -> SignRequestRow | None:
     return None
 
 
-def _asked(station: Station, node: Conversation, keys: NodeKeys, wanted: Wanted) -> SignRequest:
+def _new_request(station: Station, node: Conversation, keys: NodeKeys, wanted: Wanted) -> SignRequest:
     """A new request, which the board signed; kept before anybody sees it."""
     nonce, key = os.urandom(NONCE_OCTETS), station.credentials().key
     blocks = wanted.image.unsigned_blocks()

@@ -59,7 +59,7 @@ def review(station: Station, roster: Roster, now: datetime) -> Review | None:
     beyond = _beyond(station, roster)
     of = 0
     for page in _pages(station):
-        keys = _held(station, page)
+        keys = _keys_held(station, page)
         of += len(keys)
         _mark(station, roster, keys, beyond, now, ours)
     found = Review(now.isoformat(), named, of, _alone(station, roster))
@@ -93,7 +93,7 @@ def _pages(station: Station) -> Iterable[list[bytes]]:
         yield page
 
 
-def _held(station: Station, page: Sequence[bytes]) -> dict[bytes, KeyRecord]:
+def _keys_held(station: Station, page: Sequence[bytes]) -> dict[bytes, KeyRecord]:
     """The key of each node: the active one, or the newest of those that no session has proven yet (copies)."""
     found: dict[bytes, KeyRecord] = {}
     for key in station.keys.of_page(page):
@@ -192,7 +192,7 @@ def _alone(station: Station, roster: Roster) -> int:
     count, after = 0, b""
     while page := station.plant.tables.claimed_nodes(after, _PAGE):
         after = page[-1]
-        held = _held(station, page).keys()
+        held = _keys_held(station, page).keys()
         seen = views(station, roster, page)
         count += sum(not seen[uuid].held and bool(seen[uuid].left) and uuid not in held for uuid in page)
     return count

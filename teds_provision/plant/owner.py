@@ -39,7 +39,7 @@ from teds_provision.store.tables.plant import PlantRecord
 FIRST_ROLES: frozenset[Role] = frozenset({"keeper", "sign", "line", "base"})
 
 
-def _whole(moment: datetime) -> datetime:
+def _to_the_second(moment: datetime) -> datetime:
     return moment.replace(microsecond=0)
 
 
@@ -48,7 +48,7 @@ def draft_first(station: Station, name: str, days: timedelta = USUAL) -> Roster:
     if station.plant.joined is not None:
         raise PolicyRefused("This station belongs to a registry already.", hint="See: teds-provision registry status")
     own = Member(station.name, station.point, station.identity.signature, frozenset(FIRST_ROLES))
-    moment = _whole(now())
+    moment = _to_the_second(now())
     return Roster(str(uuid4()), name, 1, "", moment, moment + days, (own,))
 
 
@@ -98,7 +98,7 @@ def create(station: Station, name: str, days: timedelta = USUAL) -> tuple[Roster
 def following(station: Station, **change: Any) -> Roster:
     """The version after the one that counts here, not signed yet; dates as they are but for ``created``."""
     own = require_roster(station)
-    created = max(_whole(now()), own.created)
+    created = max(_to_the_second(now()), own.created)
     change.setdefault("expires", max(own.expires, created + timedelta(days=1)))
     return replace(own, version=own.version + 1, previous=own.hash, created=created, hash="", octets=b"", **change)
 
@@ -205,7 +205,7 @@ def unshared(station: Station, what: tuple[str, str]) -> Roster:
 
 def renewed(station: Station, days: timedelta) -> Roster:
     """Draft the same roster with a new end."""
-    return following(station, expires=max(_whole(now()), require_roster(station).created) + days)
+    return following(station, expires=max(_to_the_second(now()), require_roster(station).created) + days)
 
 
 def require_member(roster: Roster, name: str) -> Member:

@@ -410,9 +410,9 @@ def _due(
     shares = [share for share in roster.share if receiver in sharing.receivers(roster, me, share)]
     clear: list[bytes] = []
     disputed: list[bytes] = []
-    own = _seen(views, tables.unshared(receiver))
+    own = _with_views(views, tables.unshared(receiver))
     gone = quiet or roster.removed  # else whoever made a key shares it
-    others = _seen(views, tables.unshared(receiver, imported=True)) if gone else iter(())
+    others = _with_views(views, tables.unshared(receiver, imported=True)) if gone else iter(())
     mine = (one for one in others if sharing.sharer(roster, one[3], (one[1], one[2]), quiet) == me)
     for uuid, _, _, view in chain(own, mine):
         if sharing.shares_any(shares, view, me) and not sharing.gave_away(view, receiver):
@@ -420,7 +420,7 @@ def _due(
     return clear, disputed
 
 
-def _seen(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterator[tuple[bytes, int, str, View]]:
+def _with_views(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterator[tuple[bytes, int, str, View]]:
     """Nodes with what the plant says of them, a page at a time."""
     for page in pages(rows):
         seen = views([uuid for uuid, _, _ in page])

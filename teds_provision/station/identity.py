@@ -57,7 +57,7 @@ class Identity:
             raise NotFound(f"There is no base station in {self._store.home} yet.", hint="Make one: teds-provision init")
         return facts
 
-    def _made(self, value: bytes | None) -> bytes:
+    def _required(self, value: bytes | None) -> bytes:
         if value is None:
             raise NotFound(f"init was not finished in {self._store.home}.", hint="Finish it: teds-provision init")
         return value
@@ -70,7 +70,7 @@ class Identity:
     @property
     def point(self) -> bytes:
         """P(base station), 65 octets."""
-        return self._made(self._facts.point)
+        return self._required(self._facts.point)
 
     @property
     def fingerprint(self) -> str:
@@ -80,12 +80,12 @@ class Identity:
     @property
     def ca(self) -> bytes:
         """P(CA) of the owner, 65 octets."""
-        return self._made(self._facts.ca)
+        return self._required(self._facts.ca)
 
     @property
     def signature(self) -> bytes:
         """SIG104: the CA's signature over the station's key, 64 octets."""
-        return self._made(self._facts.signature)
+        return self._required(self._facts.signature)
 
     @property
     def keystore(self) -> str:
@@ -132,7 +132,7 @@ class Identity:
 
     def _certificate(self, facts: Facts, ca: bytes, point: bytes) -> bytes | None:
         if (ca, point) == (facts.ca, facts.point):
-            return self._made(facts.signature)
+            return self._required(facts.signature)
         return self._store.certificate(keys.fingerprint(ca), keys.fingerprint(point))
 
     def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
@@ -147,7 +147,7 @@ class Identity:
     def signature_under(self, ca: bytes) -> bytes:
         """SIG104 of ``ca`` over this station's key; raises PolicyRefused where there is none."""
         facts = self._facts
-        signature = self._certificate(facts, ca, self._made(facts.point))
+        signature = self._certificate(facts, ca, self._required(facts.point))
         if signature is None:
             raise PolicyRefused(
                 f"This station is not certified by the CA {keys.fingerprint(ca)[:16]}.",

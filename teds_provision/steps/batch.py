@@ -133,7 +133,7 @@ class Boards:
         self._station, self._request, self._reporter = station, request, reporter
         self._links = replace(links, via_chosen=True)  # a new board is tapped, unless a bus is named
         self.line = line
-        _check(request, links)
+        _require_consistent(request, links)
         check_report(request.report)
         self.node = station.nodes.resolve(request.node) if request.node is not None else None
         wanted = line.base if line is not None else request.order
@@ -477,7 +477,7 @@ def _progress(station: Station, request: Request, order: BuildOrder) -> Progress
     return Progress(station.home, sheet)
 
 
-def _check(request: Request, links: LinkSettings) -> None:
+def _require_consistent(request: Request, links: LinkSettings) -> None:
     if request.node is not None and request.several:
         raise UsageFailure(
             "A node is named, and many are asked for.", hint="Name the node, or say --watch, --batch or --all."

@@ -357,13 +357,13 @@ class Progress:
         self.sheet = sheet
         name = hashlib.sha256(str(sheet.path.resolve()).encode()).hexdigest()[:32]
         self._path = home / FOLDER / f"{name}.json"
-        self._there = kept = self._kept()
-        self.rows = {row.number: self._of(row, kept.get(str(row.number))) for row in sheet.rows}
+        self._there = kept = self._read_progress()
+        self.rows = {row.number: self._attempted(row, kept.get(str(row.number))) for row in sheet.rows}
         self.worst: TedsProvisionError | None = None
         self._tried: frozenset[int] = frozenset()
         self._turned_away: dict[int, str] = {}
 
-    def _kept(self) -> dict[str, Any]:
+    def _read_progress(self) -> dict[str, Any]:
         try:
             told = json.loads(read_limited(self._path, _MAX_OCTETS, "progress of a sheet", follow=False))
         except (NotFound, ValueError):
@@ -372,7 +372,7 @@ class Progress:
         return rows if isinstance(rows, dict) else {}
 
     @staticmethod
-    def _of(row: Row, kept: Any) -> Attempted:
+    def _attempted(row: Row, kept: Any) -> Attempted:
         if not isinstance(kept, dict) or kept.get("digest") != row.digest:
             return Attempted(row.digest)
         try:
@@ -403,9 +403,9 @@ class Progress:
 
     def _read_again(self, but: Collection[int] = ()) -> None:
         """Take in the rows that another run has changed since this one looked."""
-        before, self._there = self._there, self._kept()
+        before, self._there = self._there, self._read_progress()
         self.rows |= {
-            row.number: self._of(row, self._there[key])
+            row.number: self._attempted(row, self._there[key])
             for row in self.sheet.rows
             if row.number not in but and (key := str(row.number)) in self._there and self._there[key] != before.get(key)
         }

@@ -138,7 +138,7 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
                 "--adopt signs the datasheet that the board brought.", hint="Leave --profile and --calibration out."
             )
         return Prepared(order)
-    wanted = _whole(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
+    wanted = _absolute_profile(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
     if order.calibration is not None and not order.calibration.is_file():
         raise NotFound(f"There is no calibration file {order.calibration}.")
     if wanted is None:
@@ -149,7 +149,7 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
     calibrations = _from_file(order, profile)
     if calibrations is None:
         return Prepared(order, profile, passed=passed)
-    made = _made(profile, _NOBODY, calibrations, order.name, 2007)
+    made = _built_of(profile, _NOBODY, calibrations, order.name, 2007)
     trial = Image(_NOBODY, dict(made.blocks))
     warnings = guard(station, trial, None, order.accept_calibration, calibrations, profile, record=False)
     return Prepared(order, profile, calibrations, merged(warnings), passed)
@@ -225,7 +225,7 @@ def compose(
     Raises UsageFailure (no profile known), BadData.
     """
     order = prepared.order
-    wanted = _whole(order.profile) or _known_profile(station, uuid)
+    wanted = _absolute_profile(order.profile) or _known_profile(station, uuid)
     if wanted is None:
         raise no_profile(uuid)
     profile = prepared.profile or _load(station, wanted)
@@ -236,7 +236,7 @@ def compose(
         calibrations, warnings = _kept_calibrations(order, has, profile)
     record = station.nodes.get(uuid)
     kept = order.name or name or (record.name if as_known and record is not None else None)
-    made, digest = _made(profile, uuid, calibrations, kept, edition), digest_of(profile)
+    made, digest = _built_of(profile, uuid, calibrations, kept, edition), digest_of(profile)
     before = record.profile_digest if record is not None and record.profile == wanted else None
     changed = order.profile is None and before is not None and before != digest
     if changed:
@@ -247,13 +247,13 @@ def compose(
 
 def digest_of(profile: Profile) -> str:
     """SHA-256 (hex) of what a profile says, with all that it extends: of the TEDS that it gives, and its demands."""
-    blocks = _made(profile, _NOBODY, {}, None, 2007).blocks
+    blocks = _built_of(profile, _NOBODY, {}, None, 2007).blocks
     said = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]
     demands = [repr(one.calibration) for one in profile.channels]
     return hashlib.sha256(json.dumps([said, demands]).encode()).hexdigest()
 
 
-def _whole(profile: str | None) -> str | None:
+def _absolute_profile(profile: str | None) -> str | None:
     """A name as it is, a path from the root on: the next command may stand in another folder."""
     return profile if profile is None or is_profile_name(profile) else str(Path(profile).absolute())
 
@@ -270,7 +270,7 @@ def _kept_calibrations(
     kept = teds_calibrations(has)
     if not kept:
         return {}, ()
-    require_fit(kept, has, Image(_NOBODY, dict(_made(profile, _NOBODY, {}, None, 2007).blocks)), profile)
+    require_fit(kept, has, Image(_NOBODY, dict(_built_of(profile, _NOBODY, {}, None, 2007).blocks)), profile)
     numbers = ", ".join(map(str, kept))
     return kept, (
         f"Channel {numbers} keeps its calibration."
@@ -332,7 +332,7 @@ def guard(
         return ()
     old = has.unsigned_blocks() if has is not None else None
     findings = guarding.check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
-    errors = [_said(finding) for finding in findings if finding.severity == "error"]
+    errors = [_finding_text(finding) for finding in findings if finding.severity == "error"]
     if errors and accepted is None:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
         raise PolicyRefused(
@@ -341,7 +341,7 @@ def guard(
         )
     if errors and record:
         station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
-    return merged(tuple(_said(one) for one in findings if one.severity == "error" or one.code not in expected))
+    return merged(tuple(_finding_text(one) for one in findings if one.severity == "error" or one.code not in expected))
 
 
 def _is_calibrated(*images: Image | None) -> bool:
@@ -386,7 +386,7 @@ def _joined(head: str, numbers: list[int], rest: str) -> str:
     return f"{head}s {told}{rest}"
 
 
-def _said(finding: GuardFinding) -> str:
+def _finding_text(finding: GuardFinding) -> str:
     return f"channel {finding.channel}: {finding.message}"
 
 
@@ -428,7 +428,7 @@ def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration]
     return calibration.load_calibrations(order.calibration, profile)
 
 
-def _made(
+def _built_of(
     profile: Profile, uuid: bytes, calibrations: Mapping[int, Calibration], name: str | None, edition: int
 ) -> BuiltDatasheet:
     return profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]

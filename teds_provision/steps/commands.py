@@ -164,12 +164,12 @@ def identify_at(
     if add:
         station.unlock()  # before a node lies there: a pin is sealed by the vault
     if watch:
-        yield from watch_nodes(links, lambda node: _one(station, node, add), reporter, stop or threading.Event())
+        yield from watch_nodes(links, lambda node: _identified(station, node, add), reporter, stop or threading.Event())
         return
     first: TedsProvisionError | None = None
     identified = False
     with meet_everyone(links, reporter) as nodes:
-        for node, found in _side_by_side(nodes, lambda node: _one(station, node, add)):
+        for node, found in _side_by_side(nodes, lambda node: _identified(station, node, add)):
             if isinstance(found, Found):
                 identified = True
                 yield Arrival(node.uuid, links.places[0], 0.0, found)
@@ -204,7 +204,7 @@ def _side_by_side(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _one(station: Station, node: Conversation, add: bool) -> Found:
+def _identified(station: Station, node: Conversation, add: bool) -> Found:
     who = identify(station, node)
     described = describe(node)
     entry = who.whitelisted

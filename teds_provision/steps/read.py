@@ -83,13 +83,13 @@ def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:
     channel, access_code = block
     command, what = read_teds(channel, access_code, offset), f"to read TEDS {access_code} of channel {channel}"
     for _ in range(1 if node.sealed else 1 + _REFUSED_READS):
-        payload = _asked(node, command, what)
+        payload = _ask_despite_noise(node, command, what)
         if len(payload) >= 4 and int.from_bytes(payload[:4], "big") == offset:
             return payload[4:]
     raise Garbled(f"The node read TEDS {access_code} of channel {channel} from another offset than was asked.")
 
 
-def _asked(node: Conversation, command: Command, what: str) -> bytes:
+def _ask_despite_noise(node: Conversation, command: Command, what: str) -> bytes:
     """Ask; a refusal that came in no session is asked for again: noise on the line makes another question of a read."""
     for left in range(_REFUSED_READS, -1, -1):
         try:

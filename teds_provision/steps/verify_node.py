@@ -51,7 +51,7 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
         if not (node.sealed and refusal.message.startswith(HEARD)):
             raise
         node.forget()
-        why, image = _said(refusal), read_image(node)
+        why, image = _why(refusal), read_image(node)
     return Looked(image, verify_node(station, node, image, who.point, why=why, c=c))
 
 
@@ -85,14 +85,14 @@ def open_or_say_why(station: Station, node: Conversation) -> str:
     except NodeRefused as refusal:
         if node.sealed:
             raise
-        return _said(refusal)
+        return _why(refusal)
     if held is None and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
         elsewhere = agreed_elsewhere(station, node)
         return "the node opens no session under any key that is held here" + (elsewhere and f"; {elsewhere}")
     return ""
 
 
-def _said(refusal: NodeRefused) -> str:
+def _why(refusal: NodeRefused) -> str:
     return refusal.message.removeprefix(HEARD).rstrip(".")
 
 

@@ -244,19 +244,19 @@ class NodeTurn(_HeldFile):
         except OSError:
             return False  # nobody has ever worked on a node of this store
         try:
-            said = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, self._asked())
+            said = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, self._lock_struct())
         except OSError:
             return False
         finally:
             os.close(descriptor)
         return bool(struct.unpack_from("h", said)[0] != fcntl.F_UNLCK)
 
-    def _asked(self) -> bytes:
+    def _lock_struct(self) -> bytes:
         place = int.from_bytes(hashlib.sha256(self._uuid).digest()[:6], "big")
         return struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)  # struct flock
 
     def _acquire(self, descriptor: int) -> None:
-        asked = self._asked()
+        asked = self._lock_struct()
         until, told = time.monotonic() + _TURN_SECONDS, False
         while True:
             try:

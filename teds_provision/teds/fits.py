@@ -130,7 +130,7 @@ def parse_fits(text: str) -> Requirement:
     quantities = sorted({term.what for term in terms if term.what in QUANTITIES})
     if len(quantities) > 1:
         raise BadData(f"One expression asks for one quantity, this one for {' and '.join(quantities)}.")
-    return _whole(Requirement(terms, quantity=quantities[0] if quantities else ""))
+    return _with_fitting_units(Requirement(terms, quantity=quantities[0] if quantities else ""))
 
 
 def parse_require(text: str, file: str) -> tuple[Requirement, ...]:
@@ -152,7 +152,7 @@ def judge(requirement: Requirement, sheet: Sheet, now: datetime | None = None) -
     concerned = [channel for channel in sheet.channels if requirement.concerns(channel)]
     if not concerned:
         return (Fit(None, "", "failed", f"no channel gives {requirement.subject}."),)
-    return tuple(_judged(requirement, channel, now) for channel in concerned)
+    return tuple(_fit_of(requirement, channel, now) for channel in concerned)
 
 
 def met(requirement: Requirement, fits: Iterable[Fit]) -> bool:
@@ -161,7 +161,7 @@ def met(requirement: Requirement, fits: Iterable[Fit]) -> bool:
     return bool(results) and (all if requirement.channel else any)(result == "passed" for result in results)
 
 
-def _judged(requirement: Requirement, channel: Channel, now: datetime | None) -> Fit:
+def _fit_of(requirement: Requirement, channel: Channel, now: datetime | None) -> Fit:
     short, unknown = [], []
     if channel.value_problem:
         short.append(channel.value_problem)
@@ -266,7 +266,7 @@ def _term(text: str) -> Term:
     return Term(name, match[2], value, unit)
 
 
-def _whole(requirement: Requirement) -> Requirement:
+def _with_fitting_units(requirement: Requirement) -> Requirement:
     """Check that the unit of every term is one of what it bounds."""
     for term in requirement.terms:
         units = term.unit.units
@@ -296,7 +296,7 @@ def _table(name: str, table: object, file: str) -> Requirement:
         terms = tuple(_entry(what, value, quantity) for what, value in table.items())
         if len(terms) > LIMITS.terms:
             raise BadData(f"it has {len(terms)} bounds; {LIMITS.terms} are the most.")
-        return _whole(Requirement(terms, quantity, "" if quantity else name))
+        return _with_fitting_units(Requirement(terms, quantity, "" if quantity else name))
     except BadData as error:
         raise BadData(f"{file}: [{name[:40]}]: {error.message}", hint=error.hint) from error
 

@@ -394,7 +394,7 @@ class _Judge:
         damage = list(self._damage(calibration))
         yield from damage
         if not damage:
-            yield from self._judged(calibration)
+            yield from self._findings_of(calibration)
         if self.now is not None:
             for text in calibration.date_warnings(self.now):
                 yield GuardFinding(self.number, "overdue", text, "warning")
@@ -433,7 +433,7 @@ class _Judge:
             if not part.ascending:
                 yield self._error("inconsistent", f"the segment boundaries of input {number} do not ascend.")
 
-    def _judged(self, calibration: Calibration) -> Iterator[GuardFinding]:
+    def _findings_of(self, calibration: Calibration) -> Iterator[GuardFinding]:
         channel = self._demanded(self._channel(self.number, self.new), calibration)
         numbers = {part.channel for part in calibration.inputs}
         channels = {number: self._channel(number, self.new) for number in numbers}

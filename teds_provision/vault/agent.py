@@ -40,20 +40,20 @@ _ANSWER_SECONDS: Final = 3.0
 
 def held(home: Path, kind: str) -> bytes | None:
     """What opens the vault of this kind, None where nobody holds it open."""
-    answer = _asked(home, SECRET)
+    answer = _ask(home, SECRET)
     return answer[1:] if answer[:1] == KINDS[kind] and len(answer) > 1 else None
 
 
 def seconds_left(home: Path) -> int | None:
     """How long the vault is still held open, None where it is not."""
-    answer = _asked(home, TIME)
+    answer = _ask(home, TIME)
     return struct.unpack(">I", answer)[0] if len(answer) == 4 else None
 
 
 def lock(home: Path) -> bool:
     """Have the secret wiped and the process end; False where there was none."""
     there = seconds_left(home) is not None
-    _asked(home, END)
+    _ask(home, END)
     return there
 
 
@@ -91,7 +91,7 @@ def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
         raise VaultFailure(f"The vault cannot be held open: {SOCKET} in {home} does not come up.")
 
 
-def _asked(home: Path, request: bytes) -> bytes:
+def _ask(home: Path, request: bytes) -> bytes:
     """The whole answer; empty where nobody of this user's own listens."""
     path = home / SOCKET
     if not path.is_socket() or not hasattr(socket, "SO_PEERCRED"):

@@ -80,7 +80,7 @@ def _wtx(octets: bytes) -> Bend:
         def asks_first(self: tags.IsoDepTag, apdu: bytes) -> bytes:
             if self._pending is None:
                 self._pending = apdu
-                return self._kept(octets)
+                return self._remember(octets)
             return run(self, apdu)
 
         patch.setattr(tags.IsoDepTag, "_run", asks_first)

@@ -175,8 +175,8 @@ PATTERNS = (
     Pattern(
         "off the whitelist nothing moves", "Standing.require", "require_whitelisted(self._station, self._uuid)", "None"
     ),
-    Pattern("a set point grows old", "TopicActuators._left", "age > self._dead_man / 1000", "False"),
-    Pattern("a set point grows old in the queue", "TopicActuators._send", "self._left(command)", "None"),
+    Pattern("a set point grows old", "TopicActuators._seconds_left", "age > self._dead_man / 1000", "False"),
+    Pattern("a set point grows old in the queue", "TopicActuators._send", "self._seconds_left(command)", "None"),
     Pattern("a browser's token ends", "Tokens.find", "one.until > now", "True"),
     Pattern("a login link ends", "Tokens.login", "until < time.monotonic()", "False"),
     Pattern(

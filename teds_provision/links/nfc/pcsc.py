@@ -39,7 +39,7 @@ def _context(scard: Any) -> Any:
     result, context = scard.SCardEstablishContext(scard.SCARD_SCOPE_USER)
     if result != scard.SCARD_S_SUCCESS:
         raise NoReader(
-            f"The PC/SC service does not answer: {_said(scard, result)}.",
+            f"The PC/SC service does not answer: {_error_text(scard, result)}.",
             hint="sudo apt install pcscd; sudo systemctl start pcscd.socket. Over ssh polkit may refuse; run as root.",
         )
     return context
@@ -91,7 +91,7 @@ class PcscReader:
             scard.SCARD_PROTOCOL_T0 | scard.SCARD_PROTOCOL_T1,
         )
         if result in _gone(scard):
-            raise ReaderLost(_said(scard, result))
+            raise ReaderLost(_error_text(scard, result))
         if result == scard.SCARD_E_SHARING_VIOLATION:
             raise ReaderLost("another program holds it")
         if result != scard.SCARD_S_SUCCESS:
@@ -143,7 +143,7 @@ def _gone(scard: Any) -> set[int]:
     }
 
 
-def _said(scard: Any, result: int) -> str:
+def _error_text(scard: Any, result: int) -> str:
     return str(scard.SCardGetErrorMessage(result)).strip().rstrip(".")
 
 
@@ -181,7 +181,7 @@ class _Card:
             self._trace.frame("pcsc", "out", apdu)
         result, answer = self._scard.SCardTransmit(self.handle, self._protocol, list(apdu))
         if result in _gone(self._scard):
-            raise ReaderLost(_said(self._scard, result))
+            raise ReaderLost(_error_text(self._scard, result))
         if result != self._scard.SCARD_S_SUCCESS or len(answer) < 2:
             raise FieldLost
         if self._trace is not None:

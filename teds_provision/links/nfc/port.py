@@ -336,7 +336,7 @@ class NfcLink:
         attempt = 0
         while True:
             try:
-                poller = self._ready()  # a node that is gone for good ends it here
+                poller = self._ready_poller()  # a node that is gone for good ends it here
                 try:
                     return poller.transact(transaction, frame)
                 except (NodeSilent, Garbled) as error:
@@ -370,7 +370,7 @@ class NfcLink:
         except LinkFailure:
             self._poller = None
 
-    def _ready(self) -> Poller:
+    def _ready_poller(self) -> Poller:
         if self._poller is None:
             self.lost = True
             self.visit = self._port.back(self.visit.identity.uuid, RETURN_WITHIN)

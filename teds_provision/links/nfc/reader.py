@@ -129,7 +129,7 @@ def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -
     if code == errno.EACCES:
         return _forbidden(path, vendor, product)
     if code == errno.EBUSY and vendor:
-        return _held(path, vendor, product)
+        return _in_use(path, vendor, product)
     if code in (errno.ENODEV, errno.ENOENT):
         return _absent(path)
     return NoReader(f"The reader {path} cannot be opened: {error}.", hint="Unplug it, plug it in again.")
@@ -148,7 +148,7 @@ def _forbidden(path: str, vendor: int, product: int) -> NoReader:
     return NoReader(f"This user may not open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again.")
 
 
-def _held(path: str, vendor: int, product: int) -> NoReader:
+def _in_use(path: str, vendor: int, product: int) -> NoReader:
     driver = _kernel_driver(vendor, product)
     return NoReader(
         f"The reader {path} is held by {driver or 'another program'}.",

@@ -261,7 +261,7 @@ class ReaderTag:
     def is_present(self) -> bool:
         """Whether the tag still answers, in this activation; raises ReaderLost."""
         try:
-            with self._asked():
+            with self._talking():
                 return bool(self._tag.is_present)
         except FieldLost:
             return False
@@ -288,11 +288,11 @@ class ReaderTag:
             self.read()
         if not self._ndef.is_writeable or len(octets) > self._ndef.capacity:
             raise Garbled(f"The tag does not take an NDEF message of {len(octets)} octets.")
-        with self._asked():
+        with self._talking():
             self._ndef.octets = octets
 
     @contextmanager
-    def _asked(self) -> Iterator[None]:
+    def _talking(self) -> Iterator[None]:
         """Talk to the tag: FieldLost where the reader has looked for another since."""
         with translated():
             if self._tag.target is None or self._tag.clf.target is not self._tag.target:
@@ -300,7 +300,7 @@ class ReaderTag:
             yield
 
     def _read_once(self) -> bytes | None:
-        with self._asked():
+        with self._talking():
             if self._ndef is None:
                 self._ndef = self._tag.NDEF(self._tag)
             self._ndef.has_changed  # noqa: B018  (nfcpy: this property reads the tag)

@@ -162,7 +162,9 @@ class ParquetWriter:
                 elif column.dtype.kind == "O":
                     found[at:end] = np.array(column.tolist(), dtype=dtype)
                 else:
-                    found[at:end] = column.astype(dtype, casting="same_kind") if dtype != np.int64 else _whole(column)
+                    found[at:end] = (
+                        column.astype(dtype, casting="same_kind") if dtype != np.int64 else _as_int64(column)
+                    )
                 missing[at:end] = False
             return self._pa.array(found[order], kind, mask=missing[order])
         except (TypeError, ValueError, OverflowError) as error:
@@ -172,7 +174,7 @@ class ParquetWriter:
             ) from None
 
 
-def _whole(column: NDArray[Any]) -> NDArray[Any]:
+def _as_int64(column: NDArray[Any]) -> NDArray[Any]:
     whole = column.astype(np.int64)
     if column.dtype.kind == "f" and (whole != column).any():
         raise ValueError("it is no whole number")

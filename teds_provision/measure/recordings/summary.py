@@ -55,7 +55,7 @@ class Summary:
         elif isinstance(entry, GroupRows):
             self.messages += len(entry.time)
             for column, key in enumerate(entry.channels):
-                self._of(key).saw(entry.time, entry.value[:, column])
+                self._seen_of(key).saw(entry.time, entry.value[:, column])
         elif isinstance(entry, NodeReport):
             if len(self.reports) < MOST.channels:
                 self.reports[entry.uuid] = entry
@@ -64,7 +64,7 @@ class Summary:
         else:
             self.facts.update((one.key, one) for one in entry if len(self.facts) < MOST.channels)
 
-    def _of(self, key: tuple[str, int]) -> Seen:
+    def _seen_of(self, key: tuple[str, int]) -> Seen:
         return self.channels.setdefault(key, Seen())
 
     def _block(self, block: Block) -> None:
@@ -77,7 +77,7 @@ class Summary:
             self.missing += block.index - due
         self._next[stream] = block.index + len(block.time)
         for column, number in enumerate(block.channels):
-            self._of((block.uuid, number)).saw(block.time, block.value[:, column])
+            self._seen_of((block.uuid, number)).saw(block.time, block.value[:, column])
 
     def to_json(self, recording: Recording) -> dict[str, Any]:
         """The result of ``record info``: ``lost`` counts messages of nodes, as the recorder reported them last.

@@ -142,7 +142,7 @@ class FileSink(ThreadedSink):
         except OSError as error:
             raise as_sink_failure(error, self.name) from error
 
-    def _news(self, facts: tuple[ChannelFacts, ...]) -> tuple[ChannelFacts, ...]:
+    def _learn(self, facts: tuple[ChannelFacts, ...]) -> tuple[ChannelFacts, ...]:
         """Keep the facts; gives those that are new or other than before."""
         changed = tuple(one for one in facts if self.facts.get(one.key) != one)
         self.facts.update((one.key, one) for one in changed)
@@ -227,7 +227,7 @@ class FileSink(ThreadedSink):
         if isinstance(item, Block):
             self._count(dropped=int(item.value.size))
         elif isinstance(item, tuple):
-            self._news(item)
+            self._learn(item)
         elif isinstance(item, ClockSet):
             self.station = replace(self.station, started=self.station.started + item.by)
             self._unsaid.append(item)

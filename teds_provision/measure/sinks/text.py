@@ -45,7 +45,7 @@ class TextSink(FileSink):
         if isinstance(item, Block):
             self._block(item)
         elif isinstance(item, tuple):
-            if self._news(item) and self._columns:
+            if self._learn(item) and self._columns:
                 self._new_part()
         elif isinstance(item, NodeReport):
             if item.state == "running":

@@ -37,7 +37,7 @@ class WideSink(TextSink):
         if isinstance(item, GroupRows):
             self._rows_of(item)
         elif isinstance(item, tuple):
-            if self._news(item):  # other columns, or another datasheet: the next rows begin another part
+            if self._learn(item):  # other columns, or another datasheet: the next rows begin another part
                 self._changed = bool(self._columns)
         elif not isinstance(item, Block):
             super()._take(item)

@@ -144,7 +144,7 @@ class Desk:
     def contact(self, uuid: str) -> Contact | None:
         """A node that is on a bus now; None where it is not."""
         port = self._bus_of(uuid)
-        return None if port is None else self._found(port, uuid)
+        return None if port is None else self._find(port, uuid)
 
     def on_a_bus(self, uuid: str) -> bool:
         """Whether a node is on a bus of this station now."""
@@ -155,13 +155,13 @@ class Desk:
         port = self._port_of(seen.place) if seen.present and seen.place else None
         return port if port is not None and port.capabilities.many else None
 
-    def _found(self, port: Port, uuid: str) -> Contact:
+    def _find(self, port: Port, uuid: str) -> Contact:
         wanted = bytes.fromhex(uuid)
         address = self._roster.seen(uuid).address
         return port.find(lambda identity: identity.uuid == wanted, seconds=ON_A_BUS, notice=_quiet, address=address)
 
     def _on_a_bus(self, port: Port, uuid: str, what: str, work: Callable[[Conversation], Result]) -> Result:
-        with self._turns.of(uuid, what), Conversation(self._found(port, uuid), notice=_quiet) as node:
+        with self._turns.of(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
             try:
                 return work(node)
             except SessionLost as lost:

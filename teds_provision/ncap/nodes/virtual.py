@@ -131,7 +131,7 @@ class Virtuals:
             raise UsageFailure(f"This station already has {MOST} virtual transducers.", hint="Remove one first.")
         folder = self._home / secrets.token_hex(6)
         try:
-            one = self._made(folder, name or "", source, content, profile)
+            one = self._create(folder, name or "", source, content, profile)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -140,7 +140,7 @@ class Virtuals:
         self._live.event("virtual", state="made", uuid=one.uuid, name=one.name)
         return one
 
-    def _made(self, folder: Path, name: str, source: str, content: str | None, profile: str | None) -> Virtual:
+    def _create(self, folder: Path, name: str, source: str, content: str | None, profile: str | None) -> Virtual:
         folder.mkdir(parents=True, mode=0o700)
         teds: Path | None = None
         if content is not None:
@@ -192,26 +192,26 @@ class Virtuals:
 
     def profile_of(self, uuid: str) -> str | None:
         """The profile that one was made from; None: from a datasheet."""
-        found = json.loads((self._of(uuid).folder / _FACTS).read_text()).get("profile")
+        found = json.loads((self._virtual_of(uuid).folder / _FACTS).read_text()).get("profile")
         return found if isinstance(found, str) else None
 
     def calibration_of(self, uuid: str) -> Path | None:
         """The straight lines of one that was made from a profile, None where it has none."""
-        path = self._of(uuid).folder / _CALIBRATION
+        path = self._virtual_of(uuid).folder / _CALIBRATION
         return path if path.exists() else None
 
     def name_of(self, uuid: str) -> str:
         """The name that it was given, "" for none."""
-        return self._of(uuid).name
+        return self._virtual_of(uuid).name
 
     def document_of(self, uuid: str) -> str | None:
         """The datasheet that one was made from, None where it was a profile."""
-        path = self._of(uuid).folder / "datasheet"
+        path = self._virtual_of(uuid).folder / "datasheet"
         return path.read_text(encoding="utf-8") if path.exists() else None
 
     def remove(self, uuid: str) -> None:
         """End it, and its key with it; raises NotFound."""
-        one = self._of(uuid)
+        one = self._virtual_of(uuid)
         with self._guard:
             self._all.pop(uuid, None)
         _end(one.process)
@@ -221,7 +221,7 @@ class Virtuals:
         shutil.rmtree(one.folder, ignore_errors=True)
         self._live.event("virtual", state="removed", uuid=uuid)
 
-    def _of(self, uuid: str) -> Virtual:
+    def _virtual_of(self, uuid: str) -> Virtual:
         with self._guard:
             found = self._all.get(uuid)
         if found is None:

@@ -161,7 +161,7 @@ class IsoDepTag:
         self._parts = []  # a reader that begins anew wants no more of the answer before
         self._received = (self._received + octets)[:_LONGEST_APDU]
         if pcb & 0x10:
-            return self._kept(bytes((0xA2 | self._number,)))
+            return self._remember(bytes((0xA2 | self._number,)))
         apdu, self._received = self._received, b""
         return self._run(apdu)
 
@@ -169,16 +169,16 @@ class IsoDepTag:
         answer = self._application.run(apdu, self._patience)
         if answer is None:
             self._pending = apdu
-            return self._kept(_WTX)
+            return self._remember(_WTX)
         self._pending = None
         self._parts = [answer[at : at + self._information] for at in range(0, len(answer), self._information)]
         return self._part()
 
     def _part(self) -> bytes:
         part = self._parts.pop(0)
-        return self._kept(bytes((0x02 | (0x10 if self._parts else 0) | self._number,)) + part)
+        return self._remember(bytes((0x02 | (0x10 if self._parts else 0) | self._number,)) + part)
 
-    def _kept(self, block: bytes) -> bytes:
+    def _remember(self, block: bytes) -> bytes:
         self._last = block
         return block
 

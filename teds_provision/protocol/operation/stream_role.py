@@ -145,7 +145,7 @@ class StreamRole:
             demand(port.kind == "can", Reason.DOES_NOT_FIT)
         elif asked.start != SOON:
             demand(now < asked.start <= now + LATEST_START, Reason.TOO_LATE)
-        own = self._of(session)
+        own = self._measuring_of(session)
         demand(own.run < LAST_RUN and len(others) < self._room, Reason.NO_ROOM)
         own.run += 1
         if old is not None:
@@ -172,7 +172,7 @@ class StreamRole:
         demand(port.kind != "nfc", Reason.DOES_NOT_FIT)
         layout = self._layout(channels, session)
         demand(all(self._hardware.channels[channel].actuator for channel in channels), Reason.NOT_PERMITTED)
-        own = self._of(session)
+        own = self._measuring_of(session)
         demand(own.run < LAST_RUN, Reason.NO_ROOM)
         own.run += 1
         length = drive_length(layout.octets)
@@ -183,7 +183,7 @@ class StreamRole:
     def clock(self, payload: bytes, session: NodeSession, received: int) -> bytes:
         """Clock: ``received`` is the tick at which the last frame of the request came."""
         demand_form(not payload)
-        own, hardware = self._of(session), self._hardware
+        own, hardware = self._measuring_of(session), self._hardware
         last = NONE if own.drive is None or own.drive.last is None else own.drive.last
         return Clock(received, hardware.now(), own.mark, hardware.step, hardware.drift, last).encode()
 
@@ -192,7 +192,7 @@ class StreamRole:
         asked = Arm.decode(payload)
         demand(asked.life <= LONGEST_LIFE and asked.action in set(Action), Reason.OUT_OF_RANGE)
         demand(port.kind == "can", Reason.DOES_NOT_FIT)
-        armed = self._of(session).armed
+        armed = self._measuring_of(session).armed
         armed.pop(Action(asked.action), None)
         if asked.life:
             armed[Action(asked.action)] = Armed(asked.commitment, self._real() + asked.life * SECOND)
@@ -202,7 +202,7 @@ class StreamRole:
 
     def trigger(self, session: NodeSession, token: bytes, tick: int) -> None:
         """A trigger frame of this session's station, at whose end the clock stood at ``tick``."""
-        own, seen = self._of(session), commitment(token)
+        own, seen = self._measuring_of(session), commitment(token)
         for action, armed in list(own.armed.items()):
             if self._real() >= armed.until:
                 del own.armed[action]
@@ -219,14 +219,14 @@ class StreamRole:
 
     def drive_frame(self, session: NodeSession, data: bytes) -> None:
         """One CAN frame of a Drive message."""
-        drive = self._of(session).drive
+        drive = self._measuring_of(session).drive
         message = drive.assembly.take_drive(data) if drive is not None else None
         if message is not None:
             self.drive_message(session, message)
 
     def drive_message(self, session: NodeSession, message: bytes) -> None:
         """One whole Drive message; whatever is wrong with it, it is dropped without a word."""
-        drive = self._of(session).drive
+        drive = self._measuring_of(session).drive
         if drive is None or len(message) != drive.assembly.length:
             return
         counter = counter_of(message)
@@ -264,7 +264,7 @@ class StreamRole:
         """Claims of these channels ended: streams and Drive over any of them end, with the last one what is armed."""
         for stream in [s for s in self._streams if s.session is session and channels.intersection(s.channels)]:
             self._end(stream)
-        own = self._of(session)
+        own = self._measuring_of(session)
         if own.drive is not None and channels.intersection(own.drive.layout.channels):
             own.drive = None
         if not self._claims.of(session):
@@ -310,7 +310,7 @@ class StreamRole:
 
     # -- the inside ------------------------------------------------------------------------------------------------
 
-    def _of(self, session: NodeSession) -> _Measuring:
+    def _measuring_of(self, session: NodeSession) -> _Measuring:
         return self._sessions.setdefault(session, _Measuring())
 
     def _on(self, bus: str) -> list[Stream]:

@@ -304,9 +304,9 @@ def fit(
             xs = [x for x, _ in pairs]
             part, coefficients = _polynomial(pairs, wanted, about=(min(xs) + max(xs)) / 2)
         case "table":
-            part, coefficients = _table(_held(_thinned(_averaged(pairs), tolerance)))
+            part, coefficients = _table(_require_room(_thinned(_averaged(pairs), tolerance)))
         case "steps":
-            part, coefficients = _steps(_held(_averaged(pairs)))
+            part, coefficients = _steps(_require_room(_averaged(pairs)))
     curve = CalibrationInput(channel, *part)
     if not curve.ascending:
         raise BadData("Two inputs of the calibration lie so close together that a Float32 cannot tell them apart.")
@@ -347,7 +347,7 @@ def _steps(pairs: Points) -> tuple[_Part, tuple[float, ...]]:
     return (0, (*x.tolist(), float(end)), tuple(x.tolist())), tuple(y.tolist())
 
 
-def _held(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def _require_room(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
     if len(pairs) > MAXIMUM_NODES:
         raise BadData(
             f"A table of {len(pairs)} nodes is too large for a TEDS, which holds {MAXIMUM_NODES} at most.",

@@ -116,7 +116,7 @@ def _curve(order: Order, channel: ChannelProfile) -> Calibration:
         case ["slope"]:
             return _line(order, channel, method)
         case ["coefficients"]:
-            return _ready(order, channel, method, degree)
+            return _with_coefficients(order, channel, method, degree)
         case []:
             raise order.wrong("", "there is nothing to calibrate with: points, coefficients, or slope and intercept.")
         case _:
@@ -181,7 +181,7 @@ def _connected(order: Order) -> list[tuple[float, ...]]:
     return rows
 
 
-def _ready(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:
+def _with_coefficients(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:
     coefficients = order.numbers("coefficients") or ()
     boundaries = order.numbers("boundaries") or _ends(order, channel)
     segments = max(len(boundaries) - 1, 1)

@@ -53,7 +53,7 @@ def calibration_from_json(data: object, channel: int, units: Units) -> Calibrati
         scale, offset = _numbers(data["si"])
         inputs = tuple(
             CalibrationInput(
-                _whole(one["channel"]), _whole(one["degree"]), _numbers(one["boundaries"]), _numbers(one["offsets"])
+                _u16(one["channel"]), _u16(one["degree"]), _numbers(one["boundaries"]), _numbers(one["offsets"])
             )
             for one in data["inputs"]
         )
@@ -75,7 +75,7 @@ def calibration_from_json(data: object, channel: int, units: Units) -> Calibrati
         raise BadData("The calibration is not that of a recording.") from error
 
 
-def _whole(value: object) -> int:
+def _u16(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFF:
         raise ValueError(value)
     return value

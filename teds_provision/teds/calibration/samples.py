@@ -163,8 +163,8 @@ class SampleReader:
             whole = 8 * self.form.octets
             if not self._long:
                 return _words(rows).astype(np.float64) * 2.0**-whole
-            return np.array([number / (1 << whole) for number in _whole(rows).tolist()], dtype=np.float64)
-        return _whole(rows) if self._long else _words(rows)
+            return np.array([number / (1 << whole) for number in _as_integers(rows).tolist()], dtype=np.float64)
+        return _as_integers(rows) if self._long else _words(rows)
 
     def numbers(self, raw: NDArray[np.generic]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Raw values as Float64, and which of them their data model and SigBits can give.
@@ -229,7 +229,7 @@ def _words(rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
     return big_endian(rows).astype(np.uint64)
 
 
-def _whole(rows: NDArray[np.uint8]) -> NDArray[np.object_]:
+def _as_integers(rows: NDArray[np.uint8]) -> NDArray[np.object_]:
     """Any number of octets a row, as Python integers."""
     out = np.empty(len(rows), dtype=object)
     out[:] = [int.from_bytes(row.tobytes(), "big") for row in rows]

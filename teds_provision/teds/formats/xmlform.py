@@ -214,7 +214,7 @@ def _value(element: ET.Element, where: str) -> tuple[Kind, EntryValue]:
         raise BadData(f"The {kind} of {where} does not read as one: {(element.text or '')[:40]!r}.") from error
 
 
-def _whole(text: str) -> int:
+def _whole_value(text: str) -> int:
     return whole_number(text, "the value")
 
 
@@ -228,10 +228,10 @@ def _float(text: str) -> float:
 
 
 _READERS: Final[dict[str, tuple[Kind, Callable[[str], EntryValue]]]] = {
-    "integer": ("integer", _whole),
+    "integer": ("integer", _whole_value),
     "number": ("number", _float),
     "text": ("text", str),
     "octets": ("octets", bytes.fromhex),
-    "integers": ("integers", lambda text: tuple(_whole(part) for part in _list(text))),
+    "integers": ("integers", lambda text: tuple(_whole_value(part) for part in _list(text))),
     "numbers": ("numbers", lambda text: tuple(_float(part) for part in _list(text))),
 }

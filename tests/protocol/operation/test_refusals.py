@@ -348,7 +348,7 @@ def test_runs_are_used_up_after_65535() -> None:
     session = bench.tim._sessions.on("can:f1")
     assert bench.tim._role is not None
     assert session is not None
-    bench.tim._role.streams._of(session).run = 65_534
+    bench.tim._role.streams._measuring_of(session).run = 65_534
     assert bench.reason(subscribe()) is None
     assert bench.reason(drive([4])) == Reason.NO_ROOM
     assert bench.reason(subscribe()) == Reason.NO_ROOM

@@ -118,7 +118,7 @@ class McapSink(FileSink):
         elif isinstance(item, NodeReport):
             self._report(item)
         elif isinstance(item, tuple):
-            self._describe(self._news(item))
+            self._describe(self._learn(item))
         self._look(time.monotonic())
 
     def _idle(self, now: float) -> None:

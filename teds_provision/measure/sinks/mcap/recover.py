@@ -85,7 +85,7 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
     if output is not None:
         require_new(output)
     try:
-        with _held(path) as (file, octets):
+        with _map_alone(path) as (file, octets):
             scan = _Scan(octets, path)
             scan.walk()
             return _finished(scan, file, path, output)
@@ -98,7 +98,7 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
 
 
 @contextmanager
-def _held(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
+def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
     """The octets of a file that no recorder writes; none begins to while this is open."""
     file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
