@@ -31,7 +31,7 @@ def _library(path: Path) -> Any:
     library = ctypes.CDLL(str(path))
     library.memory_new.restype = ctypes.c_void_p
     library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
-    library.memory_steps.restype = ctypes.c_long
+    library.memory_steps.restype = library.memory_chip_calls.restype = ctypes.c_long
     library.memory_poll.restype = ctypes.c_uint64
     library.memory_dead.restype = library.memory_misused.restype = library.memory_nfc_written.restype = ctypes.c_bool
     library.memory_ble_advertises.restype = library.memory_ble_drops.restype = ctypes.c_bool
@@ -160,6 +160,15 @@ class MemoryNode:
     def fails(self, fails: bool) -> None:
         """Flash that refuses to be written, and works again."""
         self._library.memory_fails(self._board, ctypes.c_bool(fails))
+
+    def chip_fails(self, call: int) -> None:
+        """Have this call of its random source or cryptography fail, it alone, counted from now; 0: none."""
+        self._library.memory_chip_fails(self._board, ctypes.c_long(call))
+
+    @property
+    def chip_calls(self) -> int:
+        """Calls since :meth:`chip_fails`."""
+        return int(self._library.memory_chip_calls(self._board))
 
     @property
     def steps(self) -> int:

@@ -283,6 +283,40 @@ static void everyone_is_answered_in_time_though_the_last_answer_waits(void)
     memory_free(board);
 }
 
+/* Four stations read at once, and there is room for three replies: the oldest is cut short, and nobody hears another's. */
+static void more_long_answers_than_room_cut_the_oldest_short(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    unsigned frames[4] = {0}, others = 0;
+    for (uint8_t i = 0; i < 4; i++) {
+        const uint8_t rest[8] = {0x21, 5, 0x80, 0, 0, 0, (uint8_t)(i + 1), 0xCC}; /* from octet i + 1 on */
+        now += MS;
+        in(board, TO_NODE + i, "\x10\x0c\x05\x00\x00\x01\x02\x00", 8, false);
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "station %u is heard", i);
+        in(board, TO_NODE + i, (const char *)rest, 8, false);
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && data[1] == 245 - (i + 1) && data[3] == 1,
+              "station %u: a first frame of %u octets", i, data[1]);
+        CHECK(identifier == (0x18DA0000u | (0xF1u + i) << 8 | OWN), "to it");
+    }
+    for (uint8_t i = 0; i < 4; i++) {
+        in(board, TO_NODE + i, "\x30\x00\x00", 3, false);
+    }
+    while (out(board, &identifier, data) >= 0) {
+        const unsigned to = (identifier >> 8 & 0xFF) - 0xF1;
+        if (to < 4 && ++frames[to] == 1) {
+            others += data[2] != to + 1; /* the offset's last octet */
+        }
+    }
+    CHECK(frames[0] == 0, "the oldest is cut short: %u frames", frames[0]);
+    for (unsigned i = 1; i < 4; i++) {
+        CHECK(frames[i] == (245 - (i + 1) - 6 + 6) / 7, "station %u: %u frames", i, frames[i]);
+    }
+    CHECK(others == 0, "each its own");
+    memory_free(board);
+}
+
 static uint8_t address_of(const memory_board *board)
 {
     uint8_t identity[23];
@@ -404,6 +438,7 @@ int main(void)
     a_repetition_while_the_reply_is_under_way_gets_it_again();
     everyone_is_answered_after_a_wait();
     everyone_is_answered_in_time_though_the_last_answer_waits();
+    more_long_answers_than_room_cut_the_oldest_short();
     a_new_address_counts_though_its_reply_is_lost();
     after_bus_off_it_is_silent_for_longer_and_longer();
     nodes_that_meet_sort_themselves_out();

@@ -142,6 +142,67 @@ static void safe(void *user, uint8_t channel)
     memset(board->values[place_of(board, channel)], 0, 8);
 }
 
+/* -- a chip whose calls may fail --------------------------------------------------------------------------------------- */
+
+static bool chip_fails(void *user)
+{
+    memory_board *board = user;
+    return ++board->calls == board->failing;
+}
+
+static int chip_random(void *user, uint8_t *out, size_t length)
+{
+    return chip_fails(user) ? -1 : ((memory_board *)user)->chip.random(user, out, length);
+}
+
+static int chip_make(void *user, int use, teds_key_ref *key, uint8_t point[65])
+{
+    return chip_fails(user) ? -1 : ((memory_board *)user)->chip.p256_make(user, use, key, point);
+}
+
+static int chip_ecdh(void *user, const teds_key_ref *key, const uint8_t peer[65], uint8_t out[32])
+{
+    return chip_fails(user) ? -1 : ((memory_board *)user)->chip.p256_ecdh(user, key, peer, out);
+}
+
+static int chip_sign(void *user, const teds_key_ref *key, const uint8_t hash[32], uint8_t out[64])
+{
+    return chip_fails(user) ? -1 : ((memory_board *)user)->chip.p256_sign(user, key, hash, out);
+}
+
+static int chip_hmac(void *user, const uint8_t *key, size_t key_length, const teds_part *parts, size_t count,
+                     uint8_t out[32])
+{
+    return chip_fails(user) ? -1 : ((memory_board *)user)->chip.hmac(user, key, key_length, parts, count, out);
+}
+
+static int chip_seal(void *user, const uint8_t key[16], const uint8_t nonce[13], const uint8_t *in, size_t length,
+                     uint8_t *out, size_t tag_length)
+{
+    return chip_fails(user) ? -1 : ((memory_board *)user)->chip.ccm_seal(user, key, nonce, in, length, out, tag_length);
+}
+
+void memory_chip_fails(memory_board *board, long call)
+{
+    teds_port *port = &board->port;
+    if (board->chip.hmac == NULL) {
+        board->chip = *port;
+        port->random = chip_random;
+        port->p256_make = chip_make;
+        port->p256_ecdh = chip_ecdh;
+        port->p256_sign = chip_sign;
+        port->hmac = chip_hmac;
+        port->ccm_seal = chip_seal;
+    }
+    board->calls = 0;
+    board->failing = call;
+}
+
+long memory_chip_calls(const memory_board *board)
+{
+    return board->calls;
+}
+
 /* -- channels in a test's hands --------------------------------------------------------------------------------------- */
 
 static int ask(void *user, char what, uint8_t channel, uint64_t argument, uint8_t *octets_of_it, size_t length)

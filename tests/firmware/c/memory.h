@@ -31,6 +31,8 @@ typedef struct memory_board {
     teds_fixed fixed[8];
     bool fails;
     memory_hook hook;
+    teds_port chip; /* its cryptography, behind what fails */
+    long calls, failing; /* of the chip; the one that fails, 0: none */
     bool fd; /* how commands come */
 #if TEDS_NFC
     teds_isodep card;
@@ -47,6 +49,9 @@ void memory_no_channels(memory_board *board);
 void memory_halt(memory_board *board, uint8_t number, uint8_t halt);
 void memory_hook_up(memory_board *board, memory_hook hook);
 void memory_slow(memory_board *board, bool slow);
+/* This call of the chip's random source or cryptography from now on fails, it alone; 0: none. How many there were. */
+void memory_chip_fails(memory_board *board, long call);
+long memory_chip_calls(const memory_board *board);
 void memory_clock(memory_board *board, uint32_t step, uint16_t drift);
 void memory_by_fd(memory_board *board, bool fd);
 bool memory_acts(const memory_board *board);
