@@ -228,7 +228,8 @@ def new(
             f'# For all settings: teds-provision profile new --dry-run {name}\n\nextends = "{base}"\ntitle = "{name}"\n'
             f"\n[channel.1]\n# high-limit = 20.0\n"
         )
-    path = output or _place(app.home, name)
+    folder = Path("profiles") if Path("profiles").is_dir() else app.home / "profiles"
+    path = output or folder / f"{name}.toml"
     done = holds(path, text.encode())
     if path.exists() and not done:
         raise UsageFailure(
@@ -251,11 +252,6 @@ profile.add_command(new)
 def _plain(text: str) -> Callable[[Console], None]:
     """Text as it is: brackets are no markup, lines stay whole."""
     return lambda _console: click.echo(text)
-
-
-def _place(home: Path, name: str) -> Path:
-    folder = Path("profiles") if Path("profiles").is_dir() else home / "profiles"
-    return folder / f"{name}.toml"
 
 
 def _make(folder: Path) -> None:

@@ -577,8 +577,11 @@ def _proposal(station: Station, prepared: Prepared, present: Survey) -> Proposal
     keep = {block: has.blocks[block] for block in present.read_only}
     if not has.unsigned_blocks().keys() - keep.keys():
         return _composed(station, prepared, present, keep, named=True)
-    if order.adopt:
-        return _as_it_is(station, present, keep) if order.name is None else _only_named(station, prepared, present)
+    if order.adopt and order.name is None:
+        return _as_it_is(station, present, keep)
+    if order.adopt:  # what it has, under another name, whatever its type
+        brought = brought_by(station, present.image, name=order.name)
+        return Proposal(brought.image, (), True, name=brought.name or None)
     if not _intact(station, present):
         return _mended(station, prepared, present) or _composed(
             station, prepared, present, keep, named=order.profile is not None
@@ -645,12 +648,6 @@ def _as_it_is(station: Station, present: Survey, keep: Mapping[BlockId, bytes]) 
     image = Image(uuid, {**keep, **pending.unsigned_blocks()})
     profile = draft.profile if draft is not None else None
     return Proposal(image, (), named=False, profile=profile, name=own_name(station, image, profile))
-
-
-def _only_named(station: Station, prepared: Prepared, present: Survey) -> Proposal:
-    """What the node has under another name, whatever its type."""
-    brought = brought_by(station, present.image, name=prepared.order.name)
-    return Proposal(brought.image, (), True, name=brought.name or None)
 
 
 def _only_what_is_named(

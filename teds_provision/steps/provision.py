@@ -46,7 +46,7 @@ from teds_provision.steps.sign import Signed, sign
 from teds_provision.steps.verify import Verified
 from teds_provision.steps.verify_node import look_at_node, verify_node
 from teds_provision.steps.write import Low, Written, wait_for_charge, write
-from teds_provision.store import Draft, WhitelistEntry
+from teds_provision.store import WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
@@ -349,7 +349,8 @@ class _Run:
                 step.result = NOTHING if elsewhere.reused else DONE
                 step.detail = f"sequence {elsewhere.sequence}, by the office"
                 return elsewhere
-            earlier = _signed_draft(self.station.nodes.draft(who.uuid))
+            draft = self.station.nodes.draft(who.uuid)
+            earlier = draft.image.blocks.get(SECURITY) if draft is not None and draft.stage == "signed" else None
             # a node whose TEDS are not what it was signed for takes them only under a newer sequence
             intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()
             signed = sign(
@@ -430,10 +431,3 @@ def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> W
             station.nodes.remember(who.uuid, point=who.point)
         station.audit("whitelist", who.uuid, "added", fingerprint=entry.fingerprint, assurance=entry.assurance)
     return entry
-
-
-def _signed_draft(draft: Draft | None) -> bytes | None:
-    """The Security TEDS of a signed draft, None for a built one."""
-    if draft is None or draft.stage != "signed":
-        return None
-    return draft.image.blocks.get(SECURITY)
