@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -126,6 +128,27 @@ def test_the_parts_for_nfc_and_bluetooth_compile() -> None:
     """Against stub headers alone: what they name is not on this machine."""
     builds.need("make", "gcc", headers=("psa/crypto.h",))
     builds.make("boards-radio")
+
+
+def test_the_sizes_of_kconfig_are_those_that_compile() -> None:
+    """Each that a board may need has an option; its ends lie within the bounds of config.h, its default is the same."""
+    kconfig = (builds.FIRMWARE / "zephyr" / "Kconfig").read_text()
+    cmake = (builds.FIRMWARE / "zephyr" / "CMakeLists.txt").read_text()
+    config = (builds.FIRMWARE / "include" / "teds" / "config.h").read_text()
+    said = dict(re.findall(r"(TEDS_\w+)=\$\{CONFIG_(TEDS_NODE_\w+)\}", cmake))
+    assert {"TEDS_MAX_MESSAGE", "TEDS_STAGING", "TEDS_SESSIONS", "TEDS_CHANNELS", "TEDS_STREAMS"} <= said.keys()
+    for name, option in said.items():
+        found = re.search(rf"config {option}\n\tint .*\n\trange (\d+) (\d+)\n\tdefault (\d+)\n", kconfig)
+        assert found is not None, option
+        least, most, usual = found.groups()
+        assert f"#define {name} {usual}\n" in config
+        for value in (least, most):
+            words = [f"-D{name}={value}", *(["-DTEDS_CHANNELS=32"] if name == "TEDS_EVENT_CHANNELS" else [])]
+            done = subprocess.run(
+                ["gcc", "-std=c99", "-fsyntax-only", *words, f"-I{builds.FIRMWARE}/include", "-xc", "-"],
+                input='#include "teds/node.h"\n', capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("name", [LOAD, GRIPPER])
