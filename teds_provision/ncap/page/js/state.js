@@ -104,6 +104,9 @@ export function membersOf(measurement) {
   return state.groups.find((group) => group.name === measurement.group)?.uuids ?? [];
 }
 
+let asked = 0; // requests for nodes, all of them or one; an answer to an earlier one replaces none to a later
+const single = new Map(); // UUID → the last request for that node alone which was answered
+
 const LISTS = {
   status: async () => {
     state.status = shapes.status(await get("status"));
@@ -114,9 +117,16 @@ const LISTS = {
     }
   },
   nodes: async () => {
+    const mine = ++asked;
     const { nodes, total } = await get("nodes");
     state.total = total ?? 0;
-    state.nodes = new Map((nodes ?? []).map((wire) => [wire.uuid, shapes.node(wire)]));
+    const found = new Map((nodes ?? []).map((wire) => [wire.uuid, shapes.node(wire)]));
+    for (const [uuid, number] of single) {
+      if (number < mine) single.delete(uuid);
+      else if (state.nodes.has(uuid)) found.set(uuid, state.nodes.get(uuid));
+      else found.delete(uuid);
+    }
+    state.nodes = found;
     state.loaded = true;
   },
   groups: async () => (state.groups = (await get("groups")).groups ?? []),
@@ -162,10 +172,15 @@ async function fetchDue() {
   const uuids = [...due];
   due.clear();
   if (uuids.length > 5) return refresh("nodes");
+  const mine = ++asked;
   const answers = await Promise.allSettled(uuids.map((uuid) => get(paths.node(uuid))));
   answers.forEach((answer, index) => {
-    if (answer.status === "fulfilled") state.nodes.set(uuids[index], shapes.node(answer.value));
-    else if (answer.reason.status === 404) state.nodes.delete(uuids[index]);
+    const uuid = uuids[index];
+    const gone = answer.reason?.status === 404;
+    if ((single.get(uuid) ?? 0) > mine || (answer.status === "rejected" && !gone)) return;
+    single.set(uuid, mine);
+    if (gone) state.nodes.delete(uuid);
+    else state.nodes.set(uuid, shapes.node(answer.value));
   });
   return changed("nodes");
 }

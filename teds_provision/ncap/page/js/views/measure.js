@@ -87,8 +87,8 @@ class Groups {
   }
 }
 
-function tick(node) {
-  const box = h("input", { type: "checkbox", value: node.uuid });
+function tick(node, checked = false) {
+  const box = h("input", { type: "checkbox", value: node.uuid, checked });
   return h("label", { class: "tick" }, box, h("span", {}, nameOf(node)), h("span", { class: "hint" }));
 }
 
@@ -143,18 +143,18 @@ class GroupCard {
     this.errorShown = one?.error?.message;
   }
 
-  /** Nodes to tick, those of the group ticked; left alone while somebody ticks. */
+  /** Nodes to tick, those of the group ticked. What somebody ticked stays, whichever nodes come, until the group changes. */
   paintMembers(group, frozen) {
     const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false).sort(byName);
-    const told = JSON.stringify([group.uuids, nodes.map((node) => [node.uuid, node.name]), frozen]);
-    if (this.toldMembers === told) return;
+    const told = JSON.stringify([group.uuids, frozen]);
+    const anew = this.toldMembers !== told;
     this.toldMembers = told;
-    fill(this.others.lastChild, nodes.map((node) => {
-      const row = tick(node);
+    const member = (node) => group.uuids.includes(node.uuid);
+    keyed(this.others.lastChild, nodes, (node) => node.uuid, (node) => tick(node, member(node)), (row, node) => {
       text(row.querySelector("span"), nameOf(node));
-      Object.assign(row.firstChild, { checked: group.uuids.includes(node.uuid), disabled: frozen });
-      return row;
-    }));
+      row.firstChild.disabled = frozen;
+      if (anew) row.firstChild.checked = member(node);
+    });
     this.keep.disabled = frozen;
   }
 

@@ -117,6 +117,7 @@ export class ProvisionTab {
       return;
     }
     const file = this.calibration.files[0];
+    const before = this.run;
     try {
       const answer = await post(paths.provision(this.uuid), {
         profile: this.profile.value,
@@ -124,9 +125,8 @@ export class ProvisionTab {
         calibration: file ? await file.text() : null,
         calibration_name: file?.name ?? null,
       });
-      const run = this.run;
-      // An event may have come before this answer, and then knows more.
-      if (!run || run.state === "done" || run.state === "failed") state.runs.set(this.uuid, { steps: [], ...answer, state: answer.state ?? (answer.waits_for ? "waiting" : "running") });
+      // An event may have come before this answer, be it that of the end, and then knows more.
+      if (this.run === before) state.runs.set(this.uuid, { steps: [], ...answer, state: answer.state ?? (answer.waits_for ? "waiting" : "running") });
       this.paint();
     } catch (error) {
       fill(this.outcome, trouble(error));

@@ -180,6 +180,7 @@ function nameRow(one) {
   async function rename() {
     try {
       await change("names", { uuid: known.uuid, channel: known.channel, name: entry.value.trim().replace(/^\/+/, "") || null });
+      entry.told = entry.value;
       say("Renamed.");
       await refresh("names", "nodes");
     } catch (error) {
@@ -187,11 +188,11 @@ function nameRow(one) {
     }
   }
   element.paint = (now) => {
-    const before = known;
     known = now;
     text(label, labelOf(now));
     entry.setAttribute("aria-label", `Topic of ${label.textContent}`);
-    if (document.activeElement !== entry && (before !== now || !entry.value)) entry.value = now.topic ?? "";
+    // What somebody typed stays until it is sent, whatever others rename meanwhile.
+    if (document.activeElement !== entry && entry.value === (entry.told ?? "")) entry.value = entry.told = now.topic ?? "";
     keep.disabled = state.status?.write === false || state.connection !== "live";
   };
   return element;
