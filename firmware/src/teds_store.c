@@ -251,7 +251,13 @@ int teds_make_blank(teds_node *node)
 
 void teds_store_poll(teds_node *node)
 {
-    if (node->old_slot_due && !teds_can_sending(node)) {
+    bool sends = teds_can_sending(node);
+#if TEDS_BLE
+    for (int8_t i = 0; i < TEDS_REPLIES; i++) {
+        sends = sends || teds_ble_sends(node, i);
+    }
+#endif
+    if (node->old_slot_due && !sends) {
         node->old_slot_due = false; /* where it fails, the next Write or start erases it */
         (void)teds_make_blank(node);
     }

@@ -317,6 +317,26 @@ static void more_long_answers_than_room_cut_the_oldest_short(void)
     memory_free(board);
 }
 
+/* Erasing takes seconds on some chips: it waits until the reply has left, over BLE too. */
+static void the_old_slot_is_erased_when_the_reply_has_left(void)
+{
+    static const uint8_t identify[12] = {0, 5, 0, 6, 0, 0, 0, 0, 128, 7, 0, 0};
+    memory_board *board = fresh();
+    uint8_t data[512];
+    memory_ble_connected(board, 0, 23);
+    memory_ble_written(board, 0, identify, sizeof identify);
+    board->node.old_slot_due = board->node.free_slot_dirty = true;
+    memory_cut(board, 0, false);
+    (void)memory_poll(board);
+    CHECK(memory_ble_notify(board, 0, data) == 20 && memory_steps(board) == 0, "the first of two notifications");
+    (void)memory_poll(board);
+    CHECK(memory_steps(board) == 0, "one has not left yet");
+    CHECK(memory_ble_notify(board, 0, data) == 18, "the last");
+    (void)memory_poll(board);
+    CHECK(memory_steps(board) == 1, "erased: %ld steps", memory_steps(board));
+    memory_free(board);
+}
+
 static uint8_t address_of(const memory_board *board)
 {
     uint8_t identity[23];
@@ -439,6 +459,7 @@ int main(void)
     everyone_is_answered_after_a_wait();
     everyone_is_answered_in_time_though_the_last_answer_waits();
     more_long_answers_than_room_cut_the_oldest_short();
+    the_old_slot_is_erased_when_the_reply_has_left();
     a_new_address_counts_though_its_reply_is_lost();
     after_bus_off_it_is_silent_for_longer_and_longer();
     nodes_that_meet_sort_themselves_out();
