@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from typing import Any
 
 import pytest
 
+from teds_provision.client import ApiError
+from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk
 from tests.ncap.service import Service, verdict
 from tests.pace import until
@@ -48,6 +51,25 @@ def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> 
         until(lambda: not asked.node(node.uuid)["present"])
         node.start()  # a tap that nobody asked for anything: it is looked at
         until(lambda: asked.node(node.uuid)["present"])
+    service.end()
+
+
+def test_a_request_that_could_not_begin_is_none_that_runs(desk: Desk) -> None:
+    """Where no temporary file could be written, the node was "already being provisioned" until the next start."""
+    temporary = desk.folder / "tmp"
+    temporary.mkdir()
+    service = Service(desk, desk.station()).start(environment=clean_environment(TMPDIR=str(temporary)))
+    with service.client() as asked:
+        begin = ("POST", "/nodes/next/provision")
+        asked.request(*begin, {"profile": ANGLE})
+        asked.request(*begin, {"cancel": True})
+        shutil.rmtree(temporary)
+        with pytest.raises(ApiError, match="No temporary file can be written: No such file") as refused:
+            asked.request(*begin, {"profile": ANGLE})
+        assert (refused.value.status, refused.value.code) == (503, "store")
+        assert asked.request("GET", "/nodes/next/provision")["state"] == "cancelled"
+        temporary.mkdir()
+        assert asked.request(*begin, {"profile": ANGLE})["state"] == "waiting"
     service.end()
 
 

@@ -15,7 +15,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import BadData, NodeRefused, NotFound, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.errors import (
+    BadData,
+    NodeRefused,
+    NotFound,
+    PolicyRefused,
+    StoreFailure,
+    TedsProvisionError,
+    UsageFailure,
+)
 from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk, Errand
@@ -100,7 +108,8 @@ class Provisioning:
 
         ``adopt``: the datasheet that the board brought is signed; ``accept`` says why it is right in spite of findings.
 
-        Raises UsageFailure, NotFound, BadData, PolicyRefused for what cannot be built, before anybody is waited for.
+        Raises UsageFailure, NotFound, BadData, PolicyRefused for what cannot be built, StoreFailure where no temporary
+        file can be written, before anybody is waited for.
         """
         with self._guard:
             before = self._runs.get(uuid)
@@ -108,8 +117,9 @@ class Provisioning:
                 raise UsageFailure(f"Node {uuid} is already being provisioned.", hint="Cancel that first.")
             run = self._runs[uuid] = Run(uuid)  # at once: a second request meanwhile is refused
         # The text of a calibration, as the file that the steps read; it is there until the run has ended.
-        folder = tempfile.TemporaryDirectory(prefix="ncap-")
+        folder: tempfile.TemporaryDirectory[str] | None = None
         try:
+            folder = tempfile.TemporaryDirectory(prefix="ncap-")
             order = BuildOrder(
                 profile=profile,
                 calibration=_file(Path(folder.name), calibration, calibration_name),
@@ -118,10 +128,18 @@ class Provisioning:
                 accept_calibration=accept,
             )
             prepare(self._station, order, None if uuid == NEXT else bytes.fromhex(uuid))
-        except BaseException:
-            folder.cleanup()
+        except BaseException as error:
+            if folder is not None:
+                folder.cleanup()
             with self._guard:
-                self._runs.pop(uuid, None)
+                del self._runs[uuid]
+                if before is not None:
+                    self._runs[uuid] = before
+            if isinstance(error, OSError):
+                raise StoreFailure(
+                    f"No temporary file can be written: {error.strerror or type(error).__name__}.",
+                    hint=f"Make room in {tempfile.gettempdir()}, then try again.",
+                ) from error
             raise
 
         who = ACTOR.get()
