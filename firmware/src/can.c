@@ -11,7 +11,7 @@
 #define LAST_STATION 0xF7u
 #define CR_NS TEDS_SECOND
 #define MOST_OF_12_BITS 4095u
-#define LONGEST_SILENCE 30u /* s */
+#define LONGEST_SILENCE UINT64_C(30) /* s */
 #define EVERYONE_NS (UINT64_C(50) * 1000000u)
 #define START_NS (UINT64_C(500) * 1000000u)
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
