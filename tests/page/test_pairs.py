@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -106,3 +107,26 @@ def test_what_is_typed_as_a_topic_stays_while_others_rename(browser: Browser, la
         for channel in (2, 3):
             station.request("PUT", "/names", {"uuid": uuid, "channel": channel, "name": None})
         until(lambda: entry.input_value() == "/bench/hand/opening")
+
+
+def test_nothing_is_written_that_was_not_shown(browser: Browser, lab: Lab, tmp_path: Path) -> None:
+    """Another tab wrote after the changes were shown: they were other changes then, and nobody saw them."""
+    uuid = lab.nodes["slew"].uuid
+    with (
+        opened(browser, lab, route=f"nodes/{uuid}/datasheet") as page,
+        client.connect(home=lab.station.home) as station,
+    ):
+        sheet = page.request.get(f"{lab.url}/api/v1/nodes/{uuid}/teds?format=json").text()
+        file = tmp_path / "slew.json"
+        file.write_text(sheet.replace('"slew"', '"crane slew"'))
+        page.get_by_label("Choose a datasheet file").set_input_files(file)
+        row = page.get_by_role("table", name="What changes, in physical units").get_by_role("row", name="crane slew")
+        row.wait_for()
+        station.request("PUT", f"/nodes/{uuid}/teds", {"content": sheet.replace('"slew"', '"tower slew"')})
+        page.get_by_role("button", name="Sign and write to").click()
+        page.get_by_role("alert").filter(has_text="has changed since").wait_for()
+        assert row.get_by_role("cell").all_inner_texts() == ["name", "tower slew", "→ crane slew"]
+        assert station.node(uuid)["name"] == "tower slew"
+        page.get_by_role("button", name="Sign and write to").click()
+        page.get_by_text("Signed, written and verified: authentic").wait_for()
+        station.request("PUT", f"/nodes/{uuid}/teds", {"content": sheet})

@@ -100,7 +100,7 @@ export class WritePanel {
     const changes = plan.changes ?? [];
     const guard = plan.guard ?? [];
     this.go = button(`Sign and write to ${nameOf(node)}`, { class: "main" }, "good");
-    this.go.addEventListener("click", () => this.go.busy(() => this.carry(body)));
+    this.go.addEventListener("click", () => this.go.busy(() => this.carry(name, body, plan)));
     const no = button("Cancel", { onclick: () => this.clear() });
     fill(
       this.result,
@@ -131,8 +131,15 @@ export class WritePanel {
     );
   }
 
-  async carry(body) {
+  async carry(name, body, reviewed) {
     try {
+      // Somebody else may have written to it since the changes were shown: nothing is written that nobody saw.
+      const plan = await change(`${paths.teds(this.uuid)}?dry_run=1`, body);
+      if (JSON.stringify(plan.changes) !== JSON.stringify(reviewed.changes)) {
+        this.plan(name, body, plan);
+        this.result.prepend(trouble({ message: "The datasheet on the node has changed since.", hint: "Review the changes again." }));
+        return;
+      }
       const done = await change(paths.teds(this.uuid), body);
       fill(this.result, h("p", { class: "done" }, chip("good", "good", "Written"), ` Signed, written and verified${done.verdict ? `: ${done.verdict}` : ""}.`));
       this.go = null;
