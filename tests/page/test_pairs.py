@@ -130,3 +130,18 @@ def test_nothing_is_written_that_was_not_shown(browser: Browser, lab: Lab, tmp_p
         page.get_by_role("button", name="Sign and write to").click()
         page.get_by_text("Signed, written and verified: authentic").wait_for()
         station.request("PUT", f"/nodes/{uuid}/teds", {"content": sheet})
+
+
+def test_a_datasheet_that_is_open_has_the_verdict_of_now(browser: Browser, lab: Lab) -> None:
+    with client.connect(home=lab.station.home) as station:
+        uuid = station.request("POST", "/virtual", {"profile": ANGLE, "name": "passing"})["uuid"]
+        until(lambda: (station.node(uuid)["verdict"] or {}).get("verdict") == "authentic")
+        try:
+            with opened(browser, lab, route=f"nodes/{uuid}/datasheet") as page:
+                head, told = page.locator(".node-facts .chip").first, page.locator(".sheet-verdict .chip").first
+                told.get_by_text("Authentic", exact=True).wait_for()
+                lab.ask("revoke", uuid, "--why", "a test", "--yes")
+                head.get_by_text("Not authentic", exact=True).wait_for()
+                told.get_by_text("Not authentic", exact=True).wait_for()
+        finally:
+            station.request("DELETE", f"/virtual/{uuid}")

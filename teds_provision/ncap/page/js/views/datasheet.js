@@ -30,20 +30,25 @@ export class DatasheetTab {
   paint() {
     if (this.read.getAttribute("aria-busy") !== "true") this.read.disabled = state.connection !== "live";
     this.write.paint();
+    const judged = state.nodes.get(this.uuid)?.verdict;
+    // The verdict shown here is that of the last reading: it does not stay beside another one in the head of the node.
+    if (this.judged !== undefined && judged !== undefined && judged !== this.judged && state.connection === "live") this.load();
   }
 
   async load() {
+    this.judged = undefined;
     await this.read.busy(async () => {
       if (!this.body.querySelector(".teds")) fill(this.body, h("p", { class: "empty busy-line" }, "Reading and verifying the datasheet …"));
       try {
         const sheet = await get(paths.teds(this.uuid), { signal: this.leaving.signal });
         this.show(sheet);
         say(`Datasheet of ${nameOf(state.nodes.get(this.uuid))} read.`);
-        refresh("nodes");
+        await refresh("nodes");
       } catch (error) {
         if (error.name !== "AbortError") fill(this.body, trouble(error));
       }
     });
+    this.judged = state.nodes.get(this.uuid)?.verdict;
     this.paint();
   }
 
