@@ -43,9 +43,9 @@ class Yard:
     def node(self, name: str, **more: str) -> Node:
         return self.desk.node(name, **more).start(nfc=False, can=True)
 
-    def provisioned(self, name: str = "node") -> Node:
+    def provisioned(self, name: str = "node", *words: str) -> Node:
         node = self.node(name)
-        self.done("north", "provision", "--profile", PROFILE, "--yes", *self.bus)
+        self.done("north", "provision", "--profile", PROFILE, "--yes", *words, *self.bus)
         return node
 
 
@@ -99,8 +99,7 @@ def test_out_of_service_with_the_nodes_own_receipt(yard: Yard) -> None:
 
 
 def test_a_spare_in_the_place_of_a_node(yard: Yard) -> None:
-    old = yard.provisioned("old")
-    yard.done("north", "build", old.uuid, "--profile", PROFILE, "--name", "elbow")
+    old = yard.provisioned("old", "--name", "elbow")
     old.stop()
     spare = yard.provisioned("spare")
     replaced = yard.done("north", "replace", "elbow", spare.uuid, "--yes")
