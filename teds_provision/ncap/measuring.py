@@ -631,17 +631,13 @@ class Measuring:
             facts |= {"present": True, "seen": time.time(), "problem": None}
             if before.get("state") != "running":
                 facts |= {"heard": None, "looked": time.time()}  # in a session: what it said outside one is past
-        elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, one):
+        elif said.state in ("lost", "refused", "waiting") and said.why:
             facts["problem"] = as_problem(TedsProvisionError(said.why))
         if changed:
             self._roster.refresh([said.uuid])
         self._roster.note(said.uuid, said.state if changed else None, **facts)
         if changed and one.job is not None and not one.stop.is_set() and one.newcomers is None:
             self._say(one, *_state_of(one, one.job))
-
-    def _is_of(self, uuid: str, one: Running) -> bool:
-        """Whether a node is this measurement's, or nobody's: what one that it has left says of it is past."""
-        return self.of(uuid) in (None, one.kept.id)
 
     def _tell_who_comes(self, one: Running, said: NodeReport, before: str | None) -> None:
         """An event for each node that begins to be measured, is not any more, or waits, and why."""

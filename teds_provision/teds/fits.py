@@ -174,15 +174,10 @@ def _fit_of(requirement: Requirement, channel: Channel, now: datetime | None) ->
         elif term.what == "uncertainty" and now is not None and channel.overdue(now):
             short.append(f"its calibration was due on {channel.due:%Y-%m-%d}")
     if short:
-        return Fit(channel.number, channel.name, "failed", _sentence(short + unknown))
+        return Fit(channel.number, channel.name, "failed", "; ".join(short + unknown) + ".")
     if unknown:
-        return Fit(channel.number, channel.name, "skipped", _sentence(unknown))
+        return Fit(channel.number, channel.name, "skipped", "; ".join(unknown) + ".")
     return Fit(channel.number, channel.name, "passed", _all_shown(requirement, channel))
-
-
-def _sentence(parts: Iterable[str]) -> str:
-    """Half sentences, and whole ones, as one."""
-    return f"{'; '.join(part.removesuffix('.') for part in parts)}."
 
 
 def _all_shown(requirement: Requirement, channel: Channel) -> str:
