@@ -447,7 +447,7 @@ def _refusal(roster: Roster, wanted: Wanted, answer: Answer) -> TedsProvisionErr
         "sequence": "A person at the office has to look: signer once FILE --jump",
     }
     return Refused(
-        f"The office {roster.name_of(wanted.office)} does not sign ({answer.refused}): {answer.why}.",
+        f"The office {roster.name_of(wanted.office)} does not sign ({answer.refused}): {answer.why.rstrip('.')}.",
         hint=hints.get(answer.refused, ""),
     )
 

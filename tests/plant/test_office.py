@@ -356,7 +356,7 @@ def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: D
     run, one = desk.run(), board(1)
     assert run.job is not None
     desk.office.plant.line.set_job_state(run.job.id, "closed")
-    with pytest.raises(Refused, match=r"\(job\)"):
+    with pytest.raises(Refused, match=r"\(job\): .*closed here\.$"):
         build(run, one)
     desk.office.plant.line.set_job_state(run.job.id, "open")
     assert build(run, one).verified.verdict == "authentic"
