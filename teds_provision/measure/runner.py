@@ -83,8 +83,8 @@ class Measurement:
         self._known: dict[tuple[str, int], ChannelFacts] = {}
         self._grids: dict[str, Grid] = {}  # "": of all nodes together; else by UUID, each node's own
         self._for_grid: deque[Block] = deque()
-        self._shown: dict[str, str] = {}  # what was told of each sink last, and since when one waits
-        self._waits: dict[str, float] = {}
+        self._shown: dict[int, str] = {}  # by id, for two may have one name: what was told of each sink last,
+        self._waits: dict[int, float] = {}  # and since when one waits
         self._common_start = CommonStart(self.uuids, trigger=self.request.trigger)
         self._ending = False
         opened: list[Sink] = []
@@ -174,16 +174,16 @@ class Measurement:
         """Whether a sink failed, waits for its consumers for long or its disk for room, or goes on again."""
         stats, now, recorder = sink.stats, time.monotonic(), sink.recorder
         state = "failed" if stats.error else str(stats.state)
-        since = self._waits.setdefault(sink.name, now)
+        since = self._waits.setdefault(id(sink), now)
         if state != "waiting":
-            del self._waits[sink.name]
-        before = self._shown.get(sink.name, "running")
+            del self._waits[id(sink)]
+        before = self._shown.get(id(sink), "running")
         told = f"{state} {stats.detail}".strip() if recorder else state  # it may have waited and gone on between looks
         if told == before or state not in ("failed", "running", "waiting"):
             return False
         if state == "waiting" and not recorder and now - since < WAITING:
             return False
-        self._shown[sink.name] = told
+        self._shown[id(sink)] = told
         return True
 
     def _rows(self) -> None:

@@ -66,7 +66,7 @@ def test_a_broker_that_is_not_there_is_told_and_what_it_cost(hall: Hall) -> None
     place = f"mqtt://127.0.0.1:{free_tcp_port()}"
     lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place, code=5)
     told = next(line for line in lines if line["event"] == "sink")
-    assert (told["state"], told["sink"]) == ("waiting", "mqtt://127.0.0.1")
+    assert (told["state"], told["sink"]) == ("waiting", place)
     assert "nobody listens at 127.0.0.1" in told["why"]
     assert lines[-1]["error"]["code"] == "link"
     assert "took nothing: nobody listens at 127.0.0.1" in lines[-1]["error"]["message"]

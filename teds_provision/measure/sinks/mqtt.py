@@ -4,7 +4,9 @@ Topics: ``<station>/<node>`` carries the newest values of a node as one JSON obj
 ``StationFacts.scalar_rate``; ``homeassistant/sensor/<uuid>/<channel>/config`` (retained) tells Home Assistant where to
 look; ``<station>/<group>/status`` is ``online`` or, by the broker's will, ``offline``: each measurement has its own,
 for several may run and one that ends must not end the others. An entity is available while that is online and its node
-runs, so the last value of a node that is lost is not taken for one of now. Values are in the unit for people (°C), for
+runs, so the last value of a node that is lost is not taken for one of now. One client identifier serves every
+connection of a measurement: a broker that still holds one that was cut then ends it when the next one begins, and its
+will cannot say ``offline`` over the new ``online`` half a minute later. Values are in the unit for people (°C), for
 Home Assistant knows units by their signs. Nothing is subscribed: no actuator is moved by MQTT.
 
 A password is read from the file that the URL names (``mqtt://user@host?password-file=PATH``): never from the URL. With
@@ -17,10 +19,12 @@ from __future__ import annotations
 
 import json
 import math
+import secrets
 import stat
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import parse_qsl, urlsplit
@@ -30,7 +34,7 @@ from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFa
 from teds_provision.files import read_limited
 from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
-from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
+from teds_provision.measure.sinks.base import TICK, CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import status_line
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.teds.units import display_unit, short_unit
@@ -48,8 +52,10 @@ FILES: Final = ("password-file", "ca", "cert", "key")
 """Keys of the URL; each names a file."""
 _MOST_OCTETS: Final = 1 << 20
 PORTS = {"mqtt": 1883, "mqtts": 8883}
+_FULL: Final = 15  # what the library answers where WAITING messages wait
+_FAREWELL: Final = 2.0  # seconds for the broker to take that this measurement has ended
 KEEP_ALIVE = 15  # seconds: the broker says offline after one and a half of it
-WAITING = 1000  # messages that the library may hold for a slow broker
+WAITING = 1000  # messages that the library may hold for a slow broker; what it does not take is offered again
 RUNS = "{{ 'online' if value_json.state == 'running' else 'offline' }}"  # a template of Home Assistant
 DEVICE_CLASSES = {"°C": "temperature", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "lx": "illuminance"}
 
@@ -71,7 +77,8 @@ class MqttSink(ThreadedSink):
                 "A password may not stand on the command line.",
                 hint="Put it into a file: mqtt://USER@HOST?password-file=PATH",
             )
-        super().__init__(f"{parts.scheme}://{parts.hostname}")
+        shown = f":{port}" if port != PORTS[parts.scheme] else ""  # two brokers of one host are told apart
+        super().__init__(f"{parts.scheme}://{_host(parts.hostname)}{shown}")
         self._parts = parts
         self._host, self._port = parts.hostname, port
         self._files = _files_of(parts.query, tls=parts.scheme == "mqtts")
@@ -86,6 +93,10 @@ class MqttSink(ThreadedSink):
         self._topics = Topics(self._station)
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
         self._units: dict[tuple[str, int], WrittenUnit | None] = {}
+        self._parts_of_topics: dict[str, str] = {}
+        """What each node is called in topics, as it was announced last."""
+        self._owed_entities: dict[tuple[str, int], None] = {}  # to be announced, in this order
+        self._left: list[str] = []  # topics of names that nodes had, whose retained states go
         self._newest: dict[str, dict[str, float | None]] = {}
         self._due: dict[str, float] = {}
 
@@ -97,7 +108,7 @@ class MqttSink(ThreadedSink):
             raise TedsProvisionError("MQTT needs the package paho-mqtt.", hint=how_to_install("mqtt")) from None
         self._station, self._topics = station, Topics(station)
         self._learn(facts)
-        client = paho.Client(CallbackAPIVersion.VERSION2)
+        client = paho.Client(CallbackAPIVersion.VERSION2, client_id=f"teds{secrets.token_hex(8)}")
         client.max_queued_messages_set(WAITING)
         if self._parts.scheme == "mqtts":
             client.tls_set_context(self._tls())
@@ -155,10 +166,12 @@ class MqttSink(ThreadedSink):
         error = sys.exc_info()[1]
         self._waits(_in_words(error, self._host, self._port) if error is not None else "")
 
-    def _on_disconnect(self, *_: Any) -> None:
+    def _on_disconnect(self, _client: Any, _userdata: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if self._connected.is_set():
             self._connected.clear()
             self._waits(f"the broker at {self._host} has gone")
+        elif reason == "Keep alive timeout":
+            self._waits(f"whoever listens at {self._host}:{self._port} says nothing for {KEEP_ALIVE} s")
         elif not self._why:  # with TLS 1.3 a server refuses a client's certificate after the client's handshake
             tls = self._parts.scheme == "mqtts"
             may = "; it may want another client certificate (cert=, key=)" if tls else "; it may speak TLS (mqtts://)"
@@ -174,9 +187,19 @@ class MqttSink(ThreadedSink):
         self._client.loop_start()
 
     def _learn(self, facts: tuple[ChannelFacts, ...]) -> None:
+        """Facts that are new or have changed are announced, and those of a node whose topics have another name now."""
+        changed = [one.key for one in facts if self._facts.get(one.key) != one]
         self._facts.update((one.key, one) for one in facts)
         self._topics.learn(facts)
         self._units.update((one.key, display_unit(one.units) if one.units else None) for one in facts)
+        names = {uuid: self._topics.node(uuid) for uuid, _ in self._facts}
+        renamed = {uuid for uuid, name in self._parts_of_topics.items() if names[uuid] != name}
+        taken = set(names.values())
+        self._left += [name for uuid in renamed if (name := self._parts_of_topics[uuid]) not in taken]
+        self._parts_of_topics = names
+        self._owed_entities |= dict.fromkeys(changed)
+        if renamed:
+            self._owed_entities |= dict.fromkeys(key for key in self._facts if key[0] in renamed)
 
     def _take(self, item: Item) -> None:
         self._greet()
@@ -184,8 +207,7 @@ class MqttSink(ThreadedSink):
             self._block(item)
         elif isinstance(item, tuple):
             self._learn(item)
-            if self._connected.is_set():
-                self._discover()
+            self._announce()
         elif isinstance(item, NodeReport):
             self._publish(
                 f"{self._topics.station}/{self._topics.node(item.uuid)}/state", status_line(item), retain=True
@@ -193,43 +215,56 @@ class MqttSink(ThreadedSink):
 
     def _idle(self, now: float) -> None:
         self._greet()
+        self._announce()
 
     def _greet(self) -> None:
         """After each connection: who is here, and what there is."""
-        if self._anew.is_set():
+        if self._anew.is_set() and self._client.publish(self._status, "online", qos=1, retain=True).rc != _FULL:
             self._anew.clear()
             self._why = ""
             self._say("running", f"connected to {self._host}")
-            self._client.publish(self._status, "online", qos=1, retain=True)
-            self._discover()
+            self._owed_entities = dict.fromkeys(self._facts)
+            self._announce()
 
-    def _discover(self) -> None:
-        for one in self._facts.values():
-            if one.unsigned:  # raw values alone, which are none of anything: no sensor to show
-                continue
-            node = f"{self._topics.station}/{self._topics.node(one.uuid)}"
-            marked = " (unverified)" if one.unverified else ""
-            device = {
-                "identifiers": [one.uuid],
-                "name": f"{one.node or one.uuid}{marked}",
-                "manufacturer": "IEEE 1451 transducer",
-                "sw_version": f"teds-provision {__version__}",
-            }
-            unit = self._units.get(one.key)
-            sign = short_unit(unit.text) if unit else one.unit
-            words = {
-                "name": f"{one.label}{marked}",
-                "unique_id": f"{one.uuid}_{one.number}",
-                "state_topic": node,
-                "value_template": f"{{{{ value_json.{self._field(one)} }}}}",
-                "availability": [{"topic": self._status}, {"topic": f"{node}/state", "value_template": RUNS}],
-                "availability_mode": "all",
-                "state_class": "measurement",
-                "device": device,
-                **({"unit_of_measurement": sign} if sign else {}),
-                **({"device_class": DEVICE_CLASSES[sign]} if sign in DEVICE_CLASSES else {}),
-            }
-            self._publish(f"{DISCOVERY}/sensor/{one.uuid}/{one.number}/config", words, qos=1, retain=True)
+    def _announce(self) -> None:
+        """Tell Home Assistant of what it was not told yet, as far as the library takes it for now."""
+        if not self._connected.is_set() or self._anew.is_set():
+            return
+        while self._left:
+            self._client.publish(f"{self._topics.station}/{self._left.pop()}/state", b"", retain=True)
+        while self._owed_entities:
+            key = next(iter(self._owed_entities))
+            if not self._discover(self._facts[key]):
+                return
+            del self._owed_entities[key]
+
+    def _discover(self, one: ChannelFacts) -> bool:
+        """Announce a channel; False where it has to be done again."""
+        if one.unsigned:  # raw values alone, which are none of anything: no sensor to show
+            return True
+        node = f"{self._topics.station}/{self._topics.node(one.uuid)}"
+        marked = " (unverified)" if one.unverified else ""
+        device = {
+            "identifiers": [one.uuid],
+            "name": f"{one.node or one.uuid}{marked}",
+            "manufacturer": "IEEE 1451 transducer",
+            "sw_version": f"teds-provision {__version__}",
+        }
+        unit = self._units.get(one.key)
+        sign = short_unit(unit.text) if unit else one.unit
+        words = {
+            "name": f"{one.label}{marked}",
+            "unique_id": f"{one.uuid}_{one.number}",
+            "state_topic": node,
+            "value_template": f"{{{{ value_json.{self._field(one)} }}}}",
+            "availability": [{"topic": self._status}, {"topic": f"{node}/state", "value_template": RUNS}],
+            "availability_mode": "all",
+            "state_class": "measurement",
+            "device": device,
+            **({"unit_of_measurement": sign} if sign else {}),
+            **({"device_class": DEVICE_CLASSES[sign]} if sign in DEVICE_CLASSES else {}),
+        }
+        return self._publish(f"{DISCOVERY}/sensor/{one.uuid}/{one.number}/config", words, qos=1, retain=True)
 
     def _field(self, facts: ChannelFacts) -> str:
         """Name of a channel in the node's JSON; a slug, for a template of Home Assistant is a program."""
@@ -263,22 +298,47 @@ class MqttSink(ThreadedSink):
             return None
         return value if unit is None else unit.from_si(value)
 
-    def _publish(self, topic: str, words: dict[str, Any], *, qos: int = 0, retain: bool = False) -> None:
+    def _publish(self, topic: str, words: dict[str, Any], *, qos: int = 0, retain: bool = False) -> bool:
+        """Whether the library took it; without a connection it keeps what has to arrive (QoS 1) and drops the rest."""
         octets = json.dumps(words, allow_nan=False).encode()
-        self._client.publish(topic, octets, qos=qos, retain=retain)
+        if self._client.publish(topic, octets, qos=qos, retain=retain).rc == _FULL:
+            return False
         self._count(octets=len(octets), messages=1)
+        return True
 
     def _finish(self) -> None:
         if self._client is None:
             return
-        if self._connected.is_set():
-            said = self._client.publish(self._status, "offline", qos=1, retain=True)
-            said.wait_for_publish(2.0)
+        if self._connected.is_set() and not self._said_offline():
+            self._cut()
         self._client.disconnect()
         self._client.loop_stop()
         if not self._greeted and self.stats.dropped:
             why = self._why or f"the broker at {self._host}:{self._port} does not answer"
             self._fail(TedsProvisionError(f"{self.name} took nothing: {why}.", hint="Mend that, and measure again."))
+
+    def _said_offline(self) -> bool:
+        """Whether the broker knows that this measurement has ended."""
+        until = time.monotonic() + _FAREWELL
+        said = self._client.publish(self._status, "offline", qos=1, retain=True)
+        while said.rc == _FULL and time.monotonic() < until:
+            time.sleep(TICK)
+            said = self._client.publish(self._status, "offline", qos=1, retain=True)
+        with suppress(ValueError, RuntimeError):  # it was not taken
+            said.wait_for_publish(max(0.0, until - time.monotonic()))
+            return bool(said.is_published())
+        return False
+
+    def _cut(self) -> None:
+        """End the connection without a farewell, so that the broker says offline by the will that it holds."""
+        connection = self._client.socket()
+        if connection is not None:
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+
+
+def _host(name: str) -> str:
+    return f"[{name}]" if ":" in name else name
 
 
 def _files_of(query: str, *, tls: bool) -> dict[str, str]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import socket
 import subprocess
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +17,7 @@ import pytest
 
 from teds_provision.errors import TedsProvisionError, UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, NodeReport
-from teds_provision.measure.sinks import open_sink
+from teds_provision.measure.sinks import mqtt, open_sink
 from teds_provision.teds.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
 from tests.pace import until
@@ -53,6 +56,56 @@ class Broker:
         client.connect_async("127.0.0.1", self.port)
         client.loop_start()
         return client, topics
+
+    def heard_of(self, topic: str) -> tuple[Any, list[str]]:
+        """A client, and all that it hears of one topic."""
+        import paho.mqtt.client as paho
+
+        heard: list[str] = []
+        client = paho.Client(paho.CallbackAPIVersion.VERSION2)
+        client.on_connect = lambda *_: client.subscribe(topic, qos=1)
+        client.on_message = lambda _c, _u, message: heard.append(message.payload.decode())
+        client.connect("127.0.0.1", self.port)
+        client.loop_start()
+        return client, heard
+
+
+class Cable:
+    """Lies between a sink and its broker, and can be pulled: the sink notices, the broker does not."""
+
+    def __init__(self, port: int) -> None:
+        self._broker = port
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listening.getsockname()[1]
+        self._ends: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listening.accept()
+            except OSError:
+                return
+            far = socket.create_connection(("127.0.0.1", self._broker))
+            self._ends += [near, far]
+            for one, other in ((near, far), (far, near)):
+                threading.Thread(target=self._carry, args=(one, other), daemon=True).start()
+
+    def _carry(self, one: socket.socket, other: socket.socket) -> None:
+        try:
+            while octets := one.recv(1 << 16):
+                other.sendall(octets)
+        except OSError:
+            pass
+
+    def pull(self) -> None:
+        """The newest connection ends for the sink; its other half stays open."""
+        self._ends[-2].shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._listening.close()
+        for one in self._ends:
+            one.close()
 
 
 @pytest.fixture
@@ -132,6 +185,138 @@ class TestWithMosquitto:
                 until(lambda: sink.stats.state == "waiting")
         finally:
             sink.close()
+
+    def test_a_connection_that_was_cut_puts_nobody_offline_afterwards(self, broker: Broker) -> None:
+        # The broker noticed the cut only after 22 s, and its will then said offline over the new connection's online.
+        broker.start()
+        client, heard = until(lambda: _tried(lambda: broker.heard_of("bench/status")))
+        cable = Cable(broker.port)
+        sink = open_sink(f"mqtt://127.0.0.1:{cable.port}")
+        try:
+            sink.open([ANGLE], STATION)
+            until(lambda: heard == ["online"])
+            cable.pull()
+            until(lambda: "offline" in heard and heard[-1] == "online")
+        finally:
+            sink.close()
+            cable.close()
+            client.disconnect()
+            client.loop_stop()
+        assert sink.stats.error == ""
+
+    def test_more_channels_than_the_library_holds_are_all_announced(self, broker: Broker) -> None:
+        broker.start()
+        facts = [replace(ANGLE, uuid=f"{number:020x}", node=f"node {number}") for number in range(1500)]
+        client, heard = broker.heard()
+        sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
+        sink.open(facts, STATION)
+        try:
+            until(lambda: sum(topic.startswith("homeassistant/") for topic in heard) == len(facts))
+            sink.close()
+            until(lambda: heard["bench/status"] == "offline")
+        finally:
+            sink.close()
+            client.disconnect()
+            client.loop_stop()
+
+    def test_what_ends_before_the_broker_took_all_of_it_is_offline(self, broker: Broker) -> None:
+        broker.start()
+        facts = [replace(ANGLE, uuid=f"{number:020x}", node=f"node {number}") for number in range(1500)]
+        client, heard = until(lambda: _tried(lambda: broker.heard_of("bench/status")))
+        sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
+        sink.open(facts, STATION)
+        try:
+            until(lambda: heard == ["online"])
+            sink.close()
+            until(lambda: heard[-1] == "offline")
+        finally:
+            sink.close()
+            client.disconnect()
+            client.loop_stop()
+        assert sink.stats.state == "ended"
+
+    def test_a_newcomer_is_announced_and_nobody_else_again(self, broker: Broker) -> None:
+        broker.start()
+        client, heard = until(lambda: _tried(lambda: broker.heard_of("homeassistant/#")))
+        sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
+        sink.open([ANGLE], STATION)
+        try:
+            until(lambda: len(heard) == 1)
+            sink.describe([ANGLE])
+            sink.describe([OIL])
+            sink.describe([OIL])
+            sink.describe([replace(OIL, name="hot oil")])
+            until(lambda: len(heard) == 3)
+            sink.close()
+        finally:
+            sink.close()
+            client.disconnect()
+            client.loop_stop()
+        assert [json.loads(one)["name"] for one in heard] == ["angle", "oil", "hot oil"]
+
+    def test_a_node_that_gets_another_name_leaves_nothing_behind(self, broker: Broker) -> None:
+        broker.start()
+        sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
+        sink.open([ANGLE], STATION)
+        client, heard = broker.heard()
+        config = f"homeassistant/sensor/{ARM}/1/config"
+        try:
+            until(lambda: sink.stats.state == "running")
+            sink.report(NodeReport(ARM, "running"))
+            until(lambda: config in heard and heard.get("bench/arm/state"))
+            sink.describe([replace(ANGLE, chosen=((0, "boom"),))])
+            sink.report(NodeReport(ARM, "running"))
+            until(lambda: json.loads(heard[config])["state_topic"] == "bench/boom" and "bench/boom/state" in heard)
+            until(lambda: heard["bench/arm/state"] == "")  # an empty one takes what was retained away
+        finally:
+            sink.close()
+            client.disconnect()
+            client.loop_stop()
+
+    def test_a_broker_that_stands_still_holds_no_measurement_up(self, broker: Broker) -> None:
+        broker.start()
+        sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
+        sink.open([ANGLE], STATION)
+        until(lambda: sink.stats.state == "running")
+        client, heard = until(lambda: _tried(lambda: broker.heard_of("bench/status")))
+        assert broker.process is not None
+        broker.process.send_signal(signal.SIGSTOP)
+        try:
+            sink.close()
+            assert sink.stats.state == "ended"
+        finally:
+            broker.process.send_signal(signal.SIGCONT)
+        try:
+            until(lambda: heard[-1:] == ["offline"])
+        finally:
+            client.disconnect()
+            client.loop_stop()
+
+
+def _tried(make: Any) -> Any:
+    """What a broker gives that may not listen yet."""
+    try:
+        return make()
+    except OSError:
+        return None
+
+
+def test_who_accepts_and_says_nothing_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt, "KEEP_ALIVE", 1)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        port = mute.getsockname()[1]
+        sink = open_sink(f"mqtt://127.0.0.1:{port}")
+        sink.open([ANGLE], STATION)
+        try:
+            until(lambda: sink.stats.detail == f"whoever listens at 127.0.0.1:{port} says nothing for 1 s")
+        finally:
+            sink.close()
+
+
+def test_two_brokers_of_one_host_have_two_names() -> None:
+    specs = ["mqtt://lab", "mqtt://lab:1883", "mqtt://lab:1884", "mqtts://lab:1884", "mqtt://[::1]:1885"]
+    names = [open_sink(spec).name for spec in specs]
+    assert names == ["mqtt://lab", "mqtt://lab", "mqtt://lab:1884", "mqtts://lab:1884", "mqtt://[::1]:1885"]
 
 
 @pytest.mark.parametrize("spec", ["mqtt://", "mqtt:host", "mqtt://user:secret@host"])
