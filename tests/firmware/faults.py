@@ -1,5 +1,5 @@
 # ruff: noqa: E501 - lines of C as they stand
-"""The faulty nodes of ``tests/check`` in C, by their names there: one place of the source is changed, nothing else.
+"""The faulty nodes of ``tests/check`` in C, by their names there, each of them: one file of the source is changed, nothing else.
 
 The library itself holds no fault: a build of one is made from a changed copy of one file. A place that is not found any
 more, or found twice, fails the test.
@@ -11,18 +11,22 @@ from typing import Final, NamedTuple
 
 
 class Change(NamedTuple):
-    """In this file of firmware/src: ``old`` becomes ``new``; ``helper`` stands behind the first include."""
+    """In this file of firmware/src: ``old`` becomes ``new``, and so each of ``more``; ``helper`` stands behind the first
+    include."""
 
     file: str
     old: str
     new: str
     helper: str = ""
+    more: tuple[tuple[str, str], ...] = ()
 
     def made(self, text: str) -> str:
-        """The changed text; raises AssertionError where the place is not there once."""
-        assert text.count(self.old) == 1, f"{self.file} holds {self.old!r} {text.count(self.old)} times"
+        """The changed text; raises AssertionError where a place is not there once."""
+        for old, new in ((self.old, self.new), *self.more):
+            assert text.count(old) == 1, f"{self.file} holds {old!r} {text.count(old)} times"
+            text = text.replace(old, new)
         first = '#include "inside.h"\n'
-        return text.replace(self.old, self.new).replace(first, first + self.helper, 1)
+        return text.replace(first, first + self.helper, 1)
 
 
 HIGH: Final = """
@@ -425,4 +429,143 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_BASE64_NOT_STRICT": Change(
         "security_teds.c", "return out[65] == 0 && (length == 65 || out[64] == 0);", "return true;"
     ),
+    # -- the agreement, to its end
+    "FAULT_IDENTITY_KEY_AGREES": Change(
+        "agree.c",
+        "port->p256_ecdh(port->user, &own->key, payload + 194, z) != 0 ||\n"
+        "                 port->p256_ecdh(port->user, &own->key, payload, z + 32)",
+        "port->p256_ecdh(port->user, &node->key, payload + 194, z) != 0 ||\n"
+        "                 port->p256_ecdh(port->user, &node->key, payload, z + 32)",
+    ),
+    "FAULT_TWO_SLIPS": Change(
+        "agree.c",
+        'LABEL("TEDS1 transcript")',
+        'MAC_LABEL("TEDS1 transcript")',
+        more=(
+            ("&own->key, payload + 194, z)", "&own->key, payload, z)"),
+            ("payload, z + 32)", "payload + 194, z + 32)"),
+        ),
+    ),
+    "FAULT_SIGN_OF_REQUEST": Change(
+        "agree.c",
+        '{LABEL("TEDS1 agree"), {script, 32}}',
+        '{LABEL("TEDS1 agree"), {payload, REQUEST_OCTETS}}',
+    ),
+    "FAULT_FIRST_REQUEST_STAYS": Change(
+        "agree.c",
+        "    teds_pending_forget(node);\n    length = answer(node, payload, &own, out);\n",
+        "    const teds_pending before = node->pending;\n    length = answer(node, payload, &own, out);\n"
+        "    if (before.used) {\n        node->pending = before;\n        return length;\n    }\n",
+    ),
+    "FAULT_RESET_KEEPS_CA": Change(
+        "agree.c",
+        "if (!teds_in_factory(node) && memcmp(ca, node->state.ca, 65) != 0) {",
+        "if (kept[0] == 4 && memcmp(ca, kept, 65) != 0) {",
+        "static uint8_t kept[65];\n",
+        more=(
+            (
+                "    state.flags |= TEDS_KEYED;\n    state.epoch = ",
+                "    memcpy(kept, state.ca, 65);\n    state.flags |= TEDS_KEYED;\n    state.epoch = ",
+            ),
+        ),
+    ),
+    "FAULT_RESET_ANY_CHALLENGE": Change(
+        "node.c",
+        "{command->payload, 32}};\n    uint8_t hash[32];\n    if (command->length != 32) {",
+        "{command->payload, 32}};\n    uint8_t hash[32];\n    if (false) {",
+        more=(
+            (
+                "{epoch, 4}, {command->payload, 32}};\n    if (command->length != 32) {",
+                "{epoch, 4}, {command->payload, 32}};\n    if (false) {",
+            ),
+        ),
+    ),
+    # -- frames, sessions and writing, to their end
+    "FAULT_LIST_LONG": Change(
+        "node.c",
+        "    octets = close_reply(reply, outcome);\n",
+        "    if (length == 6 && frame[2] == 128 && frame[3] == TEDS_LIST) {\n"
+        "        outcome = 2046;\n        memset(reply + 3, 0, 2046);\n    }\n"
+        "    octets = close_reply(reply, outcome);\n",
+    ),
+    "FAULT_WRITE_ANYWHERE": Change(
+        "node.c",
+        "    octets = close_reply(reply, outcome);\n",
+        "    if (length >= 6 && frame[2] == 1 && frame[3] == TEDS_WRITE) {\n        outcome = 0;\n    }\n"
+        "    octets = close_reply(reply, outcome);\n",
+    ),
+    "FAULT_AAD_COUNTER": Change(
+        "session.c",
+        "    if (!node->port->ccm_open(node->port->user, keys->to_node, nonce, payload + 4, length - 20, plain, 16)) {",
+        "    if (!opened(keys->to_node, nonce, payload, length, plain)) {",
+        """#include <bearssl.h>
+static bool opened(const uint8_t key[16], const uint8_t nonce[13], const uint8_t *payload, size_t length, uint8_t *plain)
+{
+    br_aes_ct_ctrcbc_keys aes;
+    br_ccm_context ccm;
+    br_aes_ct_ctrcbc_init(&aes, key, 16);
+    br_ccm_init(&ccm, &aes.vtable);
+    br_ccm_reset(&ccm, nonce, 13, 4, length - 20, 16);
+    br_ccm_aad_inject(&ccm, payload, 4);
+    br_ccm_flip(&ccm);
+    memcpy(plain, payload + 4, length - 20);
+    br_ccm_run(&ccm, 0, plain, length - 20);
+    return br_ccm_check_tag(&ccm, payload + length - 16) != 0;
 }
+""",
+    ),
+    "FAULT_STAGING_PER_SESSION": Change(
+        "teds_store.c",
+        "    if (other >= 0 && now < node->sessions[other].staged_at + STAGED_NS) {\n        return -TEDS_BUSY;\n    }\n",
+        "",
+    ),
+    "FAULT_DIGEST_OF_DATA_BLOCKS": Change(
+        "commit.c",
+        "        const teds_part part = {image, length};\n",
+        "        const teds_part part = {image + 4, length - 6};\n",
+        more=(
+            (
+                "    return teds_find(node, id, &source) && teds_source_hash(node, &source, out) == 0 ? 0 : -1;",
+                "    uint8_t stored[4096];\n"
+                "    if (!teds_find(node, id, &source) || teds_source_read(node, &source, 0, stored, source.length) != 0) {\n"
+                "        return -1;\n    }\n"
+                "    const teds_part of_stored = {stored + 4, source.length - 6};\n"
+                "    teds_sha256_parts(node, &of_stored, 1, out);\n    return 0;",
+            ),
+        ),
+    ),
+    "FAULT_111_NOT_COVERED": Change(
+        "commit.c",
+        "    teds_base64(node->point, 65, own);\n",
+        "    for (size_t at = 6; at < length; at += 2u + block[at + 1]) {\n        if (block[at] > 110) {\n"
+        "            return true;\n        }\n    }\n    teds_base64(node->point, 65, own);\n",
+    ),
+}
+
+ON_THE_BUS: Final[dict[str, Change]] = {
+    "FAULT_RUNS_AGAIN": Change("node.c", "    if (!place->stored || memcmp(digest", "    if (true || memcmp(digest"),
+    "FAULT_EVERYONE_DROPS_REPLY": Change(
+        "can.c",
+        "    line->asked = false;\n",
+        "    line->asked = false;\n    for (size_t i = 0; i < TEDS_REPLIES; i++) {\n"
+        "        node->replies[i].stored = node->replies[i].stored && node->replies[i].link != line->source;\n    }\n",
+    ),
+    "FAULT_BUSY_SILENT": Change(
+        "can.c",
+        "        refuse(line, frame->data[head], TEDS_BUSY, frame->fd);\n        return;\n",
+        "        return;\n",
+    ),
+    "FAULT_ADDRESS_TOO_SOON": Change(
+        "node.c",
+        "    node->can.moves_to = command->payload[0]; /* when the reply has left */\n"
+        "    node->can.moves_link = origin->link;\n",
+        "    teds_can_move(node, command->payload[0]);\n",
+    ),
+    "FAULT_ADDRESS_STAYS": Change(
+        "can.c",
+        "    if (own != node->can.address) {\n",
+        "    if (own != node->can.address && own != teds_default_address(node->uuid)) {\n",
+        more=(("    switch (frame->data[0] >> 4) {\n", "    line->own = own;\n    switch (frame->data[0] >> 4) {\n"),),
+    ),
+}
+"""Faults of the node's lines, which a frame that is handed over whole does not meet: found over a bus."""

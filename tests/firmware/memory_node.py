@@ -68,6 +68,7 @@ class MemoryNode:
     ) -> None:
         self._library = _library(library or builds.library(max_message, max_teds + 4, **(sizes or {})))
         self._clock, self.max_message = clock, max_message
+        self.room = max_message
         self._draw = draw
         self._callback = _RANDOM(self._random)  # kept: the library calls it as long as the node is there
         self._fixed: list[Any] = []
@@ -193,12 +194,12 @@ class MemoryNode:
         """One command frame to one reply frame."""
         self._now()
         number, kind = link_number(link)
-        reply = ctypes.create_string_buffer(self.max_message)
+        reply = ctypes.create_string_buffer(self.room)
         length = self._library.memory_handle(
             self._board, ctypes.c_uint8(number), ctypes.c_uint8(kind), ctypes.c_bool(tapped), frame,
             ctypes.c_size_t(len(frame)), reply,
         )  # fmt: skip
-        assert length <= self.max_message
+        assert length <= self.room
         return reply.raw[:length]
 
     def identity(self) -> Identity:

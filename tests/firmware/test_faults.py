@@ -1,4 +1,7 @@
-"""``node check`` finds each faulty node in C by the rule that finds the one in Python, with the same words."""
+"""``node check`` finds each faulty node in C by the rule that finds the one in Python, with the same words.
+
+One whose fault lies in its lines is a process on a bus, all others are asked frame by frame.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,10 @@ from teds_provision.station.station import Station
 from tests.bench import make_station
 from tests.check import nodes
 from tests.check.faults import FAULTS
+from tests.e2e.desk import Desk
 from tests.firmware import builds
-from tests.firmware.faults import CHANGES
+from tests.firmware.conftest import CNode
+from tests.firmware.faults import CHANGES, ON_THE_BUS, Change
 from tests.firmware.memory_node import MemoryNode
 
 pytestmark = pytest.mark.system
@@ -34,15 +39,21 @@ def station(tmp_path: Path) -> Iterator[Station]:
     made.close()
 
 
+def faulty_source(folder: Path, change: Change) -> Path:
+    """The changed file."""
+    source = folder / change.file
+    source.write_text(
+        change.made((builds.FIRMWARE / "src" / change.file).read_text(encoding="utf-8")), encoding="utf-8"
+    )
+    return source
+
+
 def built(folder: Path, name: str) -> Path:
     """The library with this fault; "" is the good one."""
     if not name:
         return builds.library(MAX_MESSAGE, STAGING)
     objects, words = builds.objects(MAX_MESSAGE, STAGING)
-    change = CHANGES[name]
-    text = (builds.FIRMWARE / "src" / change.file).read_text(encoding="utf-8")
-    source, changed, library = folder / change.file, folder / "changed.o", folder / "faulty.so"
-    source.write_text(change.made(text), encoding="utf-8")
+    source, changed, library = faulty_source(folder, CHANGES[name]), folder / "changed.o", folder / "faulty.so"
     subprocess.run(["gcc", *words, "-w", "-c", str(source), "-o", str(changed)], check=True, cwd=builds.FIRMWARE)
     others = [str(path) for path in objects if path.stem != source.stem]
     subprocess.run(["gcc", "-shared", str(changed), *others, "-o", str(library), "-lbearssl"], check=True)
@@ -74,6 +85,7 @@ class Board(nodes.Measuring):
         node = Answering(
             self._draw, lambda: self.seconds, uuid=self.uuid, max_message=2048, max_teds=16384, library=self.library
         )
+        node.room = 2049  # FAULT_LIST_LONG
         if self.measures:
             for number, facts in self.hardware.channels.items():
                 node.add_channel(number, int(facts.kind), facts.octets)
@@ -115,3 +127,22 @@ def test_a_faulty_node_in_c_is_found_by_its_rule(
     assert FAULTS[name].rule in found, found
     assert FAULTS[name].words in found[FAULTS[name].rule].detail
     assert found[FAULTS[name].rule].slip == FAULTS[name].slip
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", ON_THE_BUS)
+def test_a_faulty_node_in_c_is_found_over_its_bus(desk: Desk, node: CNode, name: str) -> None:
+    node.program = desk.folder / "faulty-node"
+    source = faulty_source(desk.folder, ON_THE_BUS[name])
+    builds.compile_host(node.program, source)
+    node.start()
+    said = desk.station().run("--json", "node", "check", "--factory", "--yes", *desk.links.over("can"))
+    found = {check["rule"]: check for check in said.json["checks"] if check["result"] == "failed"}
+    assert FAULTS[name].rule in found, said
+    assert FAULTS[name].words in found[FAULTS[name].rule]["detail"]
+    assert found[FAULTS[name].rule]["slip"] == FAULTS[name].slip
+
+
+def test_every_faulty_node_of_the_reference_has_a_sister() -> None:
+    assert set(CHANGES) | set(ON_THE_BUS) == set(FAULTS)
+    assert not set(CHANGES) & set(ON_THE_BUS)
