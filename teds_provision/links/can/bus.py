@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
 from teds_provision.lazy import install_command, late
 from teds_provision.links.can.isotp import Frame
-from teds_provision.links.can.multicast import Multicast, of_bus
+from teds_provision.links.can.multicast import Multicast, of_bus, written
 from teds_provision.links.can.pacing import Pacer
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Trace
@@ -149,17 +149,19 @@ class Bus:
 
     def send(self, frame: Frame) -> None:
         """Put one frame on the bus; raises LinkFailure."""
+        multicast = self._multicast
+        datagram = b"" if multicast is None else written(frame)  # a controller has its frame ready when the wire is free
         if self._pacer:
             self._pacer.wait(frame.identifier, frame.data, fd=frame.fd)
         if self._echoes:
             self._echoes.sent(frame)
         if self._trace is not None:  # before it goes, so that no answer stands before it
             self._trace.frame("can", "out", frame.data, identifier=frame.identifier, fd=frame.fd)
-        if self._multicast is None:
+        if multicast is None:
             self._send_message(frame)
             return
         try:
-            self._multicast.send(frame, _SEND_SECONDS)
+            multicast.send(datagram, _SEND_SECONDS)
         except OSError as error:
             self._failed("does not take a frame", error)
 

@@ -62,9 +62,8 @@ class Multicast:
         self._poll.register(receiving, select.POLLIN)
         _drop_own(receiving, self._own)
 
-    def send(self, frame: Frame, seconds: float) -> None:
-        """Put a frame on the bus; raises OSError (TimeoutError after ``seconds``)."""
-        datagram = written(frame)
+    def send(self, datagram: bytes, seconds: float) -> None:
+        """Put a frame, as :func:`written` gives it, on the bus; raises OSError (TimeoutError after ``seconds``)."""
         try:
             self._out.send(datagram)
         except BlockingIOError:

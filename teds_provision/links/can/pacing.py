@@ -23,7 +23,9 @@ from typing import Final
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _POLYNOMIAL = 0x4599
 _TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK, linux/prctl.h
-_BEFORE = 3e-5  # seconds before the time up to which a sleep is trusted
+_BEFORE = 3e-5
+"""Seconds before the time up to which a sleep is trusted. To sleep on for nothing until then ended 10 to 15 µs late, at
+every change of direction of a bus; no other thread is held up for longer than this."""
 _LONGEST_QUEUE: Final = 10.0
 _UNTIL: Final = struct.Struct("@d")
 _THREAD = threading.local()
@@ -85,8 +87,10 @@ class Pacer:
         begin = self._free_at if queued else now
         self._free_at = begin + duration if self._wire is None else self._wire.take(begin, duration)
         self._last = duration
-        while (left := self._free_at - time.perf_counter()) > 0:
-            time.sleep(max(0.0, left - _BEFORE))  # 0 lets other threads run: a bare loop would hold them up for 5 ms
+        if (left := self._free_at - time.perf_counter()) > _BEFORE:
+            time.sleep(left - _BEFORE)
+        while time.perf_counter() < self._free_at:
+            pass
 
     def close(self) -> None:
         """Leave the wire."""

@@ -95,7 +95,7 @@ class Reading:
             if self._over or self._leaning or not self._bus.can_be_waited_for or not self._turn.acquire(blocking=False):
                 return self._lean(queue, left)
             try:
-                self._read_or_wait(min(left, _ALIVE_SECONDS))
+                self._read_for(queue, until)
             finally:
                 self._helped_until = time.monotonic() + _LINGER_SECONDS
                 self._turn.release()
@@ -113,10 +113,14 @@ class Reading:
     def _is_helped(self) -> bool:
         return self._turn.locked() or (not self._leaning and time.monotonic() < self._helped_until)
 
-    def _read_or_wait(self, seconds: float) -> None:
-        """A frame where there is one, else the wait for it."""
-        if not self._read(0.0) and not self._over:
-            self._bus.wait(seconds, self._woken)
+    def _read_for(self, queue: SimpleQueue[Thing], until: float) -> None:
+        """Read frame after frame until the queue has something, or another thread waits for something too."""
+        while queue.empty() and not self._leaning:
+            if not self._read(0.0):
+                left = until - time.monotonic()
+                if left <= 0 or self._over:
+                    return
+                self._bus.wait(min(left, _ALIVE_SECONDS), self._woken)
 
     def _read_all(self) -> None:
         """The loop's turn: every frame that is there, unless another thread has come to read them."""
@@ -508,8 +512,11 @@ class SharedBus:
     def line(self, node: int, own: int | None = None) -> Line:
         """The line to the node at this address; ``own`` is another address than this station's, to try a node out."""
         pair = node, self.own if own is None else own
-        with self._lock:
-            return self._lines.setdefault(pair, Line(*pair))
+        line = self._lines.get(pair)  # there already for all frames but the first: a new one costs more than a frame
+        if line is None:
+            with self._lock:
+                line = self._lines.setdefault(pair, Line(*pair))
+        return line
 
     @contextmanager
     def gather(self, transaction: int) -> Iterator[Asked]:
