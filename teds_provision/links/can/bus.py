@@ -150,7 +150,7 @@ class Bus:
     def send(self, frame: Frame) -> None:
         """Put one frame on the bus; raises LinkFailure."""
         multicast = self._multicast
-        datagram = b"" if multicast is None else written(frame)  # a controller has its frame ready when the wire is free
+        datagram = written(frame) if multicast is not None else b""  # ready when the wire is free, as a controller's
         if self._pacer:
             self._pacer.wait(frame.identifier, frame.data, fd=frame.fd)
         if self._echoes:
