@@ -147,14 +147,15 @@ bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length);
 typedef struct teds_source {
     uint32_t length, at;
     const uint8_t *octets; /* NULL: in flash, at `at`; the initial Security TEDS: length alone */
-    bool initial, read_only;
+    bool initial, read_only, unreadable;
 } teds_source;
 int teds_store_load(teds_node *node);
 bool teds_storable(uint16_t channel, uint8_t code);
 bool teds_find(const teds_node *node, uint16_t id, teds_source *out);
 int teds_source_read(const teds_node *node, const teds_source *source, uint32_t at, uint8_t *out, size_t length);
 int teds_source_hash(const teds_node *node, const teds_source *source, uint8_t out[32]);
-bool teds_next_id(const teds_node *node, int32_t after, uint16_t *out);
+/* The next TEDS that is there: 1; 0 at the end, negative where flash cannot be read. */
+int teds_next_id(const teds_node *node, int32_t after, uint16_t *out);
 int teds_query(const teds_node *node, const teds_command *command, uint8_t *out);
 int teds_read(const teds_node *node, const teds_command *command, uint8_t *out);
 int teds_write(teds_node *node, const teds_command *command, teds_origin *origin);

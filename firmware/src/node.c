@@ -216,11 +216,11 @@ static int list(const teds_node *node, const teds_command *command, uint8_t *out
 {
     int32_t after = -1;
     uint16_t id;
-    int length = 0;
+    int length = 0, more;
     if (command->length != 0) {
         return -TEDS_BAD_FORM;
     }
-    for (; teds_next_id(node, after, &id); after = id) {
+    for (; (more = teds_next_id(node, after, &id)) > 0; after = id) {
         if ((size_t)length + 3 > TEDS_ROOM) {
             return -TEDS_TOO_LARGE;
         }
@@ -228,7 +228,7 @@ static int list(const teds_node *node, const teds_command *command, uint8_t *out
         out[length + 2] = (uint8_t)id;
         length += 3;
     }
-    return length;
+    return more < 0 ? -TEDS_FAILURE : length;
 }
 
 /* -- routing ---------------------------------------------------------------------------------------------------------- */

@@ -263,32 +263,38 @@ void teds_store_poll(teds_node *node)
     }
 }
 
-/* The record at `at`, or false at the end. Moves `at` behind it. */
-static bool next_record(const teds_node *node, uint32_t *at, uint16_t *id, teds_source *source)
+/* The record at `at`: 1, and `at` is behind it; 0 at the end; -1 where flash cannot be read, which is not the end. */
+static int next_record(const teds_node *node, uint32_t *at, uint16_t *id, teds_source *source)
 {
     uint8_t head[RECORD_OCTETS];
-    if (*at + RECORD_OCTETS > node->records_end ||
-        node->port->read(node->port->user, node->slot, *at, head, sizeof head) != 0) {
-        return false;
+    if (*at + RECORD_OCTETS > node->records_end) {
+        return 0;
+    }
+    if (node->port->read(node->port->user, node->slot, *at, head, sizeof head) != 0) {
+        return -1;
     }
     *id = teds_get16(head);
     memset(source, 0, sizeof *source);
     source->length = teds_get32(head + 4);
     source->at = *at + RECORD_OCTETS;
     *at = source->at + source->length;
-    return *at <= node->records_end;
+    return *at <= node->records_end ? 1 : -1;
 }
 
 static bool find_stored(const teds_node *node, uint16_t id, teds_source *out)
 {
     uint32_t at = node->records_at;
     uint16_t each;
-    while (next_record(node, &at, &each, out)) {
+    int more;
+    while ((more = next_record(node, &at, &each, out)) > 0) {
         if (each == id) {
             return true;
         }
     }
-    return false;
+    memset(out, 0, sizeof *out);
+    out->unreadable = more < 0; /* nobody knows whether it is there: reading it fails, so that it is no 18 */
+    out->length = out->unreadable ? 12 : 0;
+    return out->unreadable;
 }
 
 static int copy_record(const teds_node *node, writing *into, uint16_t id, const teds_source *source,
@@ -311,33 +317,38 @@ static int copy_record(const teds_node *node, writing *into, uint16_t id, const 
     return into->failed;
 }
 
-/* The records of the new slot, ascending: written to `into`, or (NULL) only counted. */
-static uint32_t records(const teds_node *node, writing *into, teds_keep keep, const void *what, bool staged)
+/* The records of the new slot, ascending: written to `into`, or (NULL) only counted in `octets`. Not 0: flash failed. */
+static int records(const teds_node *node, writing *into, teds_keep keep, const void *what, bool staged,
+                   uint32_t *octets)
 {
     int32_t after = -1;
-    uint32_t octets = 0;
+    *octets = 0;
     for (;;) {
         uint32_t at = node->records_at, found = UINT32_MAX;
         uint16_t id;
         teds_source each = {0}, source = {0};
         const uint8_t *image = NULL;
         size_t length = 0;
-        while (next_record(node, &at, &id, &each)) {
+        int more;
+        while ((more = next_record(node, &at, &id, &each)) > 0) {
             if (id > after && id < found && keep(what, id)) {
                 found = id;
                 source = each;
             }
+        }
+        if (more < 0) {
+            return more; /* a record that is not seen would be left out */
         }
         if (staged && teds_next_staged(node, after, &id) && id <= found) {
             found = id;
             image = teds_staged(node, id, &length);
         }
         if (found == UINT32_MAX) {
-            return octets;
+            return 0;
         }
-        octets += RECORD_OCTETS + (image != NULL ? (uint32_t)length : source.length);
+        *octets += RECORD_OCTETS + (image != NULL ? (uint32_t)length : source.length);
         if (into != NULL && copy_record(node, into, (uint16_t)found, &source, image, length) != 0) {
-            return octets;
+            return into->failed;
         }
         after = (int32_t)found;
     }
@@ -346,12 +357,15 @@ static uint32_t records(const teds_node *node, writing *into, teds_keep keep, co
 int teds_store_write(teds_node *node, const teds_state *state, teds_keep keep, const void *what, bool staged)
 {
     const teds_port *port = node->port;
-    uint32_t octets = records(node, NULL, keep, what, staged);
-    uint32_t total = whole_units(port, HEAD_OCTETS + octets + 4);
+    uint32_t octets, total;
     uint8_t head[HEAD_OCTETS] = {0};
     writing into = {.port = port, .area = free_slot(node)};
     bool good = false;
     int failed;
+    if (records(node, NULL, keep, what, staged, &octets) != 0) {
+        return -TEDS_FAILURE;
+    }
+    total = whole_units(port, HEAD_OCTETS + octets + 4);
     if (total > port->slot_octets) {
         return -TEDS_TOO_LARGE;
     }
@@ -373,8 +387,8 @@ int teds_store_write(teds_node *node, const teds_state *state, teds_keep keep, c
     node->free_slot_dirty = true;
     put(&into, head, sizeof head);
     teds_wipe(head, sizeof head);
-    (void)records(node, &into, keep, what, staged);
-    if (close_area(&into, total) != 0 || crc_good(port, into.area, total, &good) != 0 || !good) {
+    if (records(node, &into, keep, what, staged, &octets) != 0 || close_area(&into, total) != 0 ||
+        crc_good(port, into.area, total, &good) != 0 || !good) {
         teds_wipe(into.buffer, sizeof into.buffer);
         /* A slot that is whole and cannot be read back now would count at the next start: it has to go. */
         (void)teds_make_blank(node);
@@ -426,6 +440,9 @@ bool teds_find(const teds_node *node, uint16_t id, teds_source *out)
 
 int teds_source_read(const teds_node *node, const teds_source *source, uint32_t at, uint8_t *out, size_t length)
 {
+    if (source->unreadable) {
+        return TEDS_E_FLASH;
+    }
     if (source->initial) {
         uint8_t teds[TEDS_INITIAL_OCTETS];
         teds_initial(node, teds);
@@ -455,12 +472,13 @@ int teds_source_hash(const teds_node *node, const teds_source *source, uint8_t o
     return failed;
 }
 
-bool teds_next_id(const teds_node *node, int32_t after, uint16_t *out)
+int teds_next_id(const teds_node *node, int32_t after, uint16_t *out)
 {
     uint32_t at = node->records_at, found = UINT32_MAX;
     uint16_t id;
     teds_source source;
-    while (next_record(node, &at, &id, &source)) {
+    int more;
+    while ((more = next_record(node, &at, &id, &source)) > 0) {
         found = id > after && id < found ? id : found;
     }
     for (size_t i = 0; i < node->config->fixed_count; i++) {
@@ -469,7 +487,7 @@ bool teds_next_id(const teds_node *node, int32_t after, uint16_t *out)
     }
     found = (int32_t)TEDS_SECURITY_ID > after && TEDS_SECURITY_ID < found ? TEDS_SECURITY_ID : found;
     *out = (uint16_t)found;
-    return found != UINT32_MAX;
+    return more < 0 ? more : found != UINT32_MAX;
 }
 
 /* -- staging: id 2, length 2, image; one after another --------------------------------------------------------------- */
@@ -542,7 +560,7 @@ static bool can_list(const teds_node *node, uint16_t id, bool own)
     int32_t after = -1;
     uint16_t each;
     size_t staged = 0, count = teds_find(node, id, &source) || (own && teds_staged(node, id, &staged) != NULL) ? 0 : 1;
-    for (; teds_next_id(node, after, &each); after = each) {
+    for (; teds_next_id(node, after, &each) > 0; after = each) {
         count++;
     }
     for (after = -1; own && teds_next_staged(node, after, &each); after = each) {

@@ -31,7 +31,7 @@ def _library(path: Path) -> Any:
     library = ctypes.CDLL(str(path))
     library.memory_new.restype = ctypes.c_void_p
     library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
-    library.memory_steps.restype = library.memory_chip_calls.restype = ctypes.c_long
+    library.memory_steps.restype = library.memory_chip_calls.restype = library.memory_reads.restype = ctypes.c_long
     library.memory_poll.restype = ctypes.c_uint64
     library.memory_dead.restype = library.memory_misused.restype = library.memory_nfc_written.restype = ctypes.c_bool
     library.memory_ble_advertises.restype = library.memory_ble_drops.restype = ctypes.c_bool
@@ -165,6 +165,15 @@ class MemoryNode:
     def chip_fails(self, call: int) -> None:
         """Have this call of its random source or cryptography fail, it alone, counted from now; 0: none."""
         self._library.memory_chip_fails(self._board, ctypes.c_long(call))
+
+    def read_fails(self, read: int) -> None:
+        """Have this read of its flash fail, it alone, counted from now; 0: none."""
+        self._library.memory_read_fails(self._board, ctypes.c_long(read))
+
+    @property
+    def reads(self) -> int:
+        """Reads of flash since :meth:`read_fails`."""
+        return int(self._library.memory_reads(self._board))
 
     @property
     def chip_calls(self) -> int:

@@ -66,8 +66,8 @@ static int write(void *user, int area, uint32_t at, const uint8_t *octets, size_
 
 static int read(void *user, int area, uint32_t at, uint8_t *out, size_t length)
 {
-    const memory_board *board = user;
-    if (board->dead || length > octets_of(area) || at + length > octets_of(area)) {
+    memory_board *board = user;
+    if (board->dead || ++board->reads == board->unreadable || length > octets_of(area) || at + length > octets_of(area)) {
         return -1;
     }
     memcpy(out, board->flash + start_of(area) + at, length);
@@ -422,6 +422,18 @@ void memory_cut(memory_board *board, long step, bool torn)
     board->steps = 0;
     board->cut = step;
     board->torn = torn;
+}
+
+/* This read of flash from now on fails, it alone; 0: none. How many there were. */
+void memory_read_fails(memory_board *board, long read_of_flash)
+{
+    board->reads = 0;
+    board->unreadable = read_of_flash;
+}
+
+long memory_reads(const memory_board *board)
+{
+    return board->reads;
 }
 
 /* Flash that refuses to be written or erased, and works again. */

@@ -30,6 +30,7 @@ typedef struct memory_board {
     uint8_t values[TEDS_CHANNELS][8];
     teds_fixed fixed[8];
     bool fails;
+    long reads, unreadable; /* of flash; the one that fails, 0: none */
     memory_hook hook;
     teds_port chip; /* its cryptography, behind what fails */
     long calls, failing; /* of the chip; the one that fails, 0: none */
@@ -52,6 +53,8 @@ void memory_slow(memory_board *board, bool slow);
 /* This call of the chip's random source or cryptography from now on fails, it alone; 0: none. How many there were. */
 void memory_chip_fails(memory_board *board, long call);
 long memory_chip_calls(const memory_board *board);
+void memory_read_fails(memory_board *board, long read_of_flash);
+long memory_reads(const memory_board *board);
 void memory_clock(memory_board *board, uint32_t step, uint16_t drift);
 void memory_by_fd(memory_board *board, bool fd);
 bool memory_acts(const memory_board *board);
