@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -74,6 +75,21 @@ def test_a_load_cell_reads_its_bridge_and_knows_itself_after_a_start(desk: Desk)
     powered(desk, LOAD, 1, TEDS_RAW="0x7fffff")  # an input is torn off
     assert station.ask("verify", done["uuid"], *over)["verdict"] == "authentic"
     assert not station.ask("sample", done["uuid"], *over)["samples"][0]["valid"]
+
+
+def test_a_reset_pad_that_is_stuck_erases_nothing(desk: Desk) -> None:
+    """Or one whose pull-up is described the wrong way round; held for five seconds after it was let go, it resets."""
+    station: Station = desk.station()
+    board = powered(desk, LOAD, 4, TEDS_RAW="0x100000", TEDS_PAD="1")
+    since = time.monotonic()
+    over = desk.links.over("can")
+    uuid = station.ask("provision", "--profile", "load-cell", "--yes", *over)["uuid"]
+    until(lambda: time.monotonic() > since + 6)
+    assert station.ask("verify", uuid, *over)["verdict"] == "authentic"
+    os.kill(board.process.pid, signal.SIGUSR1)
+    time.sleep(0.1)  # that it was let go is seen every 2 ms
+    os.kill(board.process.pid, signal.SIGUSR1)
+    until(lambda: station.ask("identify", *over)["state"] == "factory")
 
 
 def test_a_gripper_moves_and_lets_go_when_its_station_is_gone(desk: Desk) -> None:
@@ -164,3 +180,18 @@ def test_what_zephyr_needs_lies_beside_each_board(name: str) -> None:
     assert all(f"config {option.removeprefix('CONFIG_')}\n" in kconfig for option in ours)
     overlay = (folder / "nucleo_g474re.overlay").read_text()
     assert all(f"{label}: partition@" in overlay for label in ("teds_identity", "teds_slot_a", "teds_slot_b"))
+    places = [(int(at, 16), int(octets, 16)) for at, octets in re.findall(r"reg = <(0x\w+) (0x\w+)>;\n\t\t};", overlay)]
+    ends = [at + octets for at, octets in places]
+    assert len(places) == 3
+    assert all(at % 0x800 == 0 and octets % 0x800 == 0 for at, octets in places), "whole pages"
+    assert all(end <= begin for end, (begin, _) in zip(ends, places[1:], strict=False)), "none in another's place"
+    assert ends[-1] <= 0x7E800, "there the board's storage_partition begins, which holds the identity key"
+
+
+def test_kconfig_takes_in_what_psa_is_asked_for() -> None:
+    """What a build leaves out is refused at run time alone, and a signature that is none ends every agreement."""
+    kconfig = (builds.FIRMWARE / "zephyr" / "Kconfig").read_text()
+    psa = (builds.FIRMWARE / "port" / "psa" / "teds_psa.c").read_text()
+    asked = set(re.findall(r"PSA_ALG_(DETERMINISTIC_ECDSA|ECDSA|ECDH|CCM|HMAC|SHA_256)\b", psa))
+    assert asked == {"DETERMINISTIC_ECDSA", "ECDSA", "ECDH", "CCM", "HMAC", "SHA_256"}
+    assert all(f"\tselect PSA_WANT_ALG_{one}\n" in kconfig for one in asked)

@@ -3,6 +3,24 @@
 
 #include <zephyr/storage/flash_map.h>
 
+#ifndef PARTITION_ID /* before Zephyr 4.4 */
+#define PARTITION_ID FIXED_PARTITION_ID
+#define PARTITION_EXISTS FIXED_PARTITION_EXISTS
+#define PARTITION_OFFSET FIXED_PARTITION_OFFSET
+#define PARTITION_SIZE FIXED_PARTITION_SIZE
+#endif
+
+#define APART(one, other)                                                    \
+    (PARTITION_OFFSET(one) + PARTITION_SIZE(one) <= PARTITION_OFFSET(other) || \
+     PARTITION_OFFSET(other) + PARTITION_SIZE(other) <= PARTITION_OFFSET(one))
+BUILD_ASSERT(APART(teds_slot_a, teds_slot_b) && APART(teds_identity, teds_slot_a) && APART(teds_identity, teds_slot_b),
+             "the node's partitions overlap");
+#if PARTITION_EXISTS(storage_partition) /* the first erase of a slot would take PSA's keys away, the identity with them */
+BUILD_ASSERT(APART(storage_partition, teds_identity) && APART(storage_partition, teds_slot_a) &&
+                 APART(storage_partition, teds_slot_b),
+             "the node's partitions overlap storage_partition");
+#endif
+
 static const struct flash_area *areas[3];
 
 static int port_erase(void *user, int area)
@@ -25,8 +43,7 @@ static int port_read(void *user, int area, uint32_t at, uint8_t *out, size_t len
 
 int teds_zephyr_flash(teds_port *port)
 {
-    static const uint8_t ids[3] = {FIXED_PARTITION_ID(teds_identity), FIXED_PARTITION_ID(teds_slot_a),
-                                   FIXED_PARTITION_ID(teds_slot_b)};
+    static const uint8_t ids[3] = {PARTITION_ID(teds_identity), PARTITION_ID(teds_slot_a), PARTITION_ID(teds_slot_b)};
     uint32_t unit = 1;
     size_t slot;
     for (size_t i = 0; i < 3; i++) {

@@ -6,10 +6,16 @@
 #include <zephyr/drivers/hwinfo.h>
 #include <zephyr/kernel.h>
 
+#ifdef CONFIG_TEST_RANDOM_GENERATOR
+#error "CONFIG_TEST_RANDOM_GENERATOR: keys from a clock are no keys; the board needs an entropy driver"
+#endif
+
 /* P-256 by Mbed TLS wants 3 to 4 KiB beside the node's own (firmware/README.md, "What it takes"). */
 static K_THREAD_STACK_DEFINE(stack, CONFIG_TEDS_NODE_STACK);
 static struct k_thread thread;
 static K_SEM_DEFINE(woken, 0, 1);
+static K_SEM_DEFINE(begun, 0, 1);
+static int begin_failed;
 static atomic_t by_hand = ATOMIC_INIT(0);
 static teds_node node;
 
@@ -84,32 +90,6 @@ static bool bus_work(void)
 #endif
 }
 
-static void run(void *one, void *two, void *three)
-{
-    (void)one;
-    (void)two;
-    (void)three;
-    for (;;) {
-        bool moved = bus_work();
-        uint64_t due;
-#ifdef CONFIG_TEDS_NODE_NFC_T4T
-        moved = teds_zephyr_nfc_work(&node) || moved;
-#endif
-#ifdef CONFIG_TEDS_NODE_BLE
-        moved = teds_zephyr_ble_work(&node) || moved;
-#endif
-        if (atomic_cas(&by_hand, 1, 0)) {
-            (void)teds_node_reset_by_hand(&node);
-        }
-        due = teds_node_poll(&node, teds_zephyr_now());
-        moved = bus_work() || moved;
-        if (moved || (due > teds_zephyr_now() + IDLE && teds_idle_work(&node))) {
-            continue;
-        }
-        wait_until(due);
-    }
-}
-
 /* Ten octets of the chip's own number: the same after every erase, which a number drawn at random would not be. */
 static int own_uuid(uint8_t out[10])
 {
@@ -131,7 +111,7 @@ static int own_uuid(uint8_t out[10])
     return 0;
 }
 
-int teds_zephyr_start(const teds_zephyr_board *board)
+static int begin(const teds_zephyr_board *board)
 {
     teds_port *port = board->port;
     int failed = teds_zephyr_flash(port);
@@ -166,10 +146,41 @@ int teds_zephyr_start(const teds_zephyr_board *board)
         failed = teds_zephyr_ble_start(board->config);
     }
 #endif
-    if (failed != 0) {
-        return failed;
+    return failed;
+}
+
+static void run(void *board, void *two, void *three)
+{
+    (void)two;
+    (void)three;
+    begin_failed = begin(board);
+    k_sem_give(&begun);
+    while (begin_failed == 0) {
+        bool moved = bus_work();
+        uint64_t due;
+#ifdef CONFIG_TEDS_NODE_NFC_T4T
+        moved = teds_zephyr_nfc_work(&node) || moved;
+#endif
+#ifdef CONFIG_TEDS_NODE_BLE
+        moved = teds_zephyr_ble_work(&node) || moved;
+#endif
+        if (atomic_cas(&by_hand, 1, 0)) {
+            (void)teds_node_reset_by_hand(&node);
+        }
+        due = teds_node_poll(&node, teds_zephyr_now());
+        moved = bus_work() || moved;
+        if (moved || (due > teds_zephyr_now() + IDLE && teds_idle_work(&node))) {
+            continue;
+        }
+        wait_until(due);
     }
-    (void)k_thread_create(&thread, stack, K_THREAD_STACK_SIZEOF(stack), run, NULL, NULL, NULL,
+}
+
+/* The first start makes the identity key, which wants the stack of the node's thread and not that of the caller's. */
+int teds_zephyr_start(const teds_zephyr_board *board)
+{
+    (void)k_thread_create(&thread, stack, K_THREAD_STACK_SIZEOF(stack), run, (void *)board, NULL, NULL,
                           CONFIG_TEDS_NODE_PRIORITY, 0, K_NO_WAIT);
-    return 0;
+    (void)k_sem_take(&begun, K_FOREVER);
+    return begin_failed;
 }

@@ -5,7 +5,7 @@
 #include <zephyr/drivers/gpio.h>
 #include <zephyr/kernel.h>
 
-#define HELD 5000 /* ms that the reset pad is held */
+#define HELD 5000 /* ms that the reset pad is held, once it was seen let go: one that is stuck erases nothing */
 
 static const struct gpio_dt_spec pad = GPIO_DT_SPEC_GET(DT_PATH(zephyr_user), reset_gpios);
 
@@ -14,7 +14,7 @@ int main(void)
     static teds_port port;
     static teds_config config = {.quick_points = false};
     const teds_zephyr_board board = {&port, &config};
-    int held = 0, failed = gripper_start();
+    int held = -1, failed = gripper_start();
     gripper_fill(&port);
     if (failed == 0 && gpio_is_ready_dt(&pad)) {
         failed = gpio_pin_configure_dt(&pad, GPIO_INPUT);
@@ -23,7 +23,7 @@ int main(void)
         failed = teds_zephyr_start(&board);
     }
     while (failed == 0) {
-        held = gpio_pin_get_dt(&pad) == 1 ? held + 10 : 0;
+        held = gpio_pin_get_dt(&pad) != 1 ? 0 : held < 0 ? held : held + 10;
         if (held == HELD) {
             teds_zephyr_reset_by_hand();
         }

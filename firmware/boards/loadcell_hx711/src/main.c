@@ -8,7 +8,7 @@
 
 #define PERIOD 12500000u /* ns: 80 Hz */
 #define STALE (8 * (uint64_t)PERIOD)
-#define HELD 5000 /* ms that the reset pad is held */
+#define HELD 5000 /* ms that the reset pad is held, once it was seen let go: one that is stuck erases nothing */
 #define FULL 0xFFFFFFu
 
 static const teds_channel channels[] = {
@@ -53,7 +53,7 @@ int main(void)
     static teds_port port = {.channels = channels, .channel_count = 1, .sample = sample};
     static teds_config config = {.quick_points = false};
     const teds_zephyr_board board = {&port, &config};
-    int held = 0, failed = hx711_start();
+    int held = -1, failed = hx711_start();
     if (failed == 0 && gpio_is_ready_dt(&pad)) {
         failed = gpio_pin_configure_dt(&pad, GPIO_INPUT);
     }
@@ -62,7 +62,7 @@ int main(void)
     }
     while (failed == 0) {
         convert();
-        held = gpio_pin_get_dt(&pad) == 1 ? held + 2 : 0;
+        held = gpio_pin_get_dt(&pad) != 1 ? 0 : held < 0 ? held : held + 2;
         if (held == HELD) {
             teds_zephyr_reset_by_hand();
         }

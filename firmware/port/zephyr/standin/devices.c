@@ -7,6 +7,7 @@
 #define _GNU_SOURCE
 #include "host.h"
 
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -224,16 +225,28 @@ bool gpio_is_ready_dt(const struct gpio_dt_spec *spec)
     return spec->port == &standin_gpio;
 }
 
+/* The reset pad: TEDS_PAD=1 holds it from the start, SIGUSR1 presses it or lets it go. */
+static volatile sig_atomic_t pad;
+
+static void turn_pad(int signal)
+{
+    (void)signal;
+    pad = !pad;
+}
+
 int gpio_pin_configure_dt(const struct gpio_dt_spec *spec, gpio_flags_t extra_flags)
 {
-    (void)spec;
     (void)extra_flags;
+    if (spec->pin == STANDIN_reset_gpios) {
+        pad = getenv("TEDS_PAD") != NULL;
+        (void)signal(SIGUSR1, turn_pad);
+    }
     return 0;
 }
 
 int gpio_pin_get_dt(const struct gpio_dt_spec *spec)
 {
-    return spec->pin == STANDIN_hx711_data_gpios ? hx711_data() : 0;
+    return spec->pin == STANDIN_hx711_data_gpios ? hx711_data() : spec->pin == STANDIN_reset_gpios ? (int)pad : 0;
 }
 
 int gpio_pin_set_dt(const struct gpio_dt_spec *spec, int value)

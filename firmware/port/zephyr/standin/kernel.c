@@ -155,7 +155,7 @@ void k_spin_unlock(struct k_spinlock *lock, k_spinlock_key_t key)
 static void *begin(void *given)
 {
     struct k_thread *thread = given;
-    thread->entry(NULL, NULL, NULL);
+    thread->entry(thread->one, thread->two, thread->three);
     return NULL;
 }
 
@@ -169,13 +169,13 @@ k_tid_t k_thread_create(struct k_thread *thread, k_thread_stack_t *stack, size_t
 {
     (void)stack;
     (void)octets;
-    (void)one;
-    (void)two;
-    (void)three;
     (void)priority;
     (void)options;
     (void)delay;
     thread->entry = entry;
+    thread->one = one;
+    thread->two = two;
+    thread->three = three;
     k_thread_start(thread);
     return thread;
 }

@@ -86,6 +86,7 @@ typedef char k_thread_stack_t;
 struct k_thread {
     pthread_t handle;
     k_thread_entry_t entry;
+    void *one, *two, *three;
 };
 typedef struct k_thread *k_tid_t;
 #define K_THREAD_STACK_DEFINE(name, octets) k_thread_stack_t name[octets]

@@ -10,6 +10,10 @@ struct flash_area {
 };
 enum { STANDIN_teds_identity, STANDIN_teds_slot_a, STANDIN_teds_slot_b };
 #define FIXED_PARTITION_ID(label) STANDIN_##label
+#define FIXED_PARTITION_EXISTS(label) 0
+#define FIXED_PARTITION_OFFSET(label) (STANDIN_##label * 0x10000)
+#define FIXED_PARTITION_SIZE(label) 0x10000
+#define BUILD_ASSERT(condition, text) typedef char build_assert[(condition) ? 1 : -1]
 int flash_area_open(uint8_t id, const struct flash_area **fa);
 int flash_area_erase(const struct flash_area *fa, off_t off, size_t len);
 int flash_area_write(const struct flash_area *fa, off_t off, const void *src, size_t len);
