@@ -112,7 +112,11 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
                 if facts is not None:
                     copy.put_facts(replace(facts, keystore=kind, keystore_why=why))
                 due = _demand_rotations(copy, content, known)
-                _note_restored(copy, vault, known)
+                # Have a home that belongs to a plant look for its own pages before it says anything there
+                if copy.plant() is not None:
+                    station = Station(copy, known)
+                    station.adopt(vault)
+                    station.plant.begin_restored()
                 detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
                 copy.audit.append("restore", None, "rebuilt", detail)
             aside = set_aside(home) if has_store(home) else None
@@ -131,14 +135,6 @@ def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
     nodes = {record.uuid for record in keys.all()}
     keys.mark({uuid: {"rotation": why} for uuid in nodes})
     return len(nodes)
-
-
-def _note_restored(copy: Store, vault: Vault, ask: Ask) -> None:
-    """Have a home that belongs to a plant look for its own pages before it says anything there."""
-    if copy.plant() is not None:
-        station = Station(copy, ask)
-        station.adopt(vault)
-        station.plant.begin_restored()
 
 
 def keystore_for(content: Content, asked: str | None) -> str | None:

@@ -170,7 +170,8 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     how = plan.relation.value if plan.relation is not None else ""
     facts = store.facts()
     head = f"{_summary(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
-    app.note("\n".join([head, *_lines(plan)]))
+    back = [f"  restored: {what}: {count}" for what, count in plan.back.items()]
+    app.note("\n".join([head, *back + [f"  unchanged: {kept}" for kept in plan.kept]]))
     if dry_run:
         _emit(app, content, plan, f"Plan: {'restore the items listed' if plan.back else 'nothing to do'}.", dry=True)
         return
@@ -191,11 +192,6 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     backup_room.restore.open_vault_of(store, app.ask_secret)
     done = vault_room.asked_first(app.ask_secret, work)
     _emit(app, content, done, "Restored." if done.back else "Nothing to do: the store already has everything in it.")
-
-
-def _lines(done: Restored) -> list[str]:
-    back = [f"  restored: {what}: {count}" for what, count in done.back.items()]
-    return back + [f"  unchanged: {kept}" for kept in done.kept]
 
 
 def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = False) -> None:

@@ -25,7 +25,7 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from teds_provision.handover.incoming import Imported, ImportPlan, PlannedNode
+    from teds_provision.handover.incoming import Imported, ImportPlan
     from teds_provision.station.station import Station
 
 _SHOWN = 40
@@ -195,7 +195,8 @@ def _import_text(station: Station, plan: ImportPlan | Imported) -> str:
     lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {handover.pending.peer_name(station, bundle.sender)}"]
     shown = [f"  {one.decision:<8} {one.node.uuid.hex()}  {one.why}".rstrip() for one in nodes[:_SHOWN]]
     lines += first_lines(shown, _SHOWN, len(nodes))
-    lines += _noted(nodes)
+    noted = islice((one for one in nodes if one.notes), _SHOWN)
+    lines += [f"  {one.node.uuid.hex()}: {note}" for one in noted for note in one.notes]
     lines += [f"  revoked  {one.uuid.hex()}  {one.why}" for one in plan.denied]
     lines += [f"  its ban of {one.uuid.hex()} is ignored: {why}" for one, why in plan.passed_over]
     own, sender = handover.trust.spoken(station.fingerprint), handover.trust.spoken(bundle.sender)
@@ -203,11 +204,6 @@ def _import_text(station: Station, plan: ImportPlan | Imported) -> str:
     if not plan.ca_is_known:
         lines.append(f"The CA {protocol.keys.fingerprint(bundle.ca)[:32]} will be trusted for these nodes only.")
     return "\n".join([*lines, _COPIED if bundle.mode == "copy" else _MOVED])
-
-
-def _noted(nodes: Iterable[PlannedNode]) -> list[str]:
-    noted = islice((one for one in nodes if one.notes), _SHOWN)
-    return [f"  {one.node.uuid.hex()}: {note}" for one in noted for note in one.notes]
 
 
 def _import_result(

@@ -173,7 +173,11 @@ def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Every error is told in at most three lines."""
     asked = os.environ.get(COMPLETE)
     if asked:
-        return _complete(asked)
+        # Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)
+        from click.shell_completion import shell_complete
+
+        LazyGroup.teachers.append(completing.teach)
+        return shell_complete(cli, {}, "teds-provision", COMPLETE, asked)
     try:
         arguments = in_front(arguments, lambda name: cli.get_command(click.Context(cli), name))
         with cli.make_context("teds-provision", list(arguments), terminal_width=_help_width()) as ctx:
@@ -250,14 +254,6 @@ def _bug(arguments: list[str], error: Exception) -> int:
     _traceback(arguments)
     hint = "This is a bug. Please report it with the output of --debug."
     return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
-
-
-def _complete(instruction: str) -> int:
-    """Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)."""
-    from click.shell_completion import shell_complete
-
-    LazyGroup.teachers.append(completing.teach)
-    return shell_complete(cli, {}, "teds-provision", COMPLETE, instruction)
 
 
 def wants_json(arguments: list[str]) -> bool:

@@ -121,7 +121,9 @@ def run(
 
     Prints one line when it is ready, then one line per event.
     """
-    _require_extra()
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install("ncap"))
     if said_here("yes") and not wished["adopt"]:
         raise UsageFailure("--yes belongs to --adopt.", hint="Add --adopt --detection transparent.")
     if said_here("unverified") and not wished["adopt"]:
@@ -151,12 +153,6 @@ def run(
         running.run(station, replace(wanted, trace=opened), lines.tell)
     if not lines.end():
         os._exit(0)  # all has ended in order; a line that nobody takes would hold the end of the process up for ever
-
-
-def _require_extra() -> None:
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install("ncap"))
 
 
 class Lines:

@@ -80,7 +80,11 @@ def nodes(
     if app.json or form == "json":
         print_json_list("nodes", described)
     elif form == "csv":
-        _csv(described)
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow((*_FIELDS, "remarks"))
+        for node in described:
+            row = [node[name] for name in _FIELDS]
+            writer.writerow([shown(value) if isinstance(value, str) else value for value in (*row, _remarks(node))])
     elif not found:
         known = bool(search(station))
         print("No known node matches." if known else "No nodes are known yet.", end=" ")
@@ -121,14 +125,6 @@ _FIELDS = (
     "uuid", "name", "profile", "state", "epoch", "sequence", "fingerprint", "whitelisted", "assurance", "verdict",
     "last_seen", "due", "channels", "can_address", "group",
 )  # fmt: skip
-
-
-def _csv(described: Iterable[dict[str, Any]]) -> None:
-    writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow((*_FIELDS, "remarks"))
-    for node in described:
-        row = [node[name] for name in _FIELDS]
-        writer.writerow([shown(value) if isinstance(value, str) else value for value in (*row, _remarks(node))])
 
 
 # Title, the text of a cell, and how gladly the column is dropped where a terminal is narrow (0: never).

@@ -240,7 +240,10 @@ def new(
         return
     if not done:
         if output is None:
-            _make(path.parent)
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            except OSError as error:
+                raise StoreFailure(f"Cannot create {path.parent}: {error.strerror}.") from error
         write_new(path, text.encode("utf-8"), mode=SHARED)
     said = _plain(f"{path} {'already exists' if done else 'written'}.")
     app.emit({"profiles": [{"name": name, "file": str(path)}]}, said)
@@ -252,11 +255,3 @@ profile.add_command(new)
 def _plain(text: str) -> Callable[[Console], None]:
     """Text as it is: brackets are no markup, lines stay whole."""
     return lambda _console: click.echo(text)
-
-
-def _make(folder: Path) -> None:
-    """Make our own folder of profiles."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
-        raise StoreFailure(f"Cannot create {folder}: {error.strerror}.") from error

@@ -91,7 +91,10 @@ def show(
     wanted = cast("Edition", int(edition)) if edition else None
     shown = [load(name, wanted) for name in files]
     if plot is not None:
-        _plot(app, shown, plot)
+        if len(shown) != 1:
+            raise UsageFailure("--plot works with one file.", hint="Run show once per file.")
+        channels = teds.plot.plot_blocks(placed(shown[0].blocks), plot)
+        app.note(f"Plotted in {plot}: channel {', '.join(map(str, channels))}.")
     _tell(app, shown, form)
     if any(file.malformed for file in shown) or (strict and any(map(_has_errors, shown))):
         raise click.exceptions.Exit(_BAD_DATA)
@@ -157,13 +160,6 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
     lines = [change.text for change in changes] or ["no difference"]
     lines += [f"{finding.severity}: guard, channel {finding.channel}: {finding.message}" for finding in judged]
     app.emit(result, lambda console: console.print("\n".join(lines), markup=False))
-
-
-def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
-    if len(files) != 1:
-        raise UsageFailure("--plot works with one file.", hint="Run show once per file.")
-    channels = teds.plot.plot_blocks(placed(files[0].blocks), path)
-    app.note(f"Plotted in {path}: channel {', '.join(map(str, channels))}.")
 
 
 # For people: rich tables of fields, findings and what they mean.

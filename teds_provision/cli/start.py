@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
@@ -197,16 +196,12 @@ def _print(console: Console, found: dict[str, Any]) -> None:
         print_table(console, table)
         if len(found["nodes"]) > _SHOWN:
             console.print(f"  … and {len(found['nodes']) - _SHOWN} more", markup=False)
-    _print_problems(console, found["problems"])
-    console.print(f"Next: {found['next']}", markup=False)
-    console.print("All commands: teds-provision --help", markup=False)
-
-
-def _print_problems(console: Console, problems: Sequence[dict[str, str]]) -> None:
-    for one in problems:
+    for one in found["problems"]:
         console.print(f"! {one['what']}", markup=False)
         if one["fix"]:
             console.print(f"  → {one['fix']}", markup=False)
+    console.print(f"Next: {found['next']}", markup=False)
+    console.print("All commands: teds-provision --help", markup=False)
 
 
 def _link_line(link: dict[str, Any]) -> str:

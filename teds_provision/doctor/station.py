@@ -84,7 +84,11 @@ def store(system: System) -> Iterator[Finding]:
         yield Finding("store", "ok", f"Whole; {count} nodes, {opened.count('whitelist')} whitelisted.")
         yield from _audit(opened)
         yield from _backups(opened, count)
-    yield from _lock(system)
+    holder = holder_of(system.home)
+    if holder is None:
+        yield Finding("lock", "ok", "Nobody holds the store.")
+    else:
+        yield Finding("lock", "warning", f"The store is held by {holder}.", "Wait until it has ended.")
 
 
 def _audit(opened: Store) -> Iterator[Finding]:
@@ -108,14 +112,6 @@ def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
     days = (datetime.now(UTC) - datetime.strptime(taken[-1], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)).days
     old = days > _BACKUP_DAYS
     yield Finding("backup", "warning" if old else "ok", f"The last one is {days} days old.", fix if old else "")
-
-
-def _lock(system: System) -> Iterator[Finding]:
-    holder = holder_of(system.home)
-    if holder is None:
-        yield Finding("lock", "ok", "Nobody holds the store.")
-    else:
-        yield Finding("lock", "warning", f"The store is held by {holder}.", "Wait until it has ended.")
 
 
 @check("keyring", "store")

@@ -287,17 +287,14 @@ class LowerHull:
             self._closed.append(self._best)
             _extend(self._hull, self._best)
         if self._closed and self._closed[0][0] < tick - WINDOW - WINDOW // 10:
-            self._forget(tick - WINDOW)
+            while self._closed and self._closed[0][0] < (tick - WINDOW):
+                self._closed.popleft()
+            self._hull = []
+            for point in self._closed:
+                _extend(self._hull, point)
         self._best, self._end = (tick, upper), (tick // BUCKET + 1) * BUCKET
         self.count += 1
         return True
-
-    def _forget(self, before: int) -> None:
-        while self._closed and self._closed[0][0] < before:
-            self._closed.popleft()
-        self._hull = []
-        for point in self._closed:
-            _extend(self._hull, point)
 
     @property
     def span(self) -> int:

@@ -79,7 +79,8 @@ class Sightings:
             places = self._seen.pop(sighting.uuid, {})  # who was seen last stands last
             places[place] = sighting
             self._seen[sighting.uuid] = places
-            self._forget_the_oldest()
+            while len(self._seen) > MOST:
+                del self._seen[next(uuid for uuid in self._seen if uuid not in self._announced)]
             self._turn.notify_all()
             kept = self._announced.get(sighting.uuid)
         if kept is not None and kept[0] != place:
@@ -190,10 +191,6 @@ class Sightings:
 
         with self._turn:
             return self._turn.wait_for(other, TWIN)
-
-    def _forget_the_oldest(self) -> None:
-        while len(self._seen) > MOST:
-            del self._seen[next(uuid for uuid in self._seen if uuid not in self._announced)]
 
     def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
         """Where to look for a node. A place that was wrong is not taken while another one may still answer."""

@@ -134,7 +134,7 @@ class _Zeroing:
             turn = turn_of(own, full_turn=channel.full_turn)
             settled = settle(trusted, channel.number)
             reading = require_still(settled)
-            step.detail = f"{_show(channel, own, reading.mean)}, {reading.count} samples"
+            step.detail = f"{channel.show(_si(channel, own, reading.mean))}, {reading.count} samples"
         offset = offset_for(own, reading.mean, wanted, turn)
         moved = float(shortest(np.asarray(offset - own.zero_offset), turn))
         identity = node.proven
@@ -261,7 +261,3 @@ def _si(channel: Channel, own: Calibration, value: float) -> float:
     """A reading in the calibrated unit, in SI units, as it is shown: within its turn."""
     si = own.unit.to_si(value)
     return float(wrapped(np.asarray(si), channel.low, channel.high, TURN)) if channel.full_turn else si
-
-
-def _show(channel: Channel, own: Calibration, value: float) -> str:
-    return channel.show(_si(channel, own, value))

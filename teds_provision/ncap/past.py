@@ -158,7 +158,10 @@ class Past:
             self._take_in()
             if time.monotonic() - looked > MINUTE:
                 looked = time.monotonic()
-                self._forget_silent(time.time())
+                with self._turn:
+                    gone = [key for key, one in self._channels.items() if one.hour.newest < time.time() - HOUR]
+                    for key in gone:
+                        del self._channels[key]
 
     def _take_in(self) -> None:
         with self._turn:
@@ -167,7 +170,10 @@ class Past:
 
     def _put(self, block: Block) -> None:
         at = np.asarray(block.time, np.float64)
-        lost = self._lost_before(block)
+        run, key = (block.run, block.channels[0]), (block.uuid, block.stream)
+        known = self._streams.get(key)
+        lost = max(0, block.index - known.expected) if known is not None and known.run == run else 0
+        self._streams[key] = _Stream(run, block.index + len(block.time))
         valid = np.asarray(block.valid, bool)
         values = np.where(valid, block.value, np.nan)
         for fine in (False, True):
@@ -185,19 +191,6 @@ class Past:
                     one = self._channels.setdefault((block.uuid, number), _Channel())
                 bins = one.minute if fine else one.hour
                 bins.add(numbers, low[:, column], high[:, column], np.stack([total, invalid[:, column], gone]))
-
-    def _lost_before(self, block: Block) -> int:
-        run, key = (block.run, block.channels[0]), (block.uuid, block.stream)
-        known = self._streams.get(key)
-        lost = max(0, block.index - known.expected) if known is not None and known.run == run else 0
-        self._streams[key] = _Stream(run, block.index + len(block.time))
-        return lost
-
-    def _forget_silent(self, now: float) -> None:
-        with self._turn:
-            gone = [key for key, one in self._channels.items() if one.hour.newest < now - HOUR]
-            for key in gone:
-                del self._channels[key]
 
     # -- what is asked -----------------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import hashlib
 import re
 import time
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
@@ -38,7 +38,7 @@ from teds_provision.steps.sign import sign
 from teds_provision.store import SignRequestRow, UnitRow, WhitelistEntry, utc_now
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile.load import default_folders, load_profile
 from teds_provision.teds.profile.model import Profile
 
@@ -130,7 +130,10 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
     if revoked is not None:
         raise _Refused("revoked", f"the node was revoked: {revoked.why}")
     _require_its_key(station, job, request)
-    _require_proof(request)
+    if not node_key_good(request.uuid, request.point, request.key_signature):
+        raise _Refused("proof", "field 102 does not sign this key for this UUID")
+    if not verify(request.point, prove_message(request.uuid, request.challenge()), request.proof):
+        raise _Refused("proof", "the board did not sign this request")
     _require_room(station, job, request)
     known = station.nodes.get(request.uuid)
     if not jump and request.sequence > (known.sequence if known is not None else 0) + MOST_JUMP:
@@ -195,13 +198,6 @@ def _require_its_key(station: Station, job: Job, request: SignRequest) -> None:
         raise _Refused("other-key", error.message) from error
 
 
-def _require_proof(request: SignRequest) -> None:
-    if not node_key_good(request.uuid, request.point, request.key_signature):
-        raise _Refused("proof", "field 102 does not sign this key for this UUID")
-    if not verify(request.point, prove_message(request.uuid, request.challenge()), request.proof):
-        raise _Refused("proof", "the board did not sign this request")
-
-
 def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
     """The unit that the board has or gets, with one more answer; raises _Refused where there is none."""
     tables = station.plant.line
@@ -235,16 +231,12 @@ def _built(station: Station, job: Job, request: SignRequest) -> Image:
         guard(station, image, None, None, calibrations, profile, record=False)
     except PolicyRefused as error:
         raise _Refused("guard", error.message) from error
-    _require_the_same(sent, blocks)
-    _require_name(job, request)
-    return image
-
-
-def _require_the_same(sent: Mapping[BlockId, bytes], built: Mapping[BlockId, bytes]) -> None:
-    wrong = sorted(block for block in sent.keys() | built.keys() if sent.get(block) != built.get(block))
+    wrong = sorted(block for block in sent.keys() | blocks.keys() if sent.get(block) != blocks.get(block))
     if wrong:
         named = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in wrong[:5])
         raise _Refused("differs", f"this office would make it otherwise: {named}")
+    _require_name(job, request)
+    return image
 
 
 def _require_name(job: Job, request: SignRequest) -> None:

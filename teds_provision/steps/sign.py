@@ -111,7 +111,9 @@ def sign(
     given to anyone: one that was lost with its process was never seen, and its number may be used again. ``unit``: the
     job and the unit that an office signs for, which its pages say too.
     """
-    _require_whole(image)
+    for block, teds in image.unsigned_blocks().items():
+        if not can_be_stored(block) or not passes_own_check(block, teds):
+            raise BadData(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
     if sequence is None:
         # What says the same is not signed anew, so a run that is repeated leaves the node as it is. A signature that
         # never arrived is good while its sequence is above the node's: the node takes no other.
@@ -127,13 +129,16 @@ def sign(
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
         if number > LAST_SEQUENCE:
             raise PolicyRefused("The sequence of this node is used up.")
+        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)  # a TimeInstance: two u32
+        if not 0 <= seconds < 1 << 32:
+            raise TedsProvisionError("The clock of this machine says what cannot be.", hint="Set it; see: doctor")
         unsigned = unsigned_datasheet(
             keys,
             credentials.key.point,
             credentials.station_signature,
             digests(image.blocks),
             ca=security.ca_hint(station.name, fingerprint(credentials.ca)),
-            last_modified=_now(),
+            last_modified=seconds.to_bytes(4, "big") + nanoseconds.to_bytes(4, "big"),
             sequence=number,
             key_epoch=epoch,
         )
@@ -146,12 +151,6 @@ def sign(
         station.plant.tell("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest, **of_unit)
         station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
     return Signed(made, number, reused=False)
-
-
-def _require_whole(image: Image) -> None:
-    for block, teds in image.unsigned_blocks().items():
-        if not can_be_stored(block) or not passes_own_check(block, teds):
-            raise BadData(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
 
 
 def _sequence_if_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes, epoch: int) -> int | None:
@@ -171,11 +170,3 @@ def _sequence_if_the_same(station: Station, keys: NodeKeys, image: Image, octets
         and signature_good(found, octets, keys.uuid)
     )
     return found.sequence if same else None
-
-
-def _now() -> bytes:
-    """TimeInstance of now: u32 s, u32 ns, UTC; raises TedsProvisionError where no u32 holds it."""
-    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
-    if not 0 <= seconds < 1 << 32:
-        raise TedsProvisionError("The clock of this machine says what cannot be.", hint="Set it; see: doctor")
-    return seconds.to_bytes(4, "big") + nanoseconds.to_bytes(4, "big")

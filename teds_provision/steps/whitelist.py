@@ -303,7 +303,10 @@ def _parts(text: str) -> list[str]:
 
 
 def _read_csv(text: str, reading: _Reading) -> None:
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text, reading.file), strict=True)
+    check_count(text.count("\n"), _MOST_LINES, f"lines in {reading.file}")
+    _refuse_long(text, "\n", reading.file, "a line")
+    first = next((line for line in text[:_MAX_TAG].splitlines() if line.strip() and not line.startswith("#")), "")
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count), strict=True)
     columns: list[str] | None = None
     try:
         for row in rows:
@@ -311,7 +314,8 @@ def _read_csv(text: str, reading: _Reading) -> None:
             if not any(cells) or cells[0].startswith("#"):
                 continue
             if columns is None:
-                columns, is_header = _columns_of(cells)
+                named = [_field_name(cell) for cell in cells]
+                columns, is_header = (named, True) if "uuid" in named else (["uuid", "fingerprint", "name"], False)
                 if is_header:
                     continue
             if any(cells[len(columns) :]):
@@ -320,19 +324,6 @@ def _read_csv(text: str, reading: _Reading) -> None:
             reading.add(rows.line_num, dict(zip(columns, cells, strict=False)))
     except csv.Error as error:
         raise BadData(f"{reading.file}:{rows.line_num}: this is not CSV: {error}.") from error
-
-
-def _delimiter(text: str, file: str) -> str:
-    check_count(text.count("\n"), _MOST_LINES, f"lines in {file}")
-    _refuse_long(text, "\n", file, "a line")
-    first = next((line for line in text[:_MAX_TAG].splitlines() if line.strip() and not line.startswith("#")), "")
-    return max(",;\t", key=first.count)
-
-
-def _columns_of(cells: list[str]) -> tuple[list[str], bool]:
-    """The columns of a file whose first row this is, and whether the row names them (else it is data already)."""
-    named = [_field_name(cell) for cell in cells]
-    return (named, True) if "uuid" in named else (["uuid", "fingerprint", "name"], False)
 
 
 # -- JSON --------------------------------------------------------------------------------------------------------------
@@ -409,7 +400,10 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
     Raises OtherKey where a UUID is pinned to another key, PolicyRefused for a revoked node: then none may be added.
     """
     revoked = {one.uuid: one.why for one in station.policy.revocations()}
-    _refuse_revoked([entry.uuid for entry in listed if entry.uuid in revoked], revoked)
+    uuids = [entry.uuid for entry in listed if entry.uuid in revoked]
+    if uuids:
+        shown = ", ".join(f"{uuid.hex()} ({revoked[uuid]})" for uuid in uuids[:_SHOWN])
+        raise PolicyRefused(f"Revoked nodes are not whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[Listed, str]] = []
     new = 0
@@ -442,12 +436,6 @@ def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:
         assurance="import" if gains and known.assurance == "uuid" else known.assurance,
         name=known.name or entry.name,
     )
-
-
-def _refuse_revoked(uuids: list[bytes], why: dict[bytes, str]) -> None:
-    if uuids:
-        shown = ", ".join(f"{uuid.hex()} ({why[uuid]})" for uuid in uuids[:_SHOWN])
-        raise PolicyRefused(f"Revoked nodes are not whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
 
 
 def _refuse_conflicts(conflicts: list[tuple[Listed, str]]) -> None:

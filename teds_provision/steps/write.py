@@ -147,7 +147,10 @@ def _conclude(
         else:
             known = station.nodes.remember(image.uuid, **facts)
             _tell_written(station, image, known, sequence)
-            _forget_draft(station, image)
+            # A draft that is on the node now is none any more; a newer trial stays
+            draft = station.nodes.draft(image.uuid)
+            if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
+                station.nodes.drop_draft(image.uuid)
             station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
     if differing:
         raise NotAuthentic(
@@ -195,13 +198,6 @@ def _require_newer(signed: SecurityTeds, identity: Identity, *, jump: bool) -> N
             " lied about this node.",
             hint="Sign anew (sign UUID --read-node), or if you know why: write UUID --sequence-jump --yes",
         )
-
-
-def _forget_draft(station: Station, image: Image) -> None:
-    """A draft that is on the node now is none any more; a newer trial stays."""
-    draft = station.nodes.draft(image.uuid)
-    if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
-        station.nodes.drop_draft(image.uuid)
 
 
 def _commit(station: Station, node: Conversation, image: Image, has: Image | None, progress: Progress | None) -> int:

@@ -177,12 +177,8 @@ def _fit_of(requirement: Requirement, channel: Channel, now: datetime | None) ->
         return Fit(channel.number, channel.name, "failed", "; ".join(short + unknown) + ".")
     if unknown:
         return Fit(channel.number, channel.name, "skipped", "; ".join(unknown) + ".")
-    return Fit(channel.number, channel.name, "passed", _all_shown(requirement, channel))
-
-
-def _all_shown(requirement: Requirement, channel: Channel) -> str:
     shown = (f"{term.what} {_shown(term, _has(term, channel), channel)}" for term in requirement.terms)
-    return ", ".join(dict.fromkeys(shown)) + "."
+    return Fit(channel.number, channel.name, "passed", ", ".join(dict.fromkeys(shown)) + ".")
 
 
 def _has(term: Term, channel: Channel) -> float:

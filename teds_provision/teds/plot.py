@@ -24,7 +24,6 @@ from teds_provision.teds.sheet import Sheet, name_among
 
 if TYPE_CHECKING:
     import numpy as np
-    from matplotlib.figure import Figure
 
     from teds_provision.teds.curve import Channel, Curve
     from teds_provision.teds.profile.model import Profile
@@ -88,13 +87,10 @@ def _panels(
             own = replace(own, raw=calibration.raw_range)
         others = {part.channel: channel_of(part.channel, blocks, profile) for part in calibration.inputs}
         points = calibrations[number].points if number in calibrations else ()
-        panels.append(_Panel(_name(number, blocks), curve_of(calibration, own, others, dense=True), points))
+        name = name_among(number, blocks)
+        title = f"channel {number}: {name}" if name else f"channel {number}"
+        panels.append(_Panel(title, curve_of(calibration, own, others, dense=True), points))
     return panels
-
-
-def _name(number: int, blocks: Mapping[BlockId, bytes]) -> str:
-    name = name_among(number, blocks)
-    return f"channel {number}: {name}" if name else f"channel {number}"
 
 
 def _node(blocks: Mapping[BlockId, bytes]) -> str:
@@ -122,13 +118,9 @@ def _picture(panels: list[_Panel], kind: str, title: str) -> bytes:
         grid: Any = figure.subfigures(rows, columns, squeeze=False)
         for number, panel in enumerate(panels):
             _draw(grid[number // columns][number % columns], panel)
-        return _octets(figure, kind)
-
-
-def _octets(figure: Figure, kind: str) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, metadata={"Date": None} if kind == "svg" else None)
-    return buffer.getvalue()
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=kind, metadata={"Date": None} if kind == "svg" else None)
+        return buffer.getvalue()
 
 
 def _draw(where: Any, panel: _Panel) -> None:

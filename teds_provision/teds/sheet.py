@@ -27,7 +27,7 @@ from teds_provision.teds.channel import (
     read_channel,
 )
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Decoded, Finding, Severity, Verdict
+from teds_provision.teds.codec.model import AccessCode, Decoded, Severity, Verdict
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
 
@@ -213,7 +213,7 @@ class _Reader:
             if teds is None:
                 continue
             for finding in teds.findings:
-                yield _placed(channel, code, finding)
+                yield SheetFinding(channel, code, finding.severity, finding.code, finding.message, finding.offset)
             if teds.access_code not in (code, None):
                 message = f"This stands where {name_of(code)} belongs; its TEDSID says {teds.name}."
                 yield SheetFinding(channel, code, "error", "class", message)
@@ -228,10 +228,6 @@ def _vectors(meta: Decoded) -> Iterator[tuple[int, ...]]:
 
 
 _OF_CHANNELS: Final = (AccessCode.CHANNEL, AccessCode.CALIBRATION)
-
-
-def _placed(channel: int, code: int, finding: Finding) -> SheetFinding:
-    return SheetFinding(channel, code, finding.severity, finding.code, finding.message, finding.offset)
 
 
 def _between(uuid: bytes, meta: Meta, channels: list[Channel]) -> Iterator[SheetFinding]:

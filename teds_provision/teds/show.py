@@ -16,7 +16,7 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.keyforms import read_key
 from teds_provision.teds.codec.model import AccessCode, Decoded, Field, Finding, TimeInstance, Units
-from teds_provision.teds.codec.tables import FieldSpec, Table, name_of, table
+from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.codec.uuid import unpack_uuid
 from teds_provision.teds.formats import Block
 from teds_provision.teds.formats.jsonform import teds_to_json
@@ -72,11 +72,14 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
         case Units() as units:
             return name_of_units(units)
         case TimeInstance() as moment:
-            return _moment(moment, kind)
+            return span(moment) if kind == "duration" else instant(moment)
         case float(number):
             return _number(field, number, context, spec)
         case tuple(numbers):
-            return _list(numbers)
+            shown = ", ".join(
+                f"{part:.7g}" if isinstance(part, float) else str(part) for part in numbers[:SHOWN_NUMBERS]
+            )
+            return f"{shown}, … ({len(numbers)})" if len(numbers) > SHOWN_NUMBERS else shown
         case _ if kind == "key":
             return key(field)
         case _ if kind == "block id" and len(field.raw) == 35:
@@ -84,22 +87,9 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
         case str(text):
             return text
         case int(number):
-            return _integer(number, spec)
+            return f"{number} {spec.unit}" if spec is not None and spec.unit else str(number)
         case _:
             return hexadecimal(field.raw)
-
-
-def _moment(value: TimeInstance, kind: str) -> str:
-    return span(value) if kind == "duration" else instant(value)
-
-
-def _list(numbers: tuple[int, ...] | tuple[float, ...]) -> str:
-    shown = ", ".join(f"{part:.7g}" if isinstance(part, float) else str(part) for part in numbers[:SHOWN_NUMBERS])
-    return f"{shown}, … ({len(numbers)})" if len(numbers) > SHOWN_NUMBERS else shown
-
-
-def _integer(value: int, spec: FieldSpec | None) -> str:
-    return f"{value} {spec.unit}" if spec is not None and spec.unit else str(value)
 
 
 def _number(field: Field, value: float, context: Context, spec: FieldSpec | None) -> str:
@@ -256,7 +246,10 @@ def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
         if isinstance(number, int):
             yield field_word, str(number)
     if ours and context.beside:
-        yield from _form(decoded)
+        try:
+            security.decode(decoded.octets)
+        except BadData as error:
+            yield "form", f"not canonical, so never authentic: {error.message}"
 
 
 def _keys(decoded: Decoded) -> Iterator[Line]:
@@ -266,13 +259,6 @@ def _keys(decoded: Decoded) -> Iterator[Line]:
         if point is not None:
             digits = fingerprint(point)[:FINGERPRINT_DIGITS]
             yield f"{label} key", f"fingerprint {digits} (a hint, not an anchor of trust)"
-
-
-def _form(decoded: Decoded) -> Iterator[Line]:
-    try:
-        security.decode(decoded.octets)
-    except BadData as error:
-        yield "form", f"not canonical, so never authentic: {error.message}"
 
 
 __all__ = ["Shown", "ShownField", "describe", "finding_to_json", "shown_to_json"]
@@ -320,13 +306,9 @@ def describe(
     decoded = decode(block.octets)
     context = _context(block, decoded, dict(beside or {}))
     rows = table(decoded.access_code) if decoded.access_code is not None else None
-    known: Mapping[int, FieldSpec] = _rows(rows)
+    known: Mapping[int, FieldSpec] = {} if rows is None else {**rows.inner, **rows.aliases, **rows.by_type}
     fields = tuple(_field(field, known, context) for field in decoded.fields)
     return Shown(block, decoded, fields, summary_of(decoded, context, now or datetime.now(UTC)))
-
-
-def _rows(rows: Table | None) -> dict[int, FieldSpec]:
-    return {} if rows is None else {**rows.inner, **rows.aliases, **rows.by_type}
 
 
 def _field(field: Field, known: Mapping[int, FieldSpec], context: Context) -> ShownField:

@@ -137,7 +137,11 @@ def main() -> None:
         listener = listen_alone(path, 16)
         ours = path.stat().st_ino
         os.write(1, b"ready\n")
-        _give_up_streams()
+        # Let go of whoever started this: no pipe of theirs stays open
+        null = os.open(os.devnull, os.O_RDWR)
+        for descriptor in (0, 1, 2):
+            os.dup2(null, descriptor)
+        os.close(null)
         try:
             serve(listener, page, _now() + seconds)
         finally:
@@ -207,14 +211,6 @@ def _answer(line: socket.socket, page: Page, until: float) -> bool:
     elif request == TIME:
         line.sendall(struct.pack(">I", int(left)))
     return True
-
-
-def _give_up_streams() -> None:
-    """Let go of whoever started this: no pipe of theirs stays open."""
-    null = os.open(os.devnull, os.O_RDWR)
-    for descriptor in (0, 1, 2):
-        os.dup2(null, descriptor)
-    os.close(null)
 
 
 def _now() -> float:

@@ -34,8 +34,12 @@ def write_ca(path: Path, secret: bytes, passphrase: str) -> None:
 
     Raises VaultFailure: the file exists, the passphrase is weak, or it cannot be written (then none is left).
     """
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
     check_new(passphrase)
-    pem = _encrypted_pem(_plain_der(secret), passphrase)
+    key = ec.derive_private_key(int.from_bytes(secret, "big"), ec.SECP256R1())
+    pem = _encrypted_pem(key.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption()), passphrase)
     try:
         write_new(path, pem, failure=VaultFailure)
     except UsageFailure as taken:  # this command's exit code is that of the vault since version 0.1
@@ -93,14 +97,6 @@ def _rounds(parameters: bytes) -> int:
         return int.from_bytes(parameters[number + 2 : number + 2 + parameters[number + 1]], "big")
     except IndexError:
         return 0
-
-
-def _plain_der(secret: bytes) -> bytes:
-    from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
-
-    key = ec.derive_private_key(int.from_bytes(secret, "big"), ec.SECP256R1())
-    return key.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption())
 
 
 def _encrypted_pem(der: bytes, passphrase: str) -> bytes:

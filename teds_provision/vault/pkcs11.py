@@ -274,14 +274,10 @@ def _content_of(members: dict[str, Any], session: TokenSession) -> _Content:
     ca = None if members["ca"] is None else _held(session, members["ca"], "CA")
     if not verify(station.point, _signed(members), _octets(members, "signature")):
         raise VaultFailure(f"{FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
-    return _Content(station, ca, _unsealed(station, members), _count(members))
-
-
-def _count(members: dict[str, Any]) -> int:
     pins = members.get("pins", 0)
     if not isinstance(pins, int):
         raise VaultFailure(f"{FILE_NAME} is damaged (pins).", hint=_DAMAGED)
-    return pins
+    return _Content(station, ca, _unsealed(station, members), pins)
 
 
 def _unsealed(station: TokenKey, members: dict[str, Any]) -> MasterKeys:

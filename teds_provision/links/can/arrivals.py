@@ -86,7 +86,10 @@ class Arrivals:
         self._round += 1
         self._asked_at = time.monotonic()
         self._served.clear()
-        self._listen()
+        bus = self._port.bus()
+        if bus is not self._bus:
+            self._bus = bus
+            self._listener = bus.listen(lambda frame: is_announce(frame.identifier), most=256)
         clashing: set[int] = set()
         address = self._port.spec.node
         for news in self._all(stop, clashing) if address is None else self._one(address, clashing):
@@ -120,12 +123,6 @@ class Arrivals:
         """Whether an Announce is of a node that this round brought."""
         announce = Announce.decode(frame.identifier, frame.data)
         return announce is not None and announce.crc in self._served
-
-    def _listen(self) -> None:
-        bus = self._port.bus()
-        if bus is not self._bus:
-            self._bus = bus
-            self._listener = bus.listen(lambda frame: is_announce(frame.identifier), most=256)
 
     def _one(self, address: int, clashing: set[int]) -> Iterator[tuple[int, Identity]]:
         try:

@@ -209,7 +209,8 @@ class _Exchange:
         whole = refused = 0
         while whole < self._tries and not self._hopeless():
             try:
-                self._send(self._flow_patience(refused))
+                seconds = _FLOW_SECONDS[min(refused, len(_FLOW_SECONDS) - 1)]
+                self._send(min(seconds, self._seconds * _PROMPT_SHARES[0]) if self._prompt else seconds)
             except _Answered as answered:
                 busy = answered.reply[0][1:] == _BUSY and not self._prompt
                 if not busy or time.monotonic() - began >= BUSY_SECONDS:
@@ -232,10 +233,6 @@ class _Exchange:
             if time.monotonic() - began >= self._longest:
                 break
         raise self._failed()
-
-    def _flow_patience(self, refused: int) -> float:
-        seconds = _FLOW_SECONDS[min(refused, len(_FLOW_SECONDS) - 1)]
-        return min(seconds, self._seconds * _PROMPT_SHARES[0]) if self._prompt else seconds
 
     def _share(self, whole: int) -> float:
         """The part of the time that the reply to the next sending is waited for."""

@@ -390,7 +390,9 @@ class Line:
         """Wait for this transaction's reply; one exchange with one node at a time."""
         with self.turn:
             for waiting in (self.flows, self.events):
-                _empty(waiting)
+                with contextlib.suppress(Empty):
+                    while True:
+                        waiting.get_nowait()
             self.partial = None
             self.transaction = transaction
             self.asked.append(transaction)
@@ -555,7 +557,11 @@ class SharedBus:
     def _route(self, frame: Frame) -> None:
         self.rivals.heard(frame)
         if is_announce(frame.identifier):
-            self._note_announce(frame.identifier & 0xFF)
+            node = frame.identifier & 0xFF
+            self._announced[node] = time.monotonic()
+            line = self._lines.get((node, self.own))
+            if line is not None and line.transaction >= 0:
+                line.events.put(Event("announced"))
         ends = addresses(frame.identifier)
         if ends is not None and len(frame.data) >= 2:
             own, node = ends
@@ -563,12 +569,6 @@ class SharedBus:
                 self._from_node(self.line(node, own), frame)
         for listener in self._listeners:
             listener.offer(frame)
-
-    def _note_announce(self, node: int) -> None:
-        self._announced[node] = time.monotonic()
-        line = self._lines.get((node, self.own))
-        if line is not None and line.transaction >= 0:
-            line.events.put(Event("announced"))
 
     def announced_since(self, node: int, moment: float) -> bool:
         """Whether something announced itself at this address after ``moment`` (time.monotonic)."""
@@ -666,9 +666,3 @@ class SharedBus:
     def _reply(self, frame: Frame) -> None:
         with self._sending:
             self._bus.send(frame)
-
-
-def _empty(queue: SimpleQueue[bytes] | SimpleQueue[Event]) -> None:
-    with contextlib.suppress(Empty):
-        while True:
-            queue.get_nowait()

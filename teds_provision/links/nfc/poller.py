@@ -58,7 +58,9 @@ class Poller:
             raise Garbled(
                 f"The node takes NDEF messages of at most {self._service.max_ndef} octets, too short for the profile."
             )
-        self._select()
+        if not self._selected:
+            self._exchange(message.encode([tnep.select(tnep.SERVICE)]), lambda records: True)
+            self._selected = True
         requester = Requester(transaction, frame, octets)
         steps, end = 0, self._clock() + LONGEST
         while (reply := requester.reply) is None:
@@ -80,11 +82,6 @@ class Poller:
     def restart(self) -> None:
         """Select the service anew before the next transaction."""
         self._selected = False
-
-    def _select(self) -> None:
-        if not self._selected:
-            self._exchange(message.encode([tnep.select(tnep.SERVICE)]), lambda records: True)
-            self._selected = True
 
     def _exchange(self, octets: bytes, take: Callable[[Sequence[Record]], bool]) -> None:
         """Write ``octets`` and read until ``take`` accepts an answer; our own message still there is "not yet"."""

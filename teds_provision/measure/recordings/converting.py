@@ -104,16 +104,12 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
     finally:
         writer.close()
     for one in made:
-        _sync(one)
+        file = os.open(one, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(file)
+        finally:
+            os.close(file)
     return made
-
-
-def _sync(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
 
 
 def _counted(recording: Recording, summary: Summary) -> Iterator[Entry]:

@@ -138,7 +138,11 @@ def facts_of(words: object, where: str) -> ChannelFacts:
             kept[name] = _finite(float(value), name, where)
         elif (name in _FLAGS and isinstance(value, bool)) or (name == "kind" and value in get_args(Kind)):
             kept[name] = value
-        elif name == "vector" and _are_channels(value):
+        elif name == "vector" and (
+            isinstance(value, list)
+            and len(value) <= MOST.text
+            and all(isinstance(one, int) and 0 <= one <= 0xFFFF for one in value)
+        ):
             kept[name] = tuple(value)
         elif name == "number":
             kept[name] = channel_number(value, where)
@@ -160,14 +164,6 @@ def channel_number(value: object, where: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFF:
         raise BadData(f"{where}: {_short(value)} is no number of a channel.")
     return value
-
-
-def _are_channels(value: object) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) <= MOST.text
-        and all(isinstance(one, int) and 0 <= one <= 0xFFFF for one in value)
-    )
 
 
 def _finite(value: float, name: str, where: str) -> float:

@@ -74,7 +74,11 @@ class TextRecording(Recording):
             if not line.startswith("#"):
                 self._comma = "\t" if line.startswith("time\t") else ","
                 self.station = station_of(words)
-                return self._cells(line)
+                try:
+                    [cells] = csv.reader([line], delimiter=self._comma)
+                except (csv.Error, ValueError):
+                    raise self._bad("the line of column names is damaged") from None
+                return cells
             if line.startswith(FIRST):
                 self.wide = ", wide;" in line
                 words["clock"] = "".join(_CLOCK.findall(line))
@@ -93,13 +97,6 @@ class TextRecording(Recording):
                 self._known.append(facts)
         self.station = station_of(words)
         return []  # it ends in its head: a recorder that was killed early
-
-    def _cells(self, line: str) -> list[str]:
-        try:
-            [cells] = csv.reader([line], delimiter=self._comma)
-        except (csv.Error, ValueError):
-            raise self._bad("the line of column names is damaged") from None
-        return cells
 
     def entries(self) -> Iterator[Entry]:
         """See the class above."""

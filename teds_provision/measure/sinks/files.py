@@ -198,7 +198,11 @@ class FileSink(ThreadedSink):
             return
         try:
             if isinstance(item, ClockSet):
-                self._follow(item)
+                # The clock was set: another part, which begins when this recording did by the new clock
+                self._note(item.time - item.by, item.words)
+                self.station = replace(self.station, started=self.station.started + item.by)
+                self._new_part()
+                self._note(item.time, item.words)
             else:
                 self._take(item)
         except OSError as error:
@@ -214,13 +218,6 @@ class FileSink(ThreadedSink):
             self._idle(now)
         except OSError as error:
             self._wait_for_room(error)
-
-    def _follow(self, news: ClockSet) -> None:
-        """The clock was set: another part, which begins when this recording did by the new clock."""
-        self._note(news.time - news.by, news.words)
-        self.station = replace(self.station, started=self.station.started + news.by)
-        self._new_part()
-        self._note(news.time, news.words)
 
     def _miss(self, item: Item) -> None:
         """What comes while there is no room: counted, and known to the next part."""

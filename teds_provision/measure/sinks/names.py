@@ -78,7 +78,11 @@ class Topics:
                 if one.uuid not in self._known:
                     self._strangers[one.uuid] = slug(one.node)
             if one.chosen is not None:
-                self._choose(one.uuid, one.chosen)
+                # Names that somebody chose while the node was not measured; nobody else's change by it
+                self._chosen = {key: name for key, name in self._chosen.items() if key[0] != one.uuid}
+                self._chosen |= {(one.uuid, number): name.strip("/") for number, name in one.chosen}
+                self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
+                self._made.pop(one.uuid, None)
             channels = self._channels.setdefault(one.uuid, {})
             channels.update({one.number: one.name, **dict(one.siblings)})
             self._made.pop(one.uuid, None)
@@ -92,13 +96,6 @@ class Topics:
             return
         taken = {other for key, other in self._unverified.items() if key != uuid}
         self._unverified[uuid] = next(one for one in (own, f"{own}_{uuid[:8]}", f"{own}_{uuid}") if one not in taken)
-
-    def _choose(self, uuid: str, chosen: Iterable[tuple[int, str]]) -> None:
-        """Names that somebody chose while the node was not measured; nobody else's change by it."""
-        self._chosen = {key: name for key, name in self._chosen.items() if key[0] != uuid}
-        self._chosen |= {(uuid, number): name.strip("/") for number, name in chosen}
-        self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
-        self._made.pop(uuid, None)
 
     def _name_nodes(self) -> None:
         taken = {name for (_, channel), name in self._chosen.items() if not channel} | _NOT_NODES

@@ -127,7 +127,11 @@ class Desk:
         """
         port = self._bus_of(uuid)
         if port is not None:
-            return self._on_a_bus(port, uuid, what, work)
+            with self._turns.of(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
+                try:
+                    return work(node)
+                except SessionLost as lost:
+                    raise lost.cause from lost
         errand = self.wait_for(uuid, what, work, wait)
         if not errand.done.wait(wait):
             self.cancel(errand)
@@ -159,13 +163,6 @@ class Desk:
         wanted = bytes.fromhex(uuid)
         address = self._roster.seen(uuid).address
         return port.find(lambda identity: identity.uuid == wanted, seconds=ON_A_BUS, notice=_quiet, address=address)
-
-    def _on_a_bus(self, port: Port, uuid: str, what: str, work: Callable[[Conversation], Result]) -> Result:
-        with self._turns.of(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
-            try:
-                return work(node)
-            except SessionLost as lost:
-                raise lost.cause from lost
 
     # -- taps --------------------------------------------------------------------------------------------------------
 

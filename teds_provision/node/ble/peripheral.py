@@ -142,7 +142,11 @@ class Peripheral:
         factory = self._node.in_factory_state()
         if self._address.look(factory=factory):
             await self._stop_advertising()
-            await self._take_address()
+            from bumble.hci import HCI_LE_Set_Random_Address_Command
+
+            self._device.static_address = self._device.random_address = self._bumble_address()
+            command = HCI_LE_Set_Random_Address_Command(random_address=self._device.random_address)
+            await self._device.send_sync_command(command)
         wanted = len(self._lines) < CONNECTIONS and (not factory or time.monotonic() < self._tapped_until)
         if wanted and not self._advertising:
             await self._advertise()
@@ -176,13 +180,6 @@ class Peripheral:
         if self._advertising:
             self._advertising = False
             await self._device.stop_advertising()
-
-    async def _take_address(self) -> None:
-        from bumble.hci import HCI_LE_Set_Random_Address_Command
-
-        self._device.static_address = self._device.random_address = self._bumble_address()
-        command = HCI_LE_Set_Random_Address_Command(random_address=self._device.random_address)
-        await self._device.send_sync_command(command)
 
     def _bumble_address(self) -> Any:
         from bumble.hci import Address

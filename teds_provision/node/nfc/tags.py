@@ -86,17 +86,15 @@ class NdefApplication:
         """Files, once the application is selected."""
         instruction = apdu[1]
         if instruction == _SELECT:
-            return self._select_file(_data(apdu))
+            name = _data(apdu)
+            self._file = name if name in (_CC_FILE, _NDEF_FILE) else b""
+            return _OK if self._file else _NO_FILE
         if instruction == _READ_BINARY and self._file:
             octets = self._memory.read(self._file, _offset(apdu), (apdu[4] or 256) if len(apdu) == 5 else 256)
             return _WRONG_OFFSET if octets is None else octets + _OK
         if instruction == _UPDATE_BINARY and self._file == _NDEF_FILE:
             return _OK if self._memory.write(_offset(apdu), _data(apdu)) else _NO_SPACE
         return _NO_COMMAND
-
-    def _select_file(self, name: bytes) -> bytes:
-        self._file = name if name in (_CC_FILE, _NDEF_FILE) else b""
-        return _OK if self._file else _NO_FILE
 
     def _select_application(self, name: bytes, seconds: float) -> bytes | None:
         if name != _NDEF_APPLICATION:

@@ -157,6 +157,7 @@ def _network(octets: bytes) -> Message:
     if length != len(body):
         text = f"The length says {length} octets, {len(body)} follow; one known NCAP counts one too few."
         findings.insert(0, Finding("warning", "message-length", text, 3, "length", str(len(body)), str(length)))
+    error = _number(arguments, "error")
     return Message(
         octets,
         "network-service",
@@ -169,7 +170,7 @@ def _network(octets: bytes) -> Message:
         number,
         message_type,
         _number(arguments, "channel"),
-        _succeeded(arguments),
+        None if error is None else error == 0,
         teds=_embedded(arguments),
     )
 
@@ -297,8 +298,3 @@ def _embedded(arguments: list[Argument]) -> tuple[tuple[int, bytes], ...]:
 def _number(arguments: list[Argument], name: str) -> int | None:
     value = next((argument.value for argument in arguments if argument.name == name), None)
     return value if isinstance(value, int) else None
-
-
-def _succeeded(arguments: list[Argument]) -> bool | None:
-    error = _number(arguments, "error")
-    return None if error is None else error == 0

@@ -133,7 +133,10 @@ class StreamRole:
         demand(ChannelKind.ACTUATOR not in kinds, Reason.NOT_PERMITTED)
         events = [kind is ChannelKind.EVENT_SENSOR for kind in kinds]
         demand(all(events) if asked.kind == Kind.EVENT else not any(events), Reason.OUT_OF_RANGE)
-        self._check_period(asked)
+        shortest = [self._hardware.channels[channel].shortest for channel in asked.channels]
+        shortest += [teds_period(self._teds(channel)) for channel in asked.channels]
+        demand(max(1, *shortest) <= asked.period <= LONGEST_PERIOD, Reason.OUT_OF_RANGE)
+        demand(self._hardware.keeps(asked.period), Reason.OUT_OF_RANGE)
         length = asked.length(layout.octets)
         most = min(MOST_OCTETS, port.mtu - budget.BLE_OVERHEAD) if port.kind == "ble" else MOST_OCTETS
         demand(length <= most, Reason.TOO_LARGE)
@@ -328,12 +331,6 @@ class StreamRole:
         """Widths of channels that are there and claimed here (else 2)."""
         demand(all(self._claims.holds(session, channel) for channel in channels), Reason.WRONG_STATE)
         return Layout(channels, tuple(self._hardware.channels[channel].octets for channel in channels))
-
-    def _check_period(self, asked: Subscribe) -> None:
-        shortest = [self._hardware.channels[channel].shortest for channel in asked.channels]
-        shortest += [teds_period(self._teds(channel)) for channel in asked.channels]
-        demand(max(1, *shortest) <= asked.period <= LONGEST_PERIOD, Reason.OUT_OF_RANGE)
-        demand(self._hardware.keeps(asked.period), Reason.OUT_OF_RANGE)
 
     def _end(self, stream: Stream) -> None:
         self._missed += stream.missed

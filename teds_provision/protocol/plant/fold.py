@@ -106,6 +106,7 @@ def view(
         )
     own_word = own.met or own.holds or (own.pin is not None and own.assurance != "registry")
 
+    names = [(_weight(roster, one, claim.name[1]), claim.name[0]) for one, claim in counted.items() if claim.name]
     return View(
         pin=pin,
         pins=pins,
@@ -121,7 +122,7 @@ def view(
         resets=resets,
         bans=tuple(one for one in sorted(statements, key=lambda one: (one.said.created, one.hash))
                    if bans(roster, one, own, liftings)),
-        name=_name(roster, counted),
+        name=max(names)[1] if names else None,
         groups=_groups(roster, counted),
         conflicts=conflicts,
         key_it=TWO_KEYS not in conflicts or own_word,
@@ -238,11 +239,6 @@ def _who(roster: Roster, named: Mapping[str, str]) -> str:
 def _weight(roster: Roster, station: str, at: str) -> tuple[bool, str, str]:
     """Between stations a keeper's word goes before others', then the greater time, then the higher fingerprint."""
     return "keeper" in roster.roles_of(station), at, station
-
-
-def _name(roster: Roster, claims: Mapping[str, Claim]) -> str | None:
-    names = [(_weight(roster, one, claim.name[1]), claim.name[0]) for one, claim in claims.items() if claim.name]
-    return max(names)[1] if names else None
 
 
 def _groups(roster: Roster, claims: Mapping[str, Claim]) -> dict[str, bool]:

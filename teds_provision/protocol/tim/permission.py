@@ -70,7 +70,11 @@ class Permission:
                 if command.function in _MEASURING and not self._measures(command):
                     raise Refused(Reason.UNKNOWN_COMMAND)
         elif origin.session is None:
-            self._plain(command)
+            # Other classes outside a session: Query and Read alone
+            if not of_teds(command) or command.function not in (TedsFunction.QUERY, TedsFunction.READ):
+                raise Refused(Reason.NOT_PERMITTED)
+            if command.function == TedsFunction.READ:
+                self._hold_strangers_back()
         elif not self._measures(command) and not of_teds(command):
             raise Refused(Reason.UNKNOWN_COMMAND)
         self._change(command, origin)
@@ -94,13 +98,6 @@ class Permission:
             raise Refused(Reason.NOT_PERMITTED)
         if function == Function.RESET and not self.in_factory():
             raise Refused(Reason.NOT_PERMITTED)
-
-    def _plain(self, command: Command) -> None:
-        """Other classes outside a session: Query and Read alone."""
-        if not of_teds(command) or command.function not in (TedsFunction.QUERY, TedsFunction.READ):
-            raise Refused(Reason.NOT_PERMITTED)
-        if command.function == TedsFunction.READ:
-            self._hold_strangers_back()
 
     def _measures(self, command: Command) -> bool:
         return self.role is not None and self.role.knows(command)

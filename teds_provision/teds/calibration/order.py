@@ -114,19 +114,15 @@ def _curve(order: Order, channel: ChannelProfile) -> Calibration:
         case ["inputs", "coefficients"]:
             return _multinomial(order, channel, method)
         case ["slope"]:
-            return _line(order, channel, method)
+            pair = (order.number("intercept") or 0.0, order.number("slope") or 0.0)
+            part = CalibrationInput(channel.number, 1, _ends(order, channel), (0.0,))
+            return Calibration(channel.number, method or "linear", (part,), pair, actuator=channel.type == 1)
         case ["coefficients"]:
             return _with_coefficients(order, channel, method, degree)
         case []:
             raise order.wrong("", "there is nothing to calibrate with: points, coefficients, or slope and intercept.")
         case _:
             raise order.wrong(sources[0], f"only one of {', '.join(sources)} can be the calibration.")
-
-
-def _line(order: Order, channel: ChannelProfile, method: Method | None) -> Calibration:
-    pair = (order.number("intercept") or 0.0, order.number("slope") or 0.0)
-    part = CalibrationInput(channel.number, 1, _ends(order, channel), (0.0,))
-    return Calibration(channel.number, method or "linear", (part,), pair, actuator=channel.type == 1)
 
 
 def _fitted(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:

@@ -158,7 +158,11 @@ class SampleReader:
         if model in _FLOATS:
             return np.ascontiguousarray(rows).view(_FLOATS[DataModel(model)])[:, 0].astype(np.float64)
         if model == DataModel.TIME_OF_DAY:
-            return _times(rows)
+            # TimeInstance: seconds, and nanoseconds whose highest bit is the sign of the whole
+            seconds = _words(rows[:, :4]).astype(np.float64)
+            nanoseconds = _words(rows[:, 4:])
+            value = seconds + (nanoseconds & (_NEGATIVE - 1)).astype(np.float64) * 1e-9
+            return np.where(nanoseconds & _NEGATIVE, -value, value)
         if model in _FRACTIONS:
             whole = 8 * self.form.octets
             if not self._long:
@@ -234,14 +238,6 @@ def _as_integers(rows: NDArray[np.uint8]) -> NDArray[np.object_]:
     out = np.empty(len(rows), dtype=object)
     out[:] = [int.from_bytes(row.tobytes(), "big") for row in rows]
     return out
-
-
-def _times(rows: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """TimeInstance: seconds, and nanoseconds whose highest bit is the sign of the whole."""
-    seconds = _words(rows[:, :4]).astype(np.float64)
-    nanoseconds = _words(rows[:, 4:])
-    value = seconds + (nanoseconds & (_NEGATIVE - 1)).astype(np.float64) * 1e-9
-    return np.where(nanoseconds & _NEGATIVE, -value, value)
 
 
 def _float(number: int) -> float:

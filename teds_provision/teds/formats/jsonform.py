@@ -144,7 +144,11 @@ def _value(kind: object, value: object, where: str) -> tuple[Kind, EntryValue]:
         case "units", Mapping():
             return "units", units_from_parts(value)
         case "time", Mapping():
-            return "time", _time(value, where)
+            seconds, nanoseconds = (
+                _number(value.get(part, 0), (1 << 48) - 1, f"{part} of {where}") or 0
+                for part in ("seconds", "nanoseconds")
+            )
+            return "time", TimeInstance(seconds, nanoseconds, value.get("negative") is True)
         case "integers", list() if set(map(type, value)) <= {int}:
             return "integers", tuple(value)
         case "numbers", list():
@@ -156,13 +160,6 @@ def _value(kind: object, value: object, where: str) -> tuple[Kind, EntryValue]:
         case "text" | None, str():
             return "text", value
     raise BadData(f"The value of {where} is no {str(kind or 'value')[:40]}: {str(value)[:60]!r}.")
-
-
-def _time(value: Mapping[str, object], where: str) -> TimeInstance:
-    seconds, nanoseconds = (
-        _number(value.get(part, 0), (1 << 48) - 1, f"{part} of {where}") or 0 for part in ("seconds", "nanoseconds")
-    )
-    return TimeInstance(seconds, nanoseconds, value.get("negative") is True)
 
 
 def _float(value: object, where: str) -> float:

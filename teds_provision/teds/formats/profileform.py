@@ -97,7 +97,11 @@ def _lines(decoded: Mapping[tuple[int, int], Decoded]) -> Iterator[str]:
         yield from _keys(PHY_KEYS, decoded[0, AccessCode.PHY].fields)
     for (channel, code), teds in sorted(decoded.items()):
         if code in _KINDS and len(teds.text) == 1:
-            yield from _text(channel, code, teds)
+            yield from ("", "[[text]]", f"kind = {_quoted(_KINDS[code])}", f"channel = {channel}")
+            language = teds.get("LangCode")
+            if isinstance(language, str):
+                yield f"language = {_quoted(language)}"
+            yield f"xml = {_quoted(teds.text[0].decode(errors='replace'))}"
 
 
 def _name(decoded: Mapping[tuple[int, int], Decoded], channel: int) -> str:
@@ -124,7 +128,10 @@ def _channel(teds: Decoded, name: str, number: int) -> Iterator[str]:
         yield f"name = {_quoted(name)}"
     channel = channel_from(teds)
     if channel.units_stated:
-        yield from _units(channel.units)
+        yield f"unit = {_quoted(spell(channel.units))}"
+        shown = display_unit(channel.units)
+        if shown.scale != 1 or shown.offset:
+            yield f"display-unit = {_quoted(shown.text.replace('°C', 'degC').replace('°', 'degree'))}"
     yield from _keys(CHANNEL_KEYS, teds.fields)
     if channel.calibration_key is not None:
         yield f"calibration-key = {_word_or_number(CALIBRATION_KEYS, channel.calibration_key)}"
@@ -137,21 +144,10 @@ def _channel(teds: Decoded, name: str, number: int) -> Iterator[str]:
     data_set = teds.field("DataSet")
     if data_set is not None:
         yield from ("", f"[channel.{number}.data-set]")
-        yield from _data_set(data_set)
-
-
-def _units(units: Units) -> Iterator[str]:
-    yield f"unit = {_quoted(spell(units))}"
-    shown = display_unit(units)
-    if shown.scale != 1 or shown.offset:
-        yield f"display-unit = {_quoted(shown.text.replace('°C', 'degC').replace('°', 'degree'))}"
-
-
-def _data_set(field: Field) -> Iterator[str]:
-    units = next((part.value for part in field.children if part.name == "SUnits"), None)
-    if isinstance(units, Units):
-        yield f"unit = {_quoted(spell(units))}"
-    yield from _keys(DATA_SET_KEYS, field.children)
+        units = next((part.value for part in data_set.children if part.name == "SUnits"), None)
+        if isinstance(units, Units):
+            yield f"unit = {_quoted(spell(units))}"
+        yield from _keys(DATA_SET_KEYS, data_set.children)
 
 
 def _word_or_number(words: Mapping[str, int], number: int) -> str:
@@ -166,14 +162,6 @@ def _sampling(field: Field) -> Iterator[str]:
     word = next((mode for mode, bit in MODES.items() if bit == default), None)
     if word:
         yield f"default = {_quoted(word)}"
-
-
-def _text(channel: int, code: int, teds: Decoded) -> Iterator[str]:
-    yield from ("", "[[text]]", f"kind = {_quoted(_KINDS[code])}", f"channel = {channel}")
-    language = teds.get("LangCode")
-    if isinstance(language, str):
-        yield f"language = {_quoted(language)}"
-    yield f"xml = {_quoted(teds.text[0].decode(errors='replace'))}"
 
 
 def _keys(keys: Iterable[Key], fields: Iterable[Field]) -> Iterator[str]:

@@ -80,7 +80,9 @@ def from_tree(tree: Tree) -> Block:
         return Block(tree.channel, tree.access_code, tree.octets)
     if tree.access_code is None or not tree.entries:
         raise BadData("A TEDS without octets needs an access code and fields.")
-    pairs = [*_tedsid(tree), *(_pair(entry, tree.access_code, 0) for entry in tree.entries)]
+    parts = {"family": tree.family, "version": tree.version, "subfamily": tree.subfamily}
+    given = {key: value for key, value in parts.items() if value is not None}
+    pairs = [*([("TEDSID", given)] if given else []), *(_pair(entry, tree.access_code, 0) for entry in tree.entries)]
     octets = compose(tree.access_code, pairs, edition=tree.edition or 2007, width=tree.width)
     return Block(tree.channel, tree.access_code, octets if tree.framed else octets[4:-2])
 
@@ -170,12 +172,6 @@ def _kind(value: object) -> Kind:
     if isinstance(value, tuple):
         return "numbers" if any(isinstance(part, float) for part in value) else "integers"
     return "number" if isinstance(value, float) else "integer"
-
-
-def _tedsid(tree: Tree) -> list[tuple[str, object]]:
-    parts = {"family": tree.family, "version": tree.version, "subfamily": tree.subfamily}
-    given = {key: value for key, value in parts.items() if value is not None}
-    return [("TEDSID", given)] if given else []
 
 
 def _pair(entry: Entry, access_code: int, depth: int) -> tuple[str, object]:

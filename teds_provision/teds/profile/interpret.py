@@ -347,18 +347,14 @@ def _meta(top: Section, channels: tuple[int, ...], abstract: bool) -> Pairs:
         for group in section.sections(key):
             inner = group.pairs(keys)
             group.finish()
-            _members(group, inner, channels)
+            for name, value in inner:
+                if name == "MemList" and isinstance(value, tuple):
+                    absent = [str(number) for number in value if number not in channels]
+                    if absent:
+                        group.error("members", f"the type has no channel {', '.join(absent)}.")
             pairs.append((field, inner))
     section.finish()
     return tuple(pairs)
-
-
-def _members(group: Section, pairs: Pairs, channels: tuple[int, ...]) -> None:
-    for name, value in pairs:
-        if name == "MemList" and isinstance(value, tuple):
-            absent = [str(number) for number in value if number not in channels]
-            if absent:
-                group.error("members", f"the type has no channel {', '.join(absent)}.")
 
 
 def _text(part: Section, channels: tuple[int, ...]) -> TextProfile | None:

@@ -269,6 +269,9 @@ def describe_channel(channel: ChannelProfile) -> dict[str, Any]:
 
 def template(name: str) -> str:
     """Text of a new profile: what is needed is filled with examples, what is optional stands as a comment."""
+    lines = [""]
+    for key, (field, keys) in META_GROUPS.items():
+        lines += [f"# [[meta.{key}]]  # {field}", *_lines(keys, comment=True), ""]
     return "\n".join(
         [
             f"# Transducer type {name}.",
@@ -284,7 +287,7 @@ def template(name: str) -> str:
             "",
             "[meta]                              # Meta-TEDS, access code 1; UUID and MaxChan are filled in",
             *_lines(META_KEYS),
-            *_groups(),
+            *lines,
             "# Each channel is a TransducerChannel TEDS, access code 3; [channel.1-12], [channel.all] say it for many.",
             "[channel.1]",
             'name = "channel 1"                  # {channel} stands for its number',
@@ -333,10 +336,3 @@ def _line(key: Key, comment: bool) -> str:
     choices = f" ({', '.join(key.choices)})" if key.choices else ""
     text = f"{'# ' if comment else ''}{key.key} = {key.example}"
     return f"{text:<35} # {key.field}: {key.help}{choices}"
-
-
-def _groups() -> list[str]:
-    lines = [""]
-    for key, (field, keys) in META_GROUPS.items():
-        lines += [f"# [[meta.{key}]]  # {field}", *_lines(keys, comment=True), ""]
-    return lines

@@ -143,7 +143,10 @@ def parse(text: str, file: str) -> Table:
         return Where(file, lines.get(path, 1))
 
     def build(value: dict[str, object], path: KeyPath) -> Table:
-        return Table({key: entry(item, (*path, key)) for key, item in value.items()}, place(path), _dotted(path))
+        text = ""
+        for part in path:
+            text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+        return Table({key: entry(item, (*path, key)) for key, item in value.items()}, place(path), text)
 
     def entry(value: object, path: KeyPath) -> Item | Table:
         if isinstance(value, dict):
@@ -153,13 +156,6 @@ def parse(text: str, file: str) -> Table:
         return Item(value, place(path))
 
     return build(data, ())
-
-
-def _dotted(path: KeyPath) -> str:
-    text = ""
-    for part in path:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
-    return text
 
 
 def read_text(path: Path) -> str:

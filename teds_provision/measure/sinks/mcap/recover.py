@@ -237,7 +237,8 @@ class _Scan:
         if finished and not good:
             self._damage("summary", at, len(self.octets))
         if not finished:
-            self._leave_torn_end()
+            # What is damaged behind the last good record of an unfinished file is its torn end
+            self.damaged = [one for one in self.damaged if one.offset < self.end]
         self._join_damage()
 
     def _read_end(self) -> bool:
@@ -339,10 +340,6 @@ class _Scan:
             else:
                 joined.append(one)
         self.damaged = joined
-
-    def _leave_torn_end(self) -> None:
-        """What is damaged behind the last good record of an unfinished file is its torn end."""
-        self.damaged = [one for one in self.damaged if one.offset < self.end]
 
     def _next_chunk(self, at: int) -> int:
         """Where something stands that has the form of a chunk; the end of the data where nothing does."""
