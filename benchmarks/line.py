@@ -28,7 +28,7 @@ from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message, public_key, to_pem
-from teds_provision.protocol.plant.evidence import Claim, seal
+from teds_provision.protocol.plant.evidence import EvidenceClaim, seal
 from teds_provision.protocol.plant.signing import SignRequest, challenge, seal_request
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
@@ -51,17 +51,17 @@ def evidence(folder: Path, count: int) -> Path:
     owner.unlock()
     credentials, profile = owner.credentials(), load_profile(ANGLE)
     (folder / "files").mkdir()
-    from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
+    from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
 
     for number in range(count):
         key, uuid = SoftwareKey.generate(), (1 + number).to_bytes(10, "big")
-        keys = NodeKeys(uuid, key.point, key.sign(node_key_message(uuid, key.point)))
+        keys = SignedNodeKey(uuid, key.point, key.sign(node_key_message(uuid, key.point)))
         listed = digests(profile.build(uuid).blocks)
         unsigned = unsigned_datasheet(
             keys, owner.point, owner.identity.signature, listed, ca="ca:0", sequence=1, key_epoch=1
         )
         teds = sign_datasheet(unsigned, uuid, credentials)
-        claim = Claim(uuid, teds, facts_of(owner, teds))
+        claim = EvidenceClaim(uuid, teds, facts_of(owner, teds))
         nonce = os.urandom(16)
         proof = key.sign(prove_message(uuid, claim.challenge(nonce)))
         document = seal(

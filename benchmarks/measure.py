@@ -25,10 +25,10 @@ from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.protocol.operation.can_frames import Assembly
-from teds_provision.protocol.operation.datagram import Sealer, stream_key
+from teds_provision.protocol.operation.can_frames import StreamAssembly
+from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
 from teds_provision.protocol.operation.stream_commands import Subscribed
-from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
@@ -53,8 +53,8 @@ class Stream:
     """Messages of a stream, and what hears them."""
 
     def __init__(self, known: Sheet) -> None:
-        self.plan = Plan.of(0, ((1, 2),), n=N, period=PERIOD)
-        chance, sealer = np.random.default_rng(1), Sealer(stream_key(KEY, 1))
+        self.plan = StreamPlan.of(0, ((1, 2),), n=N, period=PERIOD)
+        chance, sealer = np.random.default_rng(1), DatagramSealer(stream_key(KEY, 1))
         bodies = (b"\0" + chance.integers(0, 65536, N).astype(">u2").tobytes() for _ in range(MESSAGES))
         self.messages = [sealer.seal(k, body) for k, body in enumerate(bodies)]
         clock = ClockMap()
@@ -64,7 +64,7 @@ class Stream:
         self.blocks: list[Block] = []
         interpreter = StreamInterpreter(known, self.plan, 1, clock, HostClock(), Monotone())
         receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
-        assembly = Assembly(self.plan.length, fd=True)
+        assembly = StreamAssembly(self.plan.length, fd=True)
         self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
 
     def run(self, together: int) -> float:
@@ -83,7 +83,7 @@ class Stream:
 
 def floor(messages: list[bytes], together: int, compute: Callable[[np.ndarray], object]) -> float:
     """CPU seconds of AES-CCM and numpy alone."""
-    sealer = Sealer(stream_key(KEY, 1))
+    sealer = DatagramSealer(stream_key(KEY, 1))
     began = time.thread_time()
     for at in range(0, len(messages), together):
         plain = [sealer.open(message) for message in messages[at : at + together]]

@@ -38,10 +38,10 @@ from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.runner import BEAT
 from teds_provision.measure.sinks import Sink, open_sink
 from teds_provision.measure.trusting import facts_of
-from teds_provision.protocol.operation.can_frames import Assembly, DataAddress, cut
-from teds_provision.protocol.operation.datagram import Sealer, stream_key
+from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
+from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
 from teds_provision.protocol.operation.stream_commands import Subscribed
-from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile.load import parse_profile
@@ -64,9 +64,9 @@ def node_address(node: int) -> int:
     return 0x20 + node
 
 
-def plan_of(stream: int) -> Plan:
+def plan_of(stream: int) -> StreamPlan:
     """One of the two streams of each node."""
-    return Plan.of(stream, tuple((number, 2) for number in HALVES[stream]), n=N, period=PERIOD)
+    return StreamPlan.of(stream, tuple((number, 2) for number in HALVES[stream]), n=N, period=PERIOD)
 
 
 def sheet_of(node: int) -> Sheet:
@@ -88,7 +88,7 @@ class Feeder:
 
     def __init__(self, specs: list[str]) -> None:
         self._buses = [Bus(parse_spec(spec)) for spec in specs]
-        self._sealer = Sealer(stream_key(KEY, 1))
+        self._sealer = DatagramSealer(stream_key(KEY, 1))
         chance = np.random.default_rng(1)
         self._bodies = [
             [b"\0" + chance.integers(0, 65536, N * len(half)).astype(">u2").tobytes() for _ in range(BODIES)]
@@ -207,7 +207,9 @@ class Machine:
         plan = plan_of(stream)
         receiver = Receiver(plan, Subscribed(1, plan.length, SECOND), KEY)
         interpreter = StreamInterpreter(sheet, plan, 1, clock, self._host, Monotone())
-        return HeardStream(receiver, Assembly(plan.length, fd=True), interpreter, clock, threading.Lock(), self._block)
+        return HeardStream(
+            receiver, StreamAssembly(plan.length, fd=True), interpreter, clock, threading.Lock(), self._block
+        )
 
     def _block(self, block: Block) -> None:
         for sink in self._sinks:

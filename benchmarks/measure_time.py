@@ -29,7 +29,7 @@ from teds_provision.measure.blocks import Block
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
-from teds_provision.measure.running.job import Job
+from teds_provision.measure.running.job import MeasurementJob
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.described import create
 from teds_provision.node.hardware.board import Board
@@ -119,7 +119,7 @@ class Bench:
         uuids = tuple(self.nodes)[:count]
         file = self.folder / f"run-{count}-{time.monotonic_ns()}.csv"
         kept = KeptMeasurement("", uuids=uuids, rate=RATE, sinks=(str(file),), lasting=False)
-        job = Job(self.station, kept, request=MeasurementRequest(timeout=60.0))
+        job = MeasurementJob(self.station, kept, request=MeasurementRequest(timeout=60.0))
         came: list[tuple[int, Block]] = []
         stop, port = threading.Event(), CanPort(self.can)
         with ExitStack() as stack:

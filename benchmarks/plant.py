@@ -30,7 +30,7 @@ from teds_provision.plant.sync import sync
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.document import hash_of
-from teds_provision.protocol.plant.page import Draft, seal_page
+from teds_provision.protocol.plant.page import PageDraft, seal_page
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
@@ -53,7 +53,7 @@ def chain(key: SoftwareKey, pages: int, events: int) -> Pages:
                        {"fingerprint": "ab" * 32, "epoch": 1, "key_id": os.urandom(8).hex()})
             for _ in range(events)
         ]  # fmt: skip
-        draft = Draft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
+        draft = PageDraft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
         octets = seal_page(draft, told, key)
         made.append((n, before, octets))
         before = hash_of(octets)
@@ -149,7 +149,9 @@ def _history(nodes: int) -> None:
         made.sync(made.north)
         for _ in range(0, nodes, 250):
             told = [one for _ in range(250) for one in _told_of(os.urandom(10))]
-            draft = Draft(made.roster.registry, place[0] + 1, place[1], "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
+            draft = PageDraft(
+                made.roster.registry, place[0] + 1, place[1], "0" * 16, datetime.now(UTC), {}, (1, "0" * 64)
+            )
             octets = seal_page(draft, told, key)
             place = draft.n, hash_of(octets)
             stick.append(west.fingerprint, draft.n, draft.previous, place[1], octets)
@@ -236,7 +238,7 @@ def _woken(posts: list[postgres.Registry], keys: list[SoftwareKey]) -> None:
     name, took = fingerprint(keys[2].point), []
     n, before = writer.look().heads[name]
     for n in range(n + 1, n + 101):  # noqa: B020
-        draft = Draft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
+        draft = PageDraft(REGISTRY, n, before, "0" * 16, datetime.now(UTC), {}, (1, "0" * 64))
         octets = seal_page(draft, [], keys[2])
         began = time.perf_counter()
         pushing = threading.Thread(target=writer.append, args=([(n, before, octets)],))

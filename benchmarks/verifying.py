@@ -19,7 +19,7 @@ from pathlib import Path
 
 import teds_provision
 from benchmarks.machine import checks_a_second
-from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
+from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message
 from teds_provision.station.station import initialise
 from teds_provision.teds.codec import security
@@ -41,7 +41,7 @@ def fill(folder: Path, home: Path, count: int) -> None:
     folder.mkdir()
     for number in range(count):
         key, uuid = SoftwareKey.generate(), (1 + number).to_bytes(10, "big")
-        node = NodeKeys(uuid, key.point, key.sign(node_key_message(uuid, key.point)))
+        node = SignedNodeKey(uuid, key.point, key.sign(node_key_message(uuid, key.point)))
         blocks = profile.build(uuid).blocks
         hint = security.ca_hint(station.name, fingerprint(station.ca))
         unsigned = unsigned_datasheet(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from teds_provision.backup.content import Head
+from teds_provision.backup.content import BackupHead
 from teds_provision.backup.sealed_file import MAX_OCTETS, SealedFile, Sealer, write
 from teds_provision.errors import StoreFailure, StoreLocked, TedsProvisionError, VaultFailure
 from teds_provision.files import whole_draft
@@ -83,7 +83,7 @@ def _write(station: Station, vault: Vault, file: BinaryIO, sealer: Sealer) -> by
         # Never a path in the head: nothing may be loaded because a backup names it.
         kind = station.identity.keystore
         kind = "pkcs11" if kind.startswith("pkcs11:") else kind
-        head = Head(station.id, station.point, station.name, utc_now(), kind, vault.secret_material())
+        head = BackupHead(station.id, station.point, station.name, utc_now(), kind, vault.secret_material())
         key = write(file, head, station.rows(), vault.identity(), sealer)
         if not vault.refresh():
             return key

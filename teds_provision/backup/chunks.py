@@ -25,7 +25,7 @@ _NONCE_COUNTER_OCTETS: Final = 11
 _FULL: Final = CHUNK_OCTETS + TAG_OCTETS
 
 
-class Source(Protocol):
+class OctetSource(Protocol):
     """What gives octets in order."""
 
     def read(self, size: int, /) -> bytes:
@@ -67,7 +67,7 @@ class ChunkReader:
     Raises NotAuthentic (changed), BadData (cut off, or something follows the end).
     """
 
-    def __init__(self, source: Source, key: bytes, context: bytes) -> None:
+    def __init__(self, source: OctetSource, key: bytes, context: bytes) -> None:
         self._source, self._cipher, self._context = source, AESGCM(key), context
         self._ahead = self._plain = b""
         self._place = self._index = 0

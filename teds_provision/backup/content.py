@@ -38,7 +38,7 @@ def context_of(clear: dict[str, Any], form: str) -> bytes:
 
 
 @dataclass(frozen=True)
-class Head:
+class BackupHead:
     """Whose backup it is: store id, station's point (65 octets), name, time, keystore (its kind, as it was called).
 
     ``material`` is all that the vault keeps secret; for a token, only what it has sealed.
@@ -67,7 +67,7 @@ class Head:
         return dump({"format": form, **texts, "point": self.point.hex(), "version": __version__}) + b"\n"
 
     @staticmethod
-    def read(line: bytes, form: str) -> Head:
+    def read(line: bytes, form: str) -> BackupHead:
         """The head that a line says; raises BadData: another format, a text that is missing, no point of P-256."""
         members = load_object(line, "The head of the backup")
         if members.get("format") != form or not all(isinstance(members.get(name), str) for name in _TEXTS):
@@ -79,7 +79,7 @@ class Head:
         if not is_point(point):
             raise BadData("The backup names no valid station key.")
         values = (members[name] for name in ("name", "created", "keystore", "material"))
-        return Head(members["store"], point, *values)
+        return BackupHead(members["store"], point, *values)
 
     def age_days(self, now: datetime | None = None) -> int:
         """How many whole days ago it was made; negative for a time in the future, 0 where the time cannot be read."""
@@ -92,7 +92,7 @@ class Head:
 
 
 @dataclass(frozen=True)
-class Content(Head):
+class Content(BackupHead):
     """An opened backup: its head, and its store as a private copy that lives until :meth:`close`."""
 
     copy: Store = field(repr=False, kw_only=True)

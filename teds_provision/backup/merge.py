@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.store import Revocation, Store, Tombstone, WhitelistEntry
+from teds_provision.store import RevocationRecord, Store, Tombstone, WhitelistEntry
 from teds_provision.store.snapshot import Relation, extend_audit
 
 
@@ -200,5 +200,5 @@ def _epochs(store: Store) -> dict[bytes, int]:
     return epochs
 
 
-def _more(live: Iterable[Revocation | Tombstone], copy: Iterable[Revocation | Tombstone]) -> int:
+def _more(live: Iterable[RevocationRecord | Tombstone], copy: Iterable[RevocationRecord | Tombstone]) -> int:
     return len({record.uuid for record in live} - {record.uuid for record in copy})

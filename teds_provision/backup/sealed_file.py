@@ -3,9 +3,10 @@
 One line of JSON in the clear: ``format`` ``teds-backup/2``, ``store``, ``station``, ``created``, ``key`` and ``sha256``
 over all of it, so that a damaged head is told from a wrong passphrase. ``key`` is the file's own random key, sealed
 under a passphrase (Argon2id, AES-256-GCM) or as a JWE to a recovery key, which any JOSE implementation opens.
-Then chunks (:mod:`.chunks`), each bound to the SHA-256 of that line. Inside: a line of JSON (:class:`.content.Head`),
-the store as rows (:mod:`teds_provision.store.dump`), and the station's signature, 64 octets: SIG(station,
-"TEDS1 backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of all that stands before the signature).
+Then chunks (:mod:`.chunks`), each bound to the SHA-256 of that line. Inside: a line of JSON
+(:class:`.content.BackupHead`), the store as rows (:mod:`teds_provision.store.dump`), and the station's signature,
+64 octets: SIG(station, "TEDS1 backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of all that stands before the
+signature).
 
 Files of version 1, of the time before KeyAgreement 2, are refused by name.
 """
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from teds_provision.backup.chunks import KEY_OCTETS, ChunkReader, ChunkWriter
-from teds_provision.backup.content import MAX_HEAD_OCTETS, Content, Head, check_digest, context_of, digest_of
+from teds_provision.backup.content import MAX_HEAD_OCTETS, BackupHead, Content, check_digest, context_of, digest_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.files import open_to_read
 from teds_provision.protocol.handover import jose
@@ -56,7 +57,7 @@ class Sealer:
         return sealing.seal(self._passphrase, key, context=context_of(clear, FORMAT), costs=self._costs)
 
 
-def write(out: BinaryIO, head: Head, rows: Iterable[bytes], signer: PrivateKey, sealer: Sealer) -> bytes:
+def write(out: BinaryIO, head: BackupHead, rows: Iterable[bytes], signer: PrivateKey, sealer: Sealer) -> bytes:
     """Write a whole backup; returns the file's own key, to read it back with. Raises what ``rows`` raises, OSError."""
     key = os.urandom(KEY_OCTETS)
     clear = {"format": FORMAT, "store": head.store, "station": head.station, "created": head.created}
@@ -136,7 +137,7 @@ class SealedFile:
 
 
 def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Content:
-    head = Head.read(chunks.read_line(MAX_HEAD_OCTETS), FORMAT)
+    head = BackupHead.read(chunks.read_line(MAX_HEAD_OCTETS), FORMAT)
     if (head.store, head.station, head.created) != (clear["store"], clear["station"], clear["created"]):
         raise NotAuthentic("The backup says outside that it is of another station than it is inside.")
     copy = load_rows(chunks)

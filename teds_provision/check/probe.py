@@ -13,7 +13,7 @@ from teds_provision.errors import BadData, Garbled, NodeSilent, NotAuthentic, To
 from teds_provision.links import Contact
 from teds_provision.links.ports import Direction, Link, OnABus, Trace
 from teds_provision.protocol.agreement import AgreedKey, Credentials
-from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
@@ -67,7 +67,7 @@ class HeardFrame:
 
 
 @dataclass
-class Heard:
+class TraceRecorder:
     """A trace that remembers the frames and hands everything on to ``further``; see ``links.ports.Trace``."""
 
     further: Trace | None = None
@@ -112,7 +112,7 @@ class Probe:
     in this run. ``line`` is the line that is asked now, as a rule this station's own.
     """
 
-    def __init__(self, contact: Contact, heard: Heard | None = None) -> None:
+    def __init__(self, contact: Contact, heard: TraceRecorder | None = None) -> None:
         self.contact, self.heard = contact, heard
         self.line: Link = contact.link
         self.uuid = contact.identity.uuid
@@ -408,10 +408,10 @@ class Probe:
         return shown
 
     @property
-    def node_keys(self) -> NodeKeys:
+    def node_keys(self) -> SignedNodeKey:
         """Fields 101 and 102, as the first Security TEDS that could be read had them: they never change."""
         shown = self._shown or self.security()
-        return NodeKeys(self.uuid, shown.node_key, shown.node_key_signature)
+        return SignedNodeKey(self.uuid, shown.node_key, shown.node_key_signature)
 
     @property
     def node_key(self) -> bytes:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from teds_provision.check import agreement, link_rules, plain, sessions, writing
 from teds_provision.check.agreement import Explained, explain
-from teds_provision.check.probe import Heard, NotApplicable, Probe, RuleBroken
+from teds_provision.check.probe import NotApplicable, Probe, RuleBroken, TraceRecorder
 from teds_provision.check.rule import RULES, Checked, Rule, Stage
 from teds_provision.errors import BadData, Garbled, LinkFailure, NotAuthentic, PolicyRefused
 from teds_provision.links import LinkSettings
@@ -34,7 +34,7 @@ _TORN_TRIES = 3
 
 
 @dataclass(frozen=True)
-class Report:
+class CheckReport:
     """Every rule, in order, and how often each result came.
 
     ``lost`` is why the rest could not be tried: the node fell silent, or the reader went away; None where all was.
@@ -53,9 +53,9 @@ class Report:
 
 def check_at(
     station: Station, links: LinkSettings, reporter: Reporter, *, factory: bool, explained: bool = False
-) -> Report:
+) -> CheckReport:
     """Run the rules against the node that is met first; see :func:`check_node`. Raises NoNode, NoReader as well."""
-    heard = Heard(links.trace)
+    heard = TraceRecorder(links.trace)
     with meet(station, replace(links, trace=heard), None, reporter, before=station.unlock) as node:
         return check_node(station, node, factory=factory, heard=heard, explained=explained)
 
@@ -65,9 +65,9 @@ def check_node(
     node: Conversation,
     *,
     factory: bool = False,
-    heard: Heard | None = None,
+    heard: TraceRecorder | None = None,
     explained: bool = False,
-) -> Report:
+) -> CheckReport:
     """Run the rules against a node, most of which change nothing; ``heard`` has the frames of its link.
 
     Without ``factory`` no key changes: a factory node is tried in factory state, one of ours in sessions too. With it a
@@ -81,7 +81,7 @@ def check_node(
 
 class _Run:
     def __init__(
-        self, station: Station, node: Conversation, factory: bool, heard: Heard | None, *, explained: bool
+        self, station: Station, node: Conversation, factory: bool, heard: TraceRecorder | None, *, explained: bool
     ) -> None:
         self._station, self._node, self._factory = station, node, factory
         self._probe = Probe(node.contact, heard)
@@ -89,7 +89,7 @@ class _Run:
         self._explaining, self._explained = explained, None  # type: bool, Explained | str | None
         self._lost: LinkFailure | None = None
 
-    def all(self) -> Report:
+    def all(self) -> CheckReport:
         try:
             ours = self._probe.identity().state != NodeState.FACTORY
         except RuleBroken:  # the rules say what is wrong with it
@@ -117,7 +117,7 @@ class _Run:
         stages = list(Stage)
         ordered = sorted(RULES, key=lambda each: stages.index(each.stage))
         checks = tuple(self._checks[each.name] for each in ordered)
-        return Report(self._node.uuid, checks, self._lost, self._explained)
+        return CheckReport(self._node.uuid, checks, self._lost, self._explained)
 
     def _explain(self) -> None:
         """Before any rule: a node that cannot agree gets the figures that lead to why."""

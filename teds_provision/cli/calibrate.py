@@ -13,7 +13,7 @@ import click
 from teds_provision import measure, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import (
-    Channel,
+    ChannelNumber,
     FileToRead,
     WholeNumber,
     command,
@@ -56,7 +56,7 @@ def calibrate() -> None:
     context_settings=_NEGATIVE,
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=Channel())
+@click.argument("channel", type=ChannelNumber())
 @click.option("--value", type=float, metavar="V", help="What the channel is to read now (default: 0).")
 @click.option("--unit", metavar="U", help="Unit of V (default: the SI unit of the datasheet).")
 @click.option(
@@ -146,7 +146,7 @@ def _zero_lines(done: Zeroed, *, dry_run: bool) -> str:
     context_settings=_NEGATIVE,
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=Channel())
+@click.argument("channel", type=ChannelNumber())
 @click.option("--reference", type=float, required=True, metavar="V", help="What the sensor really stands at.")
 @click.option("--unit", metavar="U", help="Unit of V (default: the SI unit of the datasheet).")
 @click.option(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.check.agreement import Explained
-    from teds_provision.check.run import Report
+    from teds_provision.check.run import CheckReport
 
 
 @command(
@@ -126,7 +126,7 @@ _EXPLAINED: Final = {
 }
 
 
-def _table(console: Console, report: Report) -> None:
+def _table(console: Console, report: CheckReport) -> None:
     from rich.markup import escape
     from rich.table import Table
 

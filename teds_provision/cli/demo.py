@@ -81,7 +81,7 @@ def _plant(app: App) -> None:
 
 
 def _page(app: App, http: str | None) -> None:
-    over = talk.meeting.Patience(None)
+    over = talk.meeting.IdleStop(None)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.ask())
     with demo_room.page.page_demo(app.note, http) as shown:

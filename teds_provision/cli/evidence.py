@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from teds_provision.plant.verify_evidence import Judged
+    from teds_provision.plant.verify_evidence import JudgedEvidence
     from teds_provision.station.station import Station
     from teds_provision.store import EvidenceRow
 
@@ -57,7 +57,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
     """
     grounds = plant.verify_evidence.Grounds.of(protocol.keys.from_pem(read_file(ca)), pins, roster)
     names = json_files([Path(file) for file in files], "evidence")
-    totals = plant.verify_evidence.Totals()
+    totals = plant.verify_evidence.EvidenceTotals()
     for lines, counted in plant.verify_evidence.verify_evidence(grounds, names, _json if app.json else _line):
         totals.join(counted)
         app.lines(lines)
@@ -72,7 +72,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
         raise click.exceptions.Exit(totals.exit_code)
 
 
-def _line(judged: Judged) -> str:
+def _line(judged: JudgedEvidence) -> str:
     found = judged.evidence
     text = f"{judged.word:<13}  {found.uuid.hex() if found else '-':<20}  {judged.path}"
     why = judged.error.message if judged.error is not None else "; ".join(judged.faults)
@@ -81,7 +81,7 @@ def _line(judged: Judged) -> str:
     return printable(f"{text}: {why}" if why else text)
 
 
-def _json(judged: Judged) -> str:
+def _json(judged: JudgedEvidence) -> str:
     return to_json(judged.to_json())
 
 

@@ -14,7 +14,7 @@ from teds_provision.cli.rendering import reporter_for
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
-    from teds_provision.steps.commands import Found
+    from teds_provision.steps.commands import ProvenNode
 
 
 @command(
@@ -30,7 +30,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
 
     With --via can, every node on the bus is asked; --json lists several under "nodes".
     """
-    stop = talk.meeting.Patience(None)
+    stop = talk.meeting.IdleStop(None)
     if watch:
         signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     several = len(links.places) > 1
@@ -48,7 +48,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
         _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
 
 
-def _to_json(found: Found) -> dict[str, Any]:
+def _to_json(found: ProvenNode) -> dict[str, Any]:
     who, identity = found.who, found.identity
     return {
         "uuid": who.uuid.hex(),

@@ -122,7 +122,7 @@ def _tell_lines(app: App, entries: _Counted, verdict: AuditVerdict, after: int, 
 
 def _follow(app: App, station: Station, choice: Choice, verdict: AuditVerdict, after: int) -> None:
     """Give entries as they come, until SIGTERM (exit 0) or Ctrl-C (exit 130)."""
-    stop = talk.meeting.Patience(None)
+    stop = talk.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     _require_intact(verdict)
     while True:

@@ -17,7 +17,7 @@ from teds_provision import measure as measure_room
 from teds_provision import talk, teds
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import Channel, FileToRead, Number, WholeNumber, command, link_options
+from teds_provision.cli.options import ChannelNumber, FileToRead, Number, WholeNumber, command, link_options
 from teds_provision.cli.sample import ending, over_the_bus, where_met
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.lazy import late
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from teds_provision.cli import measure_view
     from teds_provision.measure.request import Requirements
     from teds_provision.measure.runner import Ended
-    from teds_provision.measure.running.job import Job
+    from teds_provision.measure.running.job import MeasurementJob
     from teds_provision.measure.sinks.mcap.recover import Recovered
     from teds_provision.station.station import Station
 else:  # loads the sinks and numpy
@@ -49,7 +49,7 @@ KINDS = ("periodic", "event", "free")
 @click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Samples per second (default: from the datasheet).")
 @click.option("--duration", type=Number(min=0.1), metavar="S", help="Seconds (default: until Ctrl-C).")
 @click.option(
-    "--channel", "channels", type=Channel(), multiple=True, metavar="N", help="Only this channel; repeatable."
+    "--channel", "channels", type=ChannelNumber(), multiple=True, metavar="N", help="Only this channel; repeatable."
 )
 @click.option("--kind", type=click.Choice(KINDS), help="How the node samples (default: each channel's own kind).")
 @click.option("--trigger", is_flag=True, help="Start all nodes at the same moment, with one frame.")
@@ -113,7 +113,7 @@ def measure(
     kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished | {"require": _requirements(require)})
     if group and duration is None:
         kept = _carried_on(app, station, kept)
-    job = measure_room.running.job.Job(
+    job = measure_room.running.job.MeasurementJob(
         station, kept, request=measure_room.request.MeasurementRequest(timeout=links.timeout)
     )
     for uuid in uuids:
@@ -198,8 +198,8 @@ def _carried_on(app: App, station: Station, asked: KeptMeasurement) -> KeptMeasu
     return kept
 
 
-def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], duration: float | None) -> Ended:
-    station, stop = job.station, talk.meeting.Patience(None)
+def _run(app: App, job: MeasurementJob, links: LinkSettings, uuids: Sequence[bytes], duration: float | None) -> Ended:
+    station, stop = job.station, talk.meeting.IdleStop(None)
     group = job.kept.group or ""
     nodes = [uuid.hex() for uuid in uuids]
     kinds = (can.port.CanPort, ble.port.BlePort)

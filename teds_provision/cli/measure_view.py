@@ -33,7 +33,7 @@ ROWS = 40
 def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threading.Event) -> Iterator[Watcher]:
     """Who watches: lines of JSON, a table, or lines on stderr."""
     if app.json:
-        lines = JsonLines(stop)
+        lines = StdoutEvents(stop)
         lines.open((), measure_room.blocks.StationFacts(station.name))
         try:
             yield Watcher(lines.write, lines.describe, lines.report_change, lines.sink, app.warn)
@@ -47,7 +47,7 @@ def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threadi
         yield Watcher(report=plain.report, sink=plain.sink, note=app.warn)
 
 
-class JsonLines(ThreadedSink):
+class StdoutEvents(ThreadedSink):
     """Events on stdout, written by a thread of its own: a slow pipe stops no measurement. It drops nothing."""
 
     recorder = True

@@ -148,14 +148,14 @@ def run(
     if wanted.measure is not None:
         matching.Match.parse(wanted.measure).require_groups(station)
     station.unlock()  # nobody is asked for a passphrase later
-    lines = Lines(app)
+    lines = DaemonLog(app)
     with tracing(trace) as opened:
         running.run(station, replace(wanted, trace=opened), lines.tell)
     if not lines.end():
         os._exit(0)  # all has ended in order; a line that nobody takes would hold the end of the process up for ever
 
 
-class Lines:
+class DaemonLog:
     """The daemon's lines: JSON on stdout, or sentences on stderr; a thread of their own writes them.
 
     Whoever stops reading them, a script that wanted the first one or a terminal that is held by Ctrl-S, stops nothing:

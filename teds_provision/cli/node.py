@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from teds_provision.node.ble.server import BleServer
     from teds_provision.node.can.server import CanServer
     from teds_provision.node.flash_file import FlashFile
-    from teds_provision.node.hardware.board import Board, Shown
+    from teds_provision.node.hardware.board import ActuatorReading, Board
     from teds_provision.node.nfc.tnep import Extras
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.protocol.operation.streams import DataFrame
@@ -227,7 +227,7 @@ def run(
         node_room.virtual.VirtualNode(folder, delays=delays, exclusive=True, board=make, pulse=pulse)
         for folder in folders
     ]
-    stop = talk.meeting.Patience(None)
+    stop = talk.meeting.IdleStop(None)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.ask())
     signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes,)).start())
@@ -368,16 +368,16 @@ class ActuatorLines:
 
     def __init__(self, app: App) -> None:
         self._app = app
-        self._news: dict[tuple[str, int], Shown] = {}
-        self._told: dict[tuple[str, int], Shown] = {}
+        self._news: dict[tuple[str, int], ActuatorReading] = {}
+        self._told: dict[tuple[str, int], ActuatorReading] = {}
         self._condition = threading.Condition()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="actuators", daemon=True)
 
-    def of(self, uuid: str) -> Callable[[Shown], None]:
+    def of(self, uuid: str) -> Callable[[ActuatorReading], None]:
         """Where the board of a node tells its states."""
 
-        def shown(state: Shown) -> None:
+        def shown(state: ActuatorReading) -> None:
             with self._condition:
                 self._news[uuid, state.channel] = state
                 self._condition.notify()
@@ -417,7 +417,7 @@ class ActuatorLines:
                     self._stop.set()
                     return
 
-    def _tell(self, uuid: str, state: Shown) -> None:
+    def _tell(self, uuid: str, state: ActuatorReading) -> None:
         name = state.name or f"channel {state.channel}"
         value = f"{state.value:g} {state.unit}".rstrip() if state.value is not None else f"raw {state.raw:g}"
         self._app.emit(

@@ -91,7 +91,7 @@ class FileToRead(click.Path):
         return path
 
 
-class Channel(WholeNumber):
+class ChannelNumber(WholeNumber):
     """The number of a TransducerChannel, 1 to 255; says so where it is none."""
 
     name = "channel"

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from teds_provision.teds.profile import Problem
+    from teds_provision.teds.profile import ProfileProblem
 
 
 @click.group(
@@ -149,7 +149,7 @@ def check(app: App, names: tuple[str, ...]) -> None:
     """Report every mistake with file, line and field. Exits 8 if there is one."""
     folders = default_folders(app.home)
     told: list[dict[str, Any]] = []
-    errors: list[Problem] = []
+    errors: list[ProfileProblem] = []
     for name in names:
         path = find_profile(name, folders)
         _, problems = check_profile(path, folders)
@@ -165,7 +165,7 @@ def check(app: App, names: tuple[str, ...]) -> None:
     app.emit({"profiles": told}, _plain(f"{good}: no mistakes found."))
 
 
-def _problem(one: Problem) -> dict[str, Any]:
+def _problem(one: ProfileProblem) -> dict[str, Any]:
     where = {"file": one.where.file, "line": one.where.line}
     return {**where, "field": one.field, "message": one.message, "severity": one.severity}
 

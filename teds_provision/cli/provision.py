@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.links import Notice
-    from teds_provision.station.summary import Summary
+    from teds_provision.station.summary import NodeSummary
     from teds_provision.steps.adopting import Brought
-    from teds_provision.steps.batch import Boards, Plan, Questions, Request
-    from teds_provision.steps.batch_sheet import Board, Row
+    from teds_provision.steps.batch import Boards, ProvisionPlan, ProvisionRequest, Questions
+    from teds_provision.steps.batch_sheet import BoardResult, SheetRow
     from teds_provision.steps.identify import Identified
     from teds_provision.steps.provision import Provisioned
     from teds_provision.teds.diff import Change
@@ -135,9 +135,9 @@ def provision(
     order = replace(order, adopt=adopt and bool(said_here("adopt")))  # a setting of that name is meant for ncap run
     if order.adopt and (batch is not None or job is not None):
         raise UsageFailure("A sheet or a job says itself what a board gets.", hint="Drop --adopt.")
-    request = steps_room.batch.Request(uuid, order, watch, everything, batch, report, operator or "")
+    request = steps_room.batch.ProvisionRequest(uuid, order, watch, everything, batch, report, operator or "")
     several = everything or len(links.places) > 1
-    reporter = Watched(reporter_for(app, several=several))
+    reporter = BoardReporter(reporter_for(app, several=several))
     base = app.station()
     line = None
     if job is not None or evidence:
@@ -176,7 +176,7 @@ def provision(
         _one(app, boards, _questions(app, yes))
 
 
-def _check_line(request: Request, job: str | None, only: str | None) -> None:
+def _check_line(request: ProvisionRequest, job: str | None, only: str | None) -> None:
     """Raise UsageFailure where a job is named beside what a job says itself."""
     order = request.order
     if only is not None and job is None:
@@ -201,7 +201,7 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
         _show_brought(app, error.brought)
         app.conclude({"findings": error.brought.findings}, None, error)
         return
-    failure = steps_room.batch_sheet.Board(done.who.uuid, 0.0, done).failure
+    failure = steps_room.batch_sheet.BoardResult(done.who.uuid, 0.0, done).failure
     _tell(app, done, error=failure, **_of_line(boards, done.who.uuid))
 
 
@@ -314,7 +314,7 @@ def _show_brought(app: App, brought: Brought) -> None:
 # -- telling -----------------------------------------------------------------------------------------------------------
 
 
-def _tell_plan(app: App, plan: Plan) -> None:
+def _tell_plan(app: App, plan: ProvisionPlan) -> None:
     changes = "".join(f"\n  {text}" for text in plan.changes) or "\n  no changes"
     text = f"Plan for {plan.uuid.hex()} ({plan.state.name.lower()}): {', '.join(plan.steps)}.{changes}"
     for warning in plan.warnings:
@@ -333,7 +333,7 @@ def _tell_plans(app: App, boards: Boards) -> None:
     """A plan for each node of the bus that is meant, at last how many they are; the worst refusal ends the command."""
     planned = 0
     for one in boards.plans():
-        if isinstance(one, steps_room.batch.Plan):
+        if isinstance(one, steps_room.batch.ProvisionPlan):
             planned += 1
             _tell_plan(app, one)
         else:
@@ -364,7 +364,7 @@ def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = Non
     app.conclude(result, lambda console: _summary(console, done, summary, more), error)
 
 
-def _tell_board(app: App, board: Board, **line: Any) -> None:
+def _tell_board(app: App, board: BoardResult, **line: Any) -> None:
     """One line of JSON, or what a person reads: UUID, time and row of the sheet on each; ``line``: its unit."""
     if board.done is not None:
         _tell(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3), **line)
@@ -379,7 +379,7 @@ def _tell_board(app: App, board: Board, **line: Any) -> None:
         app.fail_line(board.error, **of)
 
 
-def _tell_one_of(app: App, boards: Boards, board: Board) -> None:
+def _tell_one_of(app: App, boards: Boards, board: BoardResult) -> None:
     """One line for one of many on a bus: ``37 of 200  8d4d…  arm 3  authentic  1.2 s``; why, where it did not pass."""
     name = station.summary.summarise(board.done.image).name if board.done is not None else None
     words = board.done.verified.verdict if board.result == "passed" and board.done is not None else board.result
@@ -409,7 +409,7 @@ def _tell_totals(app: App, boards: Boards) -> None:
     app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in total.{steps}")
 
 
-def _summary(console: Console, done: Provisioned, summary: Summary, more: Mapping[str, object]) -> None:
+def _summary(console: Console, done: Provisioned, summary: NodeSummary, more: Mapping[str, object]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -484,17 +484,17 @@ class Told(Protocol):
         """How many of them have passed."""
 
     @property
-    def next_row(self) -> Row | None:
+    def next_row(self) -> SheetRow | None:
         """The row that the next board may be of."""
 
     @property
     def of_a_job(self) -> bool:
         """Whether a job counts them, and no sheet: any board may be the next one."""
 
-    def row(self, number: int) -> Row:
+    def row(self, number: int) -> SheetRow:
         """The row of that number."""
 
-    def board_of(self, row: Row) -> str | None:
+    def board_of(self, row: SheetRow) -> str | None:
         """UUID of the board that had a row before."""
 
 
@@ -503,7 +503,7 @@ class Screen(Protocol):
 
     tells: bool
 
-    def ended(self, board: Board) -> None:
+    def ended(self, board: BoardResult) -> None:
         """Show how it ended."""
 
     def close(self) -> None:
@@ -515,14 +515,14 @@ class _Plain:
 
     tells = False
 
-    def ended(self, board: Board) -> None:
+    def ended(self, board: BoardResult) -> None:
         """Lines were told already."""
 
     def close(self) -> None:
         """Nothing to give back."""
 
 
-class Watched:
+class BoardReporter:
     """A reporter that also says when a board is begun: its first step is to identify it."""
 
     def __init__(self, inner: Reporter) -> None:
@@ -554,14 +554,14 @@ class OperatorScreen:
     def __init__(self, console: Console, boards: Told, live_line: Callable[[], None] = lambda: None) -> None:
         self.tells = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
         self._console, self._boards, self._live_line = console, boards, live_line
-        self._last: deque[Board] = deque(maxlen=_LAST)
+        self._last: deque[BoardResult] = deque(maxlen=_LAST)
         self._draw(">>> ", self._next())
 
     def begun(self) -> None:
         """A board lies on the reader: what stood there of the one before counts no more."""
         self._draw(">>> ", "KEEP THE BOARD ON THE READER", word=("WAIT", "black on yellow"))
 
-    def ended(self, board: Board) -> None:
+    def ended(self, board: BoardResult) -> None:
         """Ring, and show PASS or FAIL."""
         self._last.appendleft(board)
         self._console.file.write(_BELL)
@@ -571,7 +571,9 @@ class OperatorScreen:
     def close(self) -> None:
         """Leave what stands there."""
 
-    def _draw(self, mark: str, now: str, *, word: tuple[str, str] | None = None, board: Board | None = None) -> None:
+    def _draw(
+        self, mark: str, now: str, *, word: tuple[str, str] | None = None, board: BoardResult | None = None
+    ) -> None:
         from rich.text import Text
 
         self._live_line()
@@ -592,7 +594,7 @@ class OperatorScreen:
             style = "green" if one.result == "passed" else "red"
             self._line(f"{line}  {self._name(one)}", style=style)
 
-    def _tell_end(self, board: Board) -> None:
+    def _tell_end(self, board: BoardResult) -> None:
         """Seconds and which board; of one that failed why, and what to do, in a few lines."""
         from rich.text import Text
 
@@ -612,7 +614,7 @@ class OperatorScreen:
 
         self._console.print(Text(sanitize(text).rstrip()), style=style, no_wrap=True, overflow="ellipsis")
 
-    def _name(self, board: Board) -> str:
+    def _name(self, board: BoardResult) -> str:
         return self._boards.row(board.row).prepared.order.name or "" if board.row is not None else ""
 
     def _next(self) -> str:
@@ -636,7 +638,7 @@ def _clock(moment: str) -> str:
 
 
 @contextmanager
-def screen_for(app: App, boards: Boards, reporter: Watched | None = None) -> Iterator[Screen]:
+def screen_for(app: App, boards: Boards, reporter: BoardReporter | None = None) -> Iterator[Screen]:
     """The operator's screen on a terminal with a sheet, else none; ``reporter`` tells it when a board is begun."""
     if app.json or app.quiet or not len(boards) or not sys.stderr.isatty():
         yield _Plain()

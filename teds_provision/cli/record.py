@@ -13,14 +13,14 @@ import click
 
 from teds_provision import measure as measure_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, Channel, FileToRead, WholeNumber, examples
+from teds_provision.cli.options import COMMAND_SETTINGS, ChannelNumber, FileToRead, WholeNumber, examples
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view, rendering
     from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
     from teds_provision.measure.recordings.source import Recording
-    from teds_provision.measure.recordings.summary import Summary
+    from teds_provision.measure.recordings.summary import RecordingSummary
 else:
     rendering = late("teds_provision.cli.rendering")
     measure_view = late("teds_provision.cli.measure_view")  # numpy and the sinks
@@ -50,14 +50,14 @@ def record() -> None:
 def info(app: App, file: Path) -> None:
     """Show the channels of a recording, from when to when it goes, and what is invalid, lost or cut off in it."""
     recordings = measure_room.recordings
-    recording, summary = recordings.opening.open_recording(file), recordings.summary.Summary()
+    recording, summary = recordings.opening.open_recording(file), recordings.summary.RecordingSummary()
     for entry in recording.entries():
         summary.take(entry)
     result = summary.to_json(recording)
     app.emit(result, "\n".join(_lines(result, summary, recording)))
 
 
-def _lines(result: Mapping[str, Any], summary: Summary, recording: Recording) -> Iterator[str]:
+def _lines(result: Mapping[str, Any], summary: RecordingSummary, recording: Recording) -> Iterator[str]:
     group = f", group {result['group']}" if result["group"] else ""
     yield f"{result['file']}: {result['format']}, station {result['station'] or 'unknown'}{group}"
     if result["test_pattern"]:
@@ -110,7 +110,12 @@ def _local(text: str) -> str:
 )
 @click.argument("file", type=FileToRead())
 @click.option(
-    "--channel", "channels", type=Channel(), multiple=True, metavar="N", help="Show only this channel; repeatable."
+    "--channel",
+    "channels",
+    type=ChannelNumber(),
+    multiple=True,
+    metavar="N",
+    help="Show only this channel; repeatable.",
 )
 @click.option(
     "--limit", type=WholeNumber(1), metavar="N", help="Show the first N values (default: 20, or all with --json)."
@@ -123,7 +128,7 @@ def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> 
     gives. It counts the whole file, whatever --channel and --limit show of it.
     """
     recordings = measure_room.recordings
-    recording, summary = recordings.opening.open_recording(file), recordings.summary.Summary()
+    recording, summary = recordings.opening.open_recording(file), recordings.summary.RecordingSummary()
     left: float = limit or (math.inf if app.json else SHOWN)
     for entry in recording.entries():
         summary.take(entry)
@@ -136,7 +141,7 @@ def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> 
         app.note(f"{summary.messages} instants in all; --limit shows more of them.")
 
 
-def _events(shown: Block | GroupRows, summary: Summary) -> Iterator[str]:
+def _events(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str]:
     lines = measure_room.sinks.lines
     events = (
         lines.data_lines(shown, summary.facts)
@@ -146,7 +151,7 @@ def _events(shown: Block | GroupRows, summary: Summary) -> Iterator[str]:
     return (lines.as_line(event).decode().rstrip() for event in events)
 
 
-def _values(shown: Block | GroupRows, summary: Summary) -> Iterator[str]:
+def _values(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str]:
     """A line for each instant, in the units for people."""
     keys = shown.keys
     known = [summary.facts.get(key) or measure_room.blocks.ChannelFacts(key[0], "", key[1], "") for key in keys]

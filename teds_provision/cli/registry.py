@@ -31,7 +31,7 @@ from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
     from teds_provision.plant.post import Post
-    from teds_provision.plant.status import Standing, Status
+    from teds_provision.plant.status import PlantStatus, StationStanding
     from teds_provision.plant.sync import Synced
     from teds_provision.protocol import keys
     from teds_provision.protocol.plant import document, roster
@@ -556,7 +556,7 @@ def status(app: App) -> None:
         raise click.exceptions.Exit(found.exit_code)
 
 
-def _standing(one: Standing) -> dict[str, Any]:
+def _standing(one: StationStanding) -> dict[str, Any]:
     return {
         "name": one.name,
         "fingerprint": one.fingerprint,
@@ -567,7 +567,7 @@ def _standing(one: Standing) -> dict[str, Any]:
     }
 
 
-def _shown(station: Station, found: Status) -> str:
+def _shown(station: Station, found: PlantStatus) -> str:
     held, digits = found.roster, found.heads[0]
     heads = " ".join(digits[at : at + 4] for at in range(0, 16, 4))
     lines = [

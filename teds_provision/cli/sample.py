@@ -15,7 +15,7 @@ import click
 
 from teds_provision import measure, talk
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import Channel, Number, WholeNumber, command, link_options, said_here
+from teds_provision.cli.options import ChannelNumber, Number, WholeNumber, command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.errors import LinkFailure, NodeRefused, UsageFailure
 from teds_provision.links import LinkSettings
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
     from teds_provision.measure.sampling import Sample
     from teds_provision.measure.trusting import Trusted
-    from teds_provision.protocol.operation.commands import Operation, Power
+    from teds_provision.protocol.operation.commands import OperationReply, Power
     from teds_provision.station.station import Station
     from teds_provision.talk.conversation import Conversation
-    from teds_provision.talk.meeting import Patience
-    from teds_provision.teds.sheet import Channel as SheetChannel
+    from teds_provision.talk.meeting import IdleStop
+    from teds_provision.teds.sheet import Channel
 
 
 def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:
@@ -80,7 +80,7 @@ def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *
     "teds-provision sample 8d4d 1 3 --nfc usb",
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channels", nargs=-1, type=Channel(), metavar="[CHANNEL …]")
+@click.argument("channels", nargs=-1, type=ChannelNumber(), metavar="[CHANNEL …]")
 @link_options
 @pass_app
 def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) -> None:
@@ -155,7 +155,7 @@ def _charging(station: Station, node: Conversation) -> dict[str, Any] | None:
     return dict(json.loads(known.charging)) if known is not None and known.charging else None
 
 
-def _mode(console: Console, found: Operation, names: dict[int, str], power: Power | None) -> None:
+def _mode(console: Console, found: OperationReply, names: dict[int, str], power: Power | None) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -177,7 +177,7 @@ def _mode(console: Console, found: Operation, names: dict[int, str], power: Powe
     context_settings={"ignore_unknown_options": True},  # -0.5 is a value, and no option
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=Channel())
+@click.argument("channel", type=ChannelNumber())
 @click.argument("value", type=float)
 @click.option("--unit", metavar="U", help="Unit of VALUE (default: the SI unit of the datasheet).")
 @click.option("--hold", type=Number(min=0), metavar="S", help="Seconds to hold the value (default: until Ctrl-C).")
@@ -211,7 +211,7 @@ def set_value(
     station = app.station()
     uuid = station.nodes.resolve(node)
     measure.trusting.require_whitelisted(station, uuid)
-    stop = talk.meeting.Patience(None)
+    stop = talk.meeting.IdleStop(None)
     links = where_met(station, over_the_bus(links), [uuid])
     with (
         measure.sources.beside(station, links, f"set {uuid.hex()}") as own,
@@ -242,7 +242,7 @@ def set_value(
     app.emit({"event": "end", "safe": actuator.safe}, "safe" if actuator.safe else "NOT in its safe state")
 
 
-def _require_unit(app: App, channel: SheetChannel, value: float, unit: str | None) -> None:
+def _require_unit(app: App, channel: Channel, value: float, unit: str | None) -> None:
     """Refuse a bare number of a person where the unit that this channel is shown in is not SI: 45 would be radians."""
     if unit is None and app.interactive and channel.shown.text != channel.si_unit:
         raise UsageFailure(
@@ -253,7 +253,7 @@ def _require_unit(app: App, channel: SheetChannel, value: float, unit: str | Non
 
 
 @contextmanager
-def ending(stop: Patience) -> Iterator[None]:
+def ending(stop: IdleStop) -> Iterator[None]:
     """The first Ctrl-C or SIGTERM ends in order, a second one at once with 130."""
 
     def end(*_: object) -> None:

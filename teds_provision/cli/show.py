@@ -25,8 +25,8 @@ from teds_provision.protocol import handover
 from teds_provision.protocol.messages.message import Argument, Message, decode_message, looks_like_message
 from teds_provision.sanitize import sanitize
 from teds_provision.teds import convert, decode
-from teds_provision.teds.codec.model import AccessCode, Decoded, Edition, Finding, TimeInstance, Verdict
-from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks, with_class
+from teds_provision.teds.codec.model import AccessCode, Conformity, Decoded, Edition, Finding, TimeInstance
+from teds_provision.teds.formats import Kind, TedsBlock, class_of, detect, read_blocks, with_class
 from teds_provision.teds.formats.jsonform import FORMAT, value_to_json
 from teds_provision.teds.guard import check_calibration
 from teds_provision.teds.show import Shown, ShownField, describe, finding_to_json, hexadecimal, instant, shown_to_json
@@ -125,7 +125,7 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
     _write(app, [block for file in files for block in file.blocks], form)
 
 
-def _write(app: App, blocks: Sequence[Block], form: Format) -> None:
+def _write(app: App, blocks: Sequence[TedsBlock], form: Format) -> None:
     written = teds.formats.write_blocks(blocks, form)
     if isinstance(written, bytes) and sys.stdout.isatty():
         raise UsageFailure(
@@ -167,7 +167,7 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 _COLOURS = {"error": "bold red", "warning": "yellow", "note": "dim"}
 _PIPE_WIDTH = 200
 _UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-_GOOD = {Verdict.CLEAN, Verdict.BLOCK_CLEAN, Verdict.MESSAGE}
+_GOOD = {Conformity.CLEAN, Conformity.BLOCK_CLEAN, Conformity.MESSAGE}
 
 
 def escape(text: str) -> str:
@@ -303,17 +303,17 @@ class ShownFile:
     conversions: Mapping[int, tuple[Finding, ...]] = field(default_factory=dict)
 
     @property
-    def blocks(self) -> list[Block]:
+    def blocks(self) -> list[TedsBlock]:
         """The blocks of its TEDS; a message is one block without a place."""
         if self.message is not None:
-            return [Block(None, None, self.message.octets)]
+            return [TedsBlock(None, None, self.message.octets)]
         return [shown.block for shown in self.teds]
 
     @property
     def malformed(self) -> bool:
         """Whether the tuples of a TEDS do not even close, or a message is none."""
         unreadable = self.message is not None and self.message.kind == "unknown"
-        return unreadable or any(shown.decoded.verdict is Verdict.MALFORMED for shown in self.teds)
+        return unreadable or any(shown.decoded.verdict is Conformity.MALFORMED for shown in self.teds)
 
 
 def read_file(name: str) -> bytes:
@@ -389,7 +389,7 @@ def _of_file(name: str, kind: Kind | None, error: BadData) -> BadData:
     return BadData(error.message if named else f"{name}: {error.message}", hint=error.hint)
 
 
-def _described(name: str, kind: Kind, blocks: Sequence[Block], edition: Edition | None) -> ShownFile:
+def _described(name: str, kind: Kind, blocks: Sequence[TedsBlock], edition: Edition | None) -> ShownFile:
     notes = ("The UUID is all zeros: a profile has none.",) if kind == "toml" else ()
     file = ShownFile(name, kind, notes=notes)
     if edition is not None:
@@ -405,10 +405,10 @@ def is_message(octets: bytes) -> bool:
     if looks_like_message(octets):
         return True
 
-    return class_of(octets) is None and decode(octets).verdict is Verdict.MESSAGE
+    return class_of(octets) is None and decode(octets).verdict is Conformity.MESSAGE
 
 
-def placed(blocks: Sequence[Block]) -> dict[tuple[int, int], bytes]:
+def placed(blocks: Sequence[TedsBlock]) -> dict[tuple[int, int], bytes]:
     """TEDS by (channel, access code); lone channel TEDS and calibrations without a channel count as channel 1."""
     out: dict[tuple[int, int], bytes] = {}
     for channel, code, octets in blocks:
@@ -429,8 +429,8 @@ def _guard(beside: dict[tuple[int, int], bytes]) -> tuple[GuardFinding, ...]:
     return tuple(check_calibration(beside, now=datetime.now(UTC)))
 
 
-def _converted(blocks: Sequence[Block], edition: Edition) -> tuple[list[Block], dict[int, tuple[Finding, ...]]]:
-    out: list[Block] = []
+def _converted(blocks: Sequence[TedsBlock], edition: Edition) -> tuple[list[TedsBlock], dict[int, tuple[Finding, ...]]]:
+    out: list[TedsBlock] = []
     said: dict[int, tuple[Finding, ...]] = {}
     for number, block in enumerate(blocks):
         decoded: Decoded = decode(block.octets)

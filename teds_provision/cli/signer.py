@@ -59,7 +59,7 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     app.closing(post.close)
     inbox = plant.asking.Inbox(station, post, protocol.plant.document.SIGN_REQUEST)
     app.closing(inbox.close)
-    stop = talk.meeting.Patience(None)
+    stop = talk.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     if seconds is not None:
         threading.Timer(seconds, stop.set).start()
@@ -120,7 +120,7 @@ def _tell(app: App, station: Station, one: Answered, *, end: bool = False) -> No
         app.emit({**told, "sequence": answered.sequence}, f"signed   {request.uuid.hex()}  {answered.sequence}  {name}")
         return
     if end:
-        raise plant.asking.Refused(f"Not signed ({answered.refused}): {answered.why}.")
+        raise plant.asking.OfficeRefused(f"Not signed ({answered.refused}): {answered.why}.")
     refused = {**told, "refused": answered.refused, "why": answered.why}
     app.emit(refused, f"refused  {request.uuid.hex()}  {answered.refused}  {name}: {answered.why}")
 

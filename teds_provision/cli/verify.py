@@ -90,7 +90,7 @@ def are_files(what: Sequence[str]) -> bool:
 def verify_many(app: App, what: Sequence[str]) -> None:
     """Judge every file by itself; one that fails stops no other."""
     files = json_files([Path(word) for word in what], "image")
-    totals = steps.verify_files.Totals()
+    totals = steps.verify_files.VerdictTotals()
     for lines, counted in steps.verify_files.verify_files(app.station(), files, _json if app.json else _line):
         totals.join(counted)
         app.lines(lines)

@@ -20,7 +20,7 @@ from teds_provision.station.label import read_label
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
-    from teds_provision.steps.whitelist import Plan
+    from teds_provision.steps.whitelist import WhitelistPlan
 
 
 @click.group(
@@ -61,7 +61,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
             raise click.BadParameter("the label carries a different key.", param_hint="--fingerprint")
         fingerprint = scanned[1]
     steps.whitelist.require_name(name)
-    wanted = steps.whitelist.Listed(0, octets, fingerprint, name)
+    wanted = steps.whitelist.ListedNode(0, octets, fingerprint, name)
     plan = steps.whitelist.plan_addition(station, [wanted])
     if dry_run or not plan.write:
         _emit_plan(app, station, plan, dry_run=dry_run)
@@ -192,7 +192,7 @@ def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     app.emit({"whitelist": listed, "file": str(file), "format": form}, f"{verb} {count} entries as {form} to {file}.")
 
 
-def _emit_plan(app: App, station: Station, plan: Plan, *, dry_run: bool) -> None:
+def _emit_plan(app: App, station: Station, plan: WhitelistPlan, *, dry_run: bool) -> None:
     changed = len(plan.write) - plan.new
     what = f"{plan.new} new, {changed} changed, {plan.unchanged} unchanged"
     text = f"Plan: {what}." if dry_run else f"Whitelist: {what}{'' if plan.write else ' (nothing to do)'}."

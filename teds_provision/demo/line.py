@@ -23,7 +23,7 @@ from teds_provision.plant.evidence import export
 from teds_provision.plant.jobs import digest_of_file, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer
-from teds_provision.plant.verify_evidence import Grounds, Totals, judge_file
+from teds_provision.plant.verify_evidence import EvidenceTotals, Grounds, judge_file
 from teds_provision.protocol.plant.document import MemberRequest
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import Role
@@ -171,9 +171,9 @@ def _tamper(folder: Path) -> None:
     file.write_text(json.dumps(told), encoding="utf-8")
 
 
-def _proof(demo: Demo, office: Station, bench: Station) -> Totals:
+def _proof(demo: Demo, office: Station, bench: Station) -> EvidenceTotals:
     """Export the evidence of both stations, and check it with nothing but files."""
-    totals = Totals()
+    totals = EvidenceTotals()
     demo.say("The evidence of both, checked with nothing but files and the CA key.")
     with demo.steps.step("evidence") as step:
         for station in (bench, office):

@@ -14,7 +14,7 @@ from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.store import Revocation
+from teds_provision.store import RevocationRecord
 
 
 def why_not(station: Station, statement: Statement, bundle: Bundle) -> str:
@@ -37,7 +37,7 @@ def deny(station: Station, statement: Statement, *, key: str | None) -> None:
     if station.policy.revocation(statement.uuid) is None:
         created = time_text(statement.created)
         named = statement.fingerprint or key
-        entry = Revocation(statement.uuid, named, statement.why, statement.statement, created)
+        entry = RevocationRecord(statement.uuid, named, statement.why, statement.statement, created)
         station.policy.deny(entry)
         station.audit("revoke", statement.uuid, "on the deny list", why=statement.why, by=statement.sender)
 

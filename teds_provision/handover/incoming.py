@@ -53,7 +53,7 @@ class PlannedNode:
     notes: tuple[str, ...] = ()
 
 
-class Arrivals:
+class ImportedRows:
     """The rows of the nodes that are taken in, made and written a page at a time; the caller holds the transaction."""
 
     def __init__(self, station: Station, bundle: Bundle) -> None:
@@ -286,7 +286,7 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
     with station.transaction():
         _keep_ca(station, plan)
         deny_all(station, plan.denied, bundle)
-        Arrivals(station, plan.opened.bundle).take_in(plan.taken)
+        ImportedRows(station, plan.opened.bundle).take_in(plan.taken)
         station.handovers.put(row)
         for one in plan.nodes if station.plant.joined is not None else ():
             node, told = one.node, {"peer": bundle.sender, "bundle": bundle.id}

@@ -14,7 +14,7 @@ from teds_provision.protocol.handover.strict_json import is_label
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.sign import known_image
-from teds_provision.store import NodeRecord, Revocation
+from teds_provision.store import NodeRecord, RevocationRecord
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import BlockId, Image
 
@@ -30,7 +30,7 @@ UNCONFIRMED = ", unconfirmed"
 class Revoked:
     """A node on the deny list; ``fresh`` False where there was nothing left to do."""
 
-    entry: Revocation
+    entry: RevocationRecord
     fresh: bool
 
 

@@ -26,7 +26,17 @@ from teds_provision.protocol.handover.envelope import Sealing
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.store import Batch, Handover, Holder, NodeRecord, Shown, Tombstone, TrustRecord, pages, utc_now
+from teds_provision.store import (
+    Batch,
+    ExportFacts,
+    Handover,
+    Holder,
+    NodeRecord,
+    Tombstone,
+    TrustRecord,
+    pages,
+    utc_now,
+)
 
 # Which nodes an export takes, and why others stay.
 
@@ -173,7 +183,7 @@ def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[
 
 def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[bytes, str]:
     """Why each node of the wanted ones, or of all, cannot go, whatever its key is; "" for nothing."""
-    known: Iterable[Sequence[NodeRecord | Shown]] = (
+    known: Iterable[Sequence[NodeRecord | ExportFacts]] = (
         pages(station.nodes.each_shown())
         if wanted is None
         else (list(station.nodes.of_page(page).values()) for page in pages(wanted))
@@ -186,7 +196,7 @@ def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[
     return stays
 
 
-def _why_node_stays(node: NodeRecord | Shown, pin: str) -> str:
+def _why_node_stays(node: NodeRecord | ExportFacts, pin: str) -> str:
     if (node.retired or "").startswith(OUT_OF_SERVICE):
         return "it is out of service"
     if node.point is None:

@@ -249,7 +249,7 @@ def _lift(station: Station, uuid: bytes, row: Handover) -> None:
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListedHandover:
     """One line of ``handover list``."""
 
     row: Handover
@@ -259,7 +259,7 @@ class Listed:
     expired: bool
 
 
-def list_handovers(station: Station, now: datetime) -> list[Listed]:
+def list_handovers(station: Station, now: datetime) -> list[ListedHandover]:
     """Every bundle that left or came, oldest first; ``expired`` says that an open one can be imported no more."""
     names = {record.fingerprint: record.name for record in station.policy.trusted("station")}
     listed = []
@@ -267,5 +267,5 @@ def list_handovers(station: Station, now: datetime) -> list[Listed]:
         notes = Notes.from_json(row.nodes)
         expired = row.state == OPEN and datetime.fromisoformat(notes.expires) <= now
         peers = tuple(names.get(peer, peer[:16]) for peer in row.peers)
-        listed.append(Listed(row, peers, len(notes.uuids), notes.expires, expired))
+        listed.append(ListedHandover(row, peers, len(notes.uuids), notes.expires, expired))
     return listed

@@ -37,7 +37,7 @@ _LABEL = b"TEDS1 station request\0"
 
 
 @dataclass(frozen=True)
-class Request:
+class CertificateRequest:
     """A station that wants to be certified: its name and point; it has proved that it holds the key."""
 
     name: str
@@ -61,7 +61,7 @@ def make_request(name: str, key: PrivateKey) -> bytes:
     return dump(members | {"proof": encode_base64url(proof)}) + b"\n"
 
 
-def read_request(octets: bytes) -> Request:
+def read_request(octets: bytes) -> CertificateRequest:
     """Read and check a request; raises BadData, NotAuthentic (the proof does not verify)."""
     if b"PRIVATE KEY" in octets:
         raise BadData("This file holds a private key where a request belongs.")
@@ -72,7 +72,7 @@ def read_request(octets: bytes) -> Request:
     station = point_of(members.get("station"), "The station's key")
     if not verify(station, _LABEL + station + name.encode(), decode_base64url(members.get("proof"), "The proof")):
         raise NotAuthentic("The request is not signed by the key that it names.")
-    return Request(name, station)
+    return CertificateRequest(name, station)
 
 
 def write_certificate(certificate: Certificate) -> bytes:
@@ -99,7 +99,7 @@ def read_certificate(octets: bytes) -> Certificate:
     return Certificate(_name(members.get("name")), station, ca, signature)
 
 
-def sign_request(station: Station, request: Request) -> Certificate:
+def sign_request(station: Station, request: CertificateRequest) -> Certificate:
     """Certify a station under this owner's CA, and remember that; raises NotFound where the CA key is not here."""
     if request.station == station.ca:
         raise PolicyRefused("The request names the CA's own key as a station.")

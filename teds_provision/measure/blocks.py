@@ -218,7 +218,7 @@ class Note:
 
 
 @dataclass(frozen=True)
-class Command:
+class SetPointCommand:
     """A set point for an actuator that came by a sink (a ROS topic), in the SI unit of the datasheet."""
 
     uuid: str

@@ -18,10 +18,10 @@ from teds_provision.measure.lookout import AirHearing, AirLookout, Lookout, air_
 from teds_provision.measure.planning import BusShare, BusTime
 from teds_provision.measure.sightings import Sighting, Sightings
 from teds_provision.protocol.messages.ble import LEAST_MTU
-from teds_provision.protocol.operation.can_frames import Assembly, DriveAddress, cut
+from teds_provision.protocol.operation.can_frames import DriveAddress, StreamAssembly, cut
 
 
-class Bus:
+class MeasuredBus:
     """One link that carries data: ``port``, who hears its data messages, how much of it is taken, who is on it."""
 
     def __init__(
@@ -41,9 +41,9 @@ class Bus:
         self.lookout.close()
         self.hearing.close()
 
-    def assembly(self, length: int) -> Assembly:
+    def assembly(self, length: int) -> StreamAssembly:
         """What puts frames of messages of so many octets together."""
-        return Assembly(length, fd=isinstance(self.port, CanPort) and self.port.spec.fd)
+        return StreamAssembly(length, fd=isinstance(self.port, CanPort) and self.port.spec.fd)
 
     def time_for(self, time: BusTime, address: int) -> BusTime:
         """The time of this link as the node at ``address`` has it: over the air its connection has an MTU."""
@@ -59,12 +59,14 @@ class Bus:
             self.port.send(Frame(identifier, piece.data, self.port.spec.fd))
 
 
-def bus_at(port: CanPort | BlePort, sightings: Sightings, *, poll: float | None) -> Bus:
+def bus_at(port: CanPort | BlePort, sightings: Sightings, *, poll: float | None) -> MeasuredBus:
     """The bus, or the adapter, behind a port."""
     if isinstance(port, BlePort):
-        return Bus(port, AirHearing(port), BusShare(BusTime(mtu=LEAST_MTU)), AirLookout(port, sightings, poll=poll))
+        return MeasuredBus(
+            port, AirHearing(port), BusShare(BusTime(mtu=LEAST_MTU)), AirLookout(port, sightings, poll=poll)
+        )
     time = BusTime(port.spec.bitrate, port.spec.data_bitrate if port.spec.fd else None)
-    return Bus(port, CanHearing(port), BusShare(time), Lookout(port, sightings, poll=poll))
+    return MeasuredBus(port, CanHearing(port), BusShare(time), Lookout(port, sightings, poll=poll))
 
 
 class Buses:
@@ -82,7 +84,7 @@ class Buses:
     ) -> None:
         self.sightings = Sightings(news, note)
         self._poll: float | None = None
-        self._buses: dict[str, Bus] = {}
+        self._buses: dict[str, MeasuredBus] = {}
         for port in ports:
             self.add(port)
 
@@ -94,17 +96,17 @@ class Buses:
     ) -> None:
         self.close()
 
-    def add(self, port: CanPort | BlePort) -> Bus:
+    def add(self, port: CanPort | BlePort) -> MeasuredBus:
         """Hear one more bus."""
         if port.place not in self._buses:
             self._buses[port.place] = bus_at(port, self.sightings, poll=self._poll)
         return self._buses[port.place]
 
-    def all(self) -> Sequence[Bus]:
+    def all(self) -> Sequence[MeasuredBus]:
         """Every bus."""
         return tuple(self._buses.values())
 
-    def of(self, sighting: Sighting) -> Bus:
+    def of(self, sighting: Sighting) -> MeasuredBus:
         """The bus on which a node was seen."""
         return self._buses[sighting.port.place]
 

@@ -19,9 +19,9 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.protocol.operation.can_frames import DATA, Assembly
-from teds_provision.protocol.operation.stream_commands import Kind
-from teds_provision.protocol.operation.subscription import Message, Receiver
+from teds_provision.protocol.operation.can_frames import DATA, StreamAssembly
+from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.protocol.operation.subscription import Receiver, StreamMessage
 
 SLICE = 0.004  # seconds between looks at what waits
 REST = 0.003  # seconds that frames gather on one bus: to be woken for each of them costs more than to read it
@@ -41,7 +41,7 @@ class HeardStream:
     """
 
     receiver: Receiver
-    assembly: Assembly
+    assembly: StreamAssembly
     interpreter: StreamInterpreter
     clock: ClockMap
     mapping: threading.Lock
@@ -59,7 +59,7 @@ class HeardStream:
         plan = self.receiver.plan
         self._at_once = plan.span >= GATHER * 1e9
         # Of a stream that runs free only the first instant of each message is known for certain.
-        self._last_instant = 0 if plan.subscribe.kind == Kind.FREE else plan.span - plan.subscribe.period
+        self._last_instant = 0 if plan.subscribe.kind == StreamKind.FREE else plan.span - plan.subscribe.period
         self._test_pattern = plan.subscribe.test_pattern
 
     def take(self, frame: Frame) -> None:
@@ -118,7 +118,7 @@ class HeardStream:
             blocks = self.interpreter.blocks(messages)
         self._hand_on(messages, blocks)
 
-    def _note_arrival(self, came: list[tuple[bytes, int]], messages: list[Message]) -> None:
+    def _note_arrival(self, came: list[tuple[bytes, int]], messages: list[StreamMessage]) -> None:
         """Tell the clock which message came soonest after its samples; of a batch with drops the last one will do."""
         at, tick = came[-1][1], messages[-1].tick
         if len(messages) == len(came) > 1:
@@ -128,7 +128,7 @@ class HeardStream:
                     at, tick, soonest = arrived, message.tick, arrived - message.tick
         self.clock.arrival(tick + self._last_instant, at)
 
-    def _hand_on(self, messages: list[Message], blocks: list[Block]) -> None:
+    def _hand_on(self, messages: list[StreamMessage], blocks: list[Block]) -> None:
         """Messages whose tag and time are right."""
         if messages:
             self.heard = time.monotonic()

@@ -14,8 +14,8 @@ import numpy as np
 
 from teds_provision.measure.blocks import Block, Invalid
 from teds_provision.measure.clock import ClockMap, HostClock, Monotone
-from teds_provision.protocol.operation.stream_commands import Kind
-from teds_provision.protocol.operation.subscription import Message, Plan
+from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.protocol.operation.subscription import StreamMessage, StreamPlan
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.sheet import Sheet
@@ -32,7 +32,7 @@ class StreamInterpreter:
     def __init__(
         self,
         sheet: Sheet,
-        plan: Plan,
+        plan: StreamPlan,
         run: int,
         clock: ClockMap,
         host: HostClock,
@@ -51,9 +51,9 @@ class StreamInterpreter:
         self._places = places
         self._row = at
         self._period, self._n = plan.subscribe.period, plan.subscribe.n
-        self._even = plan.subscribe.kind == Kind.PERIODIC
-        self._free, self._real = plan.subscribe.kind == Kind.FREE, float(self._period)  # ns between its instants
-        self._before: Message | None = None
+        self._even = plan.subscribe.kind == StreamKind.PERIODIC
+        self._free, self._real = plan.subscribe.kind == StreamKind.FREE, float(self._period)  # ns between its instants
+        self._before: StreamMessage | None = None
         self._stream, self._numbers = plan.subscribe.stream, plan.layout.channels
         self._test_pattern = plan.subscribe.test_pattern
         self._steps, self._seconds = np.zeros(0, dtype=np.uint64), np.zeros(0)  # of instants: ns, s after the first
@@ -70,7 +70,7 @@ class StreamInterpreter:
         """How many values of the run were not valid, and why. Of any thread."""
         return tuple(Invalid(channel, why, count) for (channel, why), count in self._invalid.copy().items())
 
-    def blocks(self, messages: Sequence[Message]) -> list[Block]:
+    def blocks(self, messages: Sequence[StreamMessage]) -> list[Block]:
         """Messages as blocks: one for all that follow on from each other, and another one after each gap."""
         if not messages:
             return []
@@ -86,7 +86,7 @@ class StreamInterpreter:
                 begin = end
         return done
 
-    def _block(self, messages: Sequence[Message]) -> Block:
+    def _block(self, messages: Sequence[StreamMessage]) -> Block:
         first, count = messages[0], len(messages) * self._n
         if len(messages) == 1:
             octets, flags = first.data, first.flags
@@ -146,7 +146,7 @@ class StreamInterpreter:
                 key = one.channel.number, why
                 self._invalid[key] = self._invalid.get(key, 0) + count
 
-    def _spaced(self, first: Message, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def _spaced(self, first: StreamMessage, count: int) -> tuple[np.ndarray, np.ndarray]:
         """When so many instants are after that of the first one, in ns and in seconds.
 
         The period of a stream that runs free is what its own ticks say; the asked one is nominal (operation.md 3).

@@ -28,8 +28,8 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.links.ports import Abandons
-from teds_provision.measure.blocks import Command, NodeReport, State
-from teds_provision.measure.buses import Bus, Buses
+from teds_provision.measure.blocks import NodeReport, SetPointCommand, State
+from teds_provision.measure.buses import Buses, MeasuredBus
 from teds_provision.measure.clock import AT_FIRST, HostClock
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
 from teds_provision.measure.request import Events, MeasurementRequest
@@ -42,7 +42,7 @@ from teds_provision.measure.topic_actuators import TopicActuators
 from teds_provision.measure.trusting import (
     LEASE_EACH,
     LONGEST_LEASE,
-    Standing,
+    NodeStanding,
     Trusted,
     claim,
     open_trusted,
@@ -91,7 +91,7 @@ class NodeKeeper:
         self.ready = threading.Event()  # streams were asked for
         self.done = threading.Event()
         self._station, self._buses = station, buses
-        self.bus: Bus | None = None  # where it is, once it was found
+        self.bus: MeasuredBus | None = None  # where it is, once it was found
         self._request, self._events, self._common_start = request, events, common_start
         self._stop = threading.Event()
         self._anew = threading.Event()
@@ -143,7 +143,7 @@ class NodeKeeper:
         self._stop.set()
         self._anew.set()
 
-    def command(self, command: Command) -> None:
+    def command(self, command: SetPointCommand) -> None:
         """A set point for one of its actuators; dropped while it is not there."""
         driven = self._driven
         if driven is not None:
@@ -248,8 +248,8 @@ class NodeKeeper:
                 self._buses.sightings.wrong(sighting)
             raise
 
-    def _in_session(self, bus: Bus, sighting: Sighting) -> None:
-        standing = Standing(self._station, self.uuid)
+    def _in_session(self, bus: MeasuredBus, sighting: Sighting) -> None:
+        standing = NodeStanding(self._station, self.uuid)
         self._announced = self._elsewhere = 0.0
         self._buses.sightings.on_announce(sighting, self._heard_announce, self._seen_elsewhere)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
@@ -278,7 +278,7 @@ class NodeKeeper:
             finally:
                 self._end(bus, trusted, sighting.address, answers=answers or self._stop.is_set())
 
-    def _measure(self, bus: Bus, trusted: Trusted, address: int) -> None:
+    def _measure(self, bus: MeasuredBus, trusted: Trusted, address: int) -> None:
         """Clock, Operate, Subscribe; every stream is heard from then on."""
         self.streams.new_session()
         for _ in range(AT_FIRST):
@@ -337,7 +337,7 @@ class NodeKeeper:
         nodes = self.bus.share.nodes if self.bus is not None else 0
         return min(LONGEST_LEASE, max(self._request.lease, math.ceil(LEASE_EACH * nodes)))
 
-    def _take_up(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> TopicActuators:
+    def _take_up(self, bus: MeasuredBus, trusted: Trusted, actuators: list[Channel], address: int) -> TopicActuators:
         return TopicActuators(
             trusted,
             functools.partial(bus.drive, address),
@@ -350,7 +350,7 @@ class NodeKeeper:
             tell=lambda why: self._say(self.state, why=why),
         )
 
-    def _subscribe(self, bus: Bus, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
+    def _subscribe(self, bus: MeasuredBus, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
         rate, share = self._request.rate, bus.share
         if rate is None:
             share.want(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
@@ -387,7 +387,7 @@ class NodeKeeper:
             at_most=self._request.newcomers,
         )
 
-    def _keep(self, bus: Bus, trusted: Trusted, standing: Standing) -> None:
+    def _keep(self, bus: MeasuredBus, trusted: Trusted, standing: NodeStanding) -> None:
         """Clock every lease / 3 until the end, or until the node is lost, or may not be measured any more."""
         rest = Rest(self._station, trusted, bus, by=self._request.by) if trusted.kept else None
         try:
@@ -396,7 +396,7 @@ class NodeKeeper:
             if rest is not None:
                 rest.close()
 
-    def _watch(self, bus: Bus, trusted: Trusted, standing: Standing, rest: Rest | None) -> None:
+    def _watch(self, bus: MeasuredBus, trusted: Trusted, standing: NodeStanding, rest: Rest | None) -> None:
         told = time.monotonic()
         lied = False
         while not self._stop.is_set():
@@ -464,7 +464,7 @@ class NodeKeeper:
             self._announced = 0.0
         return doubted
 
-    def _end(self, bus: Bus, trusted: Trusted, address: int, *, answers: bool) -> None:
+    def _end(self, bus: MeasuredBus, trusted: Trusted, address: int, *, answers: bool) -> None:
         """Let go in order, as far as the node still ``answers``."""
         if self._driven is not None:
             self._driven.close()

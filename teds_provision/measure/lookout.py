@@ -18,7 +18,14 @@ from typing import ClassVar
 
 from teds_provision.errors import AddressConflict, LinkFailure, NoNode
 from teds_provision.links.ble.port import BlePort
-from teds_provision.links.can.finding import LONGEST_SECONDS, SILENCE_SECONDS, Found, ask_all, settle, twice_text
+from teds_provision.links.can.finding import (
+    LONGEST_SECONDS,
+    SILENCE_SECONDS,
+    FunctionalAnswers,
+    ask_all,
+    settle,
+    twice_text,
+)
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.ports import Notice
@@ -196,10 +203,10 @@ class Lookout(Asking):
         if port.spec.node is not None:
             self._ask_one(port.spec.node, LEAST)
         else:
-            found = Found()
+            found = FunctionalAnswers()
             bus, transaction = port.bus(), port.next_transaction()
             for news in ask_all(bus, transaction, silence=SILENCE_SECONDS, longest=LONGEST_SECONDS):
-                if isinstance(news, Found):
+                if isinstance(news, FunctionalAnswers):
                     found = news
                 else:
                     self._saw(*news)
@@ -209,7 +216,7 @@ class Lookout(Asking):
         self.failure = None
         self._round_ends()
 
-    def _settle(self, found: Found, began: float) -> None:
+    def _settle(self, found: FunctionalAnswers, began: float) -> None:
         settled = settle(found, self.port.identify, until=began + 2 * LONGEST_SECONDS)
         for address in sorted(settled.conflicts):
             self._sightings.conflict(self.port.place, address)

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field, replace
 from teds_provision.errors import BadData, NoRoom, PolicyRefused
 from teds_provision.protocol.operation.budget import BLE_OVERHEAD, MOST_LOAD, bus_load, frames, share
 from teds_provision.protocol.operation.datagram import MOST_OCTETS
-from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_STREAM_CHANNELS, SOON, Kind
-from teds_provision.protocol.operation.subscription import Plan, most_instants
-from teds_provision.teds.sheet import Channel
-from teds_provision.teds.sheet import Kind as ChannelKind
+from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_STREAM_CHANNELS, SOON, StreamKind
+from teds_provision.protocol.operation.subscription import StreamPlan, most_instants
+from teds_provision.teds.sheet import Channel, ChannelKind
 
 BLOCK = 20_000_000  # ns of samples in one message, about: what calibrates well in blocks and is not late yet
 UNSTATED = 100_000_000  # ns: the period of a channel whose datasheet says none
@@ -134,7 +133,7 @@ class BusShare:
 class Plans:
     """Streams of one node; ``load`` is the share of the bus that they take at worst-case stuffing."""
 
-    streams: tuple[Plan, ...]
+    streams: tuple[StreamPlan, ...]
     load: float
     slowed: str = ""
 
@@ -148,7 +147,7 @@ def plan_node(
     bus: BusTime,
     *,
     rate: float | None = None,
-    kind: Kind | None = None,
+    kind: StreamKind | None = None,
     test_pattern: bool = False,
     start: int = SOON,
     slower: float = 1.0,
@@ -194,7 +193,7 @@ def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> st
     return f"slowed from {1e9 / asked:.6g} Hz to {possible} Hz: {why}"
 
 
-def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: Kind | None) -> list[Channel]:
+def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: StreamKind | None) -> list[Channel]:
     """The sensors to measure: those that were asked for, or all; raises BadData where one cannot be."""
     fitting = {one.number: one for one in channels if one.sample and one.kind in _SENSORS_OF[kind]}
     for number in wanted:
@@ -208,22 +207,22 @@ def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: Kind | 
     return [fitting[number] for number in dict.fromkeys(wanted or fitting)]
 
 
-_SENSORS_OF: dict[Kind | None, frozenset[ChannelKind]] = {
+_SENSORS_OF: dict[StreamKind | None, frozenset[ChannelKind]] = {
     None: frozenset({ChannelKind.SENSOR, ChannelKind.EVENT_SENSOR}),
-    Kind.EVENT: frozenset({ChannelKind.EVENT_SENSOR}),
-    Kind.PERIODIC: frozenset({ChannelKind.SENSOR}),
-    Kind.FREE: frozenset({ChannelKind.SENSOR}),
+    StreamKind.EVENT: frozenset({ChannelKind.EVENT_SENSOR}),
+    StreamKind.PERIODIC: frozenset({ChannelKind.SENSOR}),
+    StreamKind.FREE: frozenset({ChannelKind.SENSOR}),
 }
-_Paced = dict[tuple[int, Kind], list[Channel]]  # channels by period (ns) and kind of stream
-_Group = tuple[int, Kind, list[Channel]]
+_Paced = dict[tuple[int, StreamKind], list[Channel]]  # channels by period (ns) and kind of stream
+_Group = tuple[int, StreamKind, list[Channel]]
 
 
-def _groups(channels: Sequence[Channel], rate: float | None, kind: Kind | None, *, at_most: bool) -> list[_Group]:
+def _groups(channels: Sequence[Channel], rate: float | None, kind: StreamKind | None, *, at_most: bool) -> list[_Group]:
     """Channels by period and kind, at most 16 each; all at the slowest period where that makes too many streams."""
     paced: _Paced = {}
     for one in channels:
         event = one.kind == ChannelKind.EVENT_SENSOR
-        how = Kind.EVENT if event else Kind.FREE if kind == Kind.FREE else Kind.PERIODIC
+        how = StreamKind.EVENT if event else StreamKind.FREE if kind == StreamKind.FREE else StreamKind.PERIODIC
         paced.setdefault((period_of(one, rate, at_most=at_most), how), []).append(one)
     groups = _cut(paced)
     if len(groups) > LAST_STREAM + 1:
@@ -238,17 +237,17 @@ def _groups(channels: Sequence[Channel], rate: float | None, kind: Kind | None, 
 
 def _at_the_slowest(paced: _Paced) -> _Paced:
     """Every channel at the longest period of all; events, which have none, stay as they are."""
-    slowest = max((period for period, how in paced if how != Kind.EVENT), default=0)
+    slowest = max((period for period, how in paced if how != StreamKind.EVENT), default=0)
     together: _Paced = {}
     for (period, how), members in paced.items():
-        together.setdefault((period if how == Kind.EVENT else slowest, how), []).extend(members)
+        together.setdefault((period if how == StreamKind.EVENT else slowest, how), []).extend(members)
     return together
 
 
 def _cut(paced: _Paced) -> list[_Group]:
     groups: list[_Group] = []
     for (period, how), members in paced.items():
-        step = 1 if how == Kind.EVENT else MOST_STREAM_CHANNELS
+        step = 1 if how == StreamKind.EVENT else MOST_STREAM_CHANNELS
         # As even as can be: 25 channels as 13 and 12 make shorter messages than 16 and 9.
         parts = math.ceil(len(members) / step)
         size = math.ceil(len(members) / parts)
@@ -273,30 +272,30 @@ def period_of(channel: Channel, rate: float | None, *, at_most: bool = False) ->
 
 
 def _plan(
-    number: int, period: int, kind: Kind, members: list[Channel], bus: BusTime, test_pattern: bool, start: int
-) -> Plan:
+    number: int, period: int, kind: StreamKind, members: list[Channel], bus: BusTime, test_pattern: bool, start: int
+) -> StreamPlan:
     widths = tuple((one.number, one.sample.octets if one.sample else 0) for one in members)
     octets = sum(width for _, width in widths)
     most = most_instants(kind, octets, bus.most_octets)
     if most < 1:
         raise BadData(f"One instant of channels {', '.join(str(n) for n, _ in widths)} does not fit a message.")
-    n = max(1, min(most, BLOCK // period)) if kind != Kind.EVENT else 1
-    plan = Plan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
+    n = max(1, min(most, BLOCK // period)) if kind != StreamKind.EVENT else 1
+    plan = StreamPlan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
     # Fuller messages where the bus is short of room: the overhead of a message is 13 octets.
-    while n < most and _load(plan, bus) > MOST_LOAD / 2 and kind != Kind.EVENT:
+    while n < most and _load(plan, bus) > MOST_LOAD / 2 and kind != StreamKind.EVENT:
         n = min(most, 2 * n)
-        plan = Plan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
+        plan = StreamPlan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
     return plan
 
 
-def _load(plan: Plan, bus: BusTime) -> float:
+def _load(plan: StreamPlan, bus: BusTime) -> float:
     n, period = plan.subscribe.n, plan.subscribe.period
     if bus.mtu is not None:
         return 1e9 / (n * period) / AIR_MESSAGES
     return bus_load(plan.length, n, period, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate)
 
 
-def _gap(plans: Sequence[Plan], bus: BusTime) -> int | None:
+def _gap(plans: Sequence[StreamPlan], bus: BusTime) -> int | None:
     """Microseconds between the node's data frames: what spreads them and still lets all leave in time."""
     unit = sum(
         share(frames(plan.length, link=bus.link, fd=bus.fd), 1, plan.subscribe.n, plan.subscribe.period)

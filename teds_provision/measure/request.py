@@ -11,7 +11,7 @@ from typing import Any
 from teds_provision.errors import PolicyRefused
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.trusting import DEAD_MAN, LEASE
-from teds_provision.protocol.operation.stream_commands import Kind
+from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.teds.fits import Fit, Requirement, judge, met
 from teds_provision.teds.sheet import Sheet
 
@@ -80,7 +80,7 @@ class MeasurementRequest:
 
     channels: tuple[int, ...] = ()
     rate: float | None = None
-    kind: Kind | None = None
+    kind: StreamKind | None = None
     trigger: bool = False
     test_pattern: bool = False
     lease: int = LEASE

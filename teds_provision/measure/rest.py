@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from teds_provision.errors import BadData, BadDatasheet, Garbled, NodeRefused, NodeSilent
-from teds_provision.measure.buses import Bus
+from teds_provision.measure.buses import MeasuredBus
 from teds_provision.measure.trusting import Trusted
 from teds_provision.station.station import Station
 from teds_provision.steps import reading
@@ -32,7 +32,7 @@ TRIES: Final = 5
 class Rest:
     """Reads the rest of one node's datasheet, a step at a time; :meth:`close` when the session ends before it does."""
 
-    def __init__(self, station: Station, trusted: Trusted, bus: Bus, *, by: str) -> None:
+    def __init__(self, station: Station, trusted: Trusted, bus: MeasuredBus, *, by: str) -> None:
         self._station, self._trusted, self._bus, self._by = station, trusted, bus, by
         self._steps = read_in_between(trusted.node, gap=GAP)
         self._c = trusted.node.c

@@ -16,7 +16,15 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from teds_provision.errors import LinkFailure, NoNode, StoreFailure, TedsProvisionError
-from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.blocks import (
+    Block,
+    ChannelFacts,
+    ClockSet,
+    GroupRows,
+    NodeReport,
+    SetPointCommand,
+    StationFacts,
+)
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.clock import HostClock
 from teds_provision.measure.grid import Grid
@@ -276,7 +284,7 @@ class Measurement:
     def _keeper(self, uuid: bytes) -> NodeKeeper | None:
         return next((one for one in self.keepers if one.uuid == uuid), None)
 
-    def command(self, command: Command) -> None:
+    def command(self, command: SetPointCommand) -> None:
         """A set point that came by a sink."""
         for keeper in self.keepers:
             if keeper.uuid.hex() == command.uuid:

@@ -12,7 +12,7 @@ from teds_provision.measure.held_actuator import unit_for
 from teds_provision.measure.trusting import Trusted, claim
 from teds_provision.protocol.operation.commands import Sampled, idle, sample
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
-from teds_provision.teds.calibration.zero import Reading, reading_of, turn_of
+from teds_provision.teds.calibration.zero import SampleStatistics, reading_of, turn_of
 from teds_provision.teds.sheet import Channel
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def settle(trusted: Trusted, number: int, *, count: int = SAMPLES, seconds: floa
     return Settled(one, raws.pop(number), raws)
 
 
-def require_still(settled: Settled) -> Reading:
+def require_still(settled: Settled) -> SampleStatistics:
     """The reading in the calibrated unit (of angles the circular mean); raises PolicyRefused where it is restless.
 
     That is where it spreads, or drifts, by more than the stated uncertainty, or without one a hundredth of the range.

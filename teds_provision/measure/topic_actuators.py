@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NotAuthentic, TedsProvisionError
-from teds_provision.measure.blocks import Block, Command
+from teds_provision.measure.blocks import Block, SetPointCommand
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.trusting import LEASE, Trusted, claim
 from teds_provision.protocol.messages.frames import Reason
@@ -74,7 +74,7 @@ class TopicActuators:
         self._dead_man, self._clock, self._turn, self._mapping = dead_man, clock, turn, mapping
         self._echo, self._tell = echo, tell
         self._actuators = {number: _Actuator(ChannelInterpreter(trusted.sheet, number)) for number in numbers}
-        self._newest: dict[int, Command] = {}
+        self._newest: dict[int, SetPointCommand] = {}
         self._news = threading.Condition()
         self._stop = False
         self._last_drive = 0  # its run
@@ -83,7 +83,7 @@ class TopicActuators:
         self._thread = threading.Thread(target=self._run, name=f"actuators {trusted.uuid[:8]}", daemon=True)
         self._thread.start()
 
-    def take(self, command: Command) -> None:
+    def take(self, command: SetPointCommand) -> None:
         """A set point in the SI unit of the datasheet."""
         with self._news:
             if command.channel in self._actuators and not self._stop:
@@ -117,7 +117,7 @@ class TopicActuators:
         self.refused += 1
         self._tell(f"set point refused, {why.rstrip('.')}")
 
-    def _apply(self, command: Command) -> None:
+    def _apply(self, command: SetPointCommand) -> None:
         actuator = self._actuators[command.channel]
         one = actuator.interpreter
         self._seconds_left(command)
@@ -132,14 +132,14 @@ class TopicActuators:
             self._send(command, actuator, octets)
         self._say(command.channel, actuator, octets)
 
-    def _seconds_left(self, command: Command) -> float:
+    def _seconds_left(self, command: SetPointCommand) -> float:
         """Seconds until a set point is too old; raises LinkFailure where it is."""
         age = time.monotonic() - command.received
         if age > self._dead_man / 1000:
             raise LinkFailure(f"It is {age:.2f} s old; the dead-man is {self._dead_man} ms.")
         return self._dead_man / 1000 - age
 
-    def _send(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
+    def _send(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
         self._seconds_left(command)
         if self._unsure:
             self._trusted.node.send(CLOCK, "to tell its time", within=self._dead_man / 1000)
@@ -157,7 +157,7 @@ class TopicActuators:
             actuator.answered = time.monotonic()
         actuator.claimed_until = time.monotonic() + self._dead_man / 1000
 
-    def _set(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
+    def _set(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
         try:
             self._write(command, octets)
         except NodeRefused as refusal:
@@ -171,7 +171,7 @@ class TopicActuators:
             self._unsure, actuator.claimed_until, actuator.driver = True, 0.0, None
             raise
 
-    def _write(self, command: Command, octets: bytes) -> None:
+    def _write(self, command: SetPointCommand, octets: bytes) -> None:
         words = write_data_set(command.channel, octets)
         self._trusted.node.send(words, "to set the actuator", within=self._seconds_left(command))
 
@@ -183,7 +183,7 @@ class TopicActuators:
             if refusal.reason != Reason.WRONG_STATE:  # it is claimed by this session still
                 raise
 
-    def _is_driven(self, command: Command, actuator: _Actuator, octets: bytes) -> bool:
+    def _is_driven(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> bool:
         """Send it as a Drive message; False where the node takes none: then values go by command, as fast as it can."""
         if not actuator.drivable:
             return False
@@ -196,7 +196,7 @@ class TopicActuators:
             return False
         return True
 
-    def _drive(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
+    def _drive(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
         number = command.channel
         if actuator.driver is None:
             layout = Layout((number,), (len(octets),))

@@ -11,11 +11,10 @@ from datetime import UTC, datetime
 
 from teds_provision.errors import BadData, KeyStolen, PolicyRefused
 from teds_provision.links.ports import Timed
-from teds_provision.measure.blocks import ChannelFacts
-from teds_provision.measure.blocks import Kind as KindWord
+from teds_provision.measure.blocks import ChannelFacts, Kind
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.protocol.operation import commands
-from teds_provision.protocol.operation.commands import Operation
+from teds_provision.protocol.operation.commands import OperationReply
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
 from teds_provision.station.shown_units import channel_profiles, shown_units
 from teds_provision.station.station import Station
@@ -27,11 +26,15 @@ from teds_provision.steps.verify import known_of, require_authentic
 from teds_provision.steps.verify_node import Looked, look_in_session
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.profile import ChannelProfile
-from teds_provision.teds.sheet import Channel, Kind, Sheet
+from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 
 # From a signed datasheet to the facts that go with every value.
 
-_WORDS: dict[Kind, KindWord] = {Kind.SENSOR: "sensor", Kind.ACTUATOR: "actuator", Kind.EVENT_SENSOR: "event"}
+_WORDS: dict[ChannelKind, Kind] = {
+    ChannelKind.SENSOR: "sensor",
+    ChannelKind.ACTUATOR: "actuator",
+    ChannelKind.EVENT_SENSOR: "event",
+}
 
 
 def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, period: float | None) -> ChannelFacts:
@@ -45,7 +48,7 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         node=name or sheet.meta.name,
         number=channel.number,
         name=channel.name,
-        kind=_WORDS.get(channel.kind or Kind.SENSOR, "sensor"),
+        kind=_WORDS.get(channel.kind or ChannelKind.SENSOR, "sensor"),
         unit=channel.si_unit,
         units=channel.units,
         shown_unit=channel.shown.text,
@@ -59,7 +62,7 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         sample_form=channel.sample.name if channel.sample else "",
         own_period=_if_finite(channel.period),
         calibration=channel.calibration,
-        period=None if channel.kind == Kind.EVENT_SENSOR else period,
+        period=None if channel.kind == ChannelKind.EVENT_SENSOR else period,
         vector=next((group for group in sheet.meta.vectors if channel.number in group), ()),
     )
 
@@ -189,7 +192,7 @@ def require_whitelisted(station: Station, uuid: bytes) -> None:
         )
 
 
-class Standing:
+class NodeStanding:
     """What a person decides of a node while it is measured: a ban, its key given away, the whitelist.
 
     ``drives``: whether set points are taken for its actuators. Looked at where another process has changed the store.
@@ -255,6 +258,6 @@ def claim(trusted: Trusted, channel: int, *, lease: int, dead_man: int | None = 
     operate(trusted.node, channel, trusted.digest, lease=lease, dead_man=dead_man)
 
 
-def operation(node: Conversation) -> Operation:
+def operation(node: Conversation) -> OperationReply:
     """What the node claims and does (128.19)."""
-    return Operation.decode(node.send(commands.OPERATION, "to tell its mode"))
+    return OperationReply.decode(node.send(commands.OPERATION, "to tell its mode"))

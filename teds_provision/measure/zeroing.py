@@ -19,7 +19,7 @@ from teds_provision.measure.held_actuator import unit_for
 from teds_provision.measure.settled import Settled, reference_for, require_still, settle
 from teds_provision.measure.sources import beside
 from teds_provision.measure.trusting import Trusted, operation, trusted_from
-from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.operation.commands import ChannelState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
@@ -202,7 +202,7 @@ class _Zeroing:
         station, node, who = self.visit.station, self.visit.node, self.visit.who
         identity = node.proven
         assert identity is not None
-        keys = NodeKeys(node.uuid, who.point, who.key_signature)
+        keys = SignedNodeKey(node.uuid, who.point, who.key_signature)
         with self.steps.step("sign") as step:
             signed = sign(station, keys, image, epoch=identity.epoch, node_sequence=identity.sequence)
             step.detail = f"sequence {signed.sequence}"

@@ -12,7 +12,7 @@ from typing import Any, Final, get_args
 from teds_provision import __version__
 from teds_provision.errors import Frozen, NotFound, UsageFailure
 from teds_provision.links import Port
-from teds_provision.measure.blocks import Command
+from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.sightings import Sighting
 from teds_provision.ncap.live import Live
@@ -21,7 +21,7 @@ from teds_provision.ncap.names import Names
 from teds_provision.ncap.nodes.desk import Desk, Turns
 from teds_provision.ncap.nodes.holding import Holding
 from teds_provision.ncap.nodes.provisioning import Adopting, Provisioning
-from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.ncap.nodes.sheets import Sheets
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.nodes.watching import Watch
@@ -44,7 +44,7 @@ class Daemon:
     def __init__(self, station: Station, settings: Settings) -> None:
         self.station, self.settings = station, settings
         self.live, self.turns, self.tokens = Live(), Turns(), Tokens(station.home)
-        self.roster = Roster(station, self.live)
+        self.roster = NodeDirectory(station, self.live)
         self.buses = Buses(news=self._saw)
         self.desk = Desk(self.roster, self.turns, self._port_of)
         sinks = DaemonSinks(
@@ -225,7 +225,7 @@ class Daemon:
             "plant": self.station.plant.joined is not None,
         }
 
-    def _admits(self, set_point: Command) -> bool:
+    def _admits(self, set_point: SetPointCommand) -> bool:
         return self.holding.admits(set_point)
 
     def _link(self, watch: Watch) -> dict[str, Any]:

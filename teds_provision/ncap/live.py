@@ -51,7 +51,7 @@ class Last:
     time: float
 
 
-class Listener:
+class LiveClient:
     """One client. ``wait`` gives the next messages for it, each a JSON text.
 
     ``reader``: it may only read, so it is told no files and users of this machine.
@@ -117,7 +117,7 @@ class Live:
         self._channels: dict[Key, _Channel] = {}
         self._last: dict[Key, Last] = {}
         self._turning: frozenset[Key] = frozenset()
-        self._listeners: set[Listener] = set()
+        self._listeners: set[LiveClient] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self.overrun = 0
         self.values = 0
@@ -156,13 +156,13 @@ class Live:
 
     # -- in the loop -------------------------------------------------------------------------------------------------
 
-    def join(self, *, reader: bool = False) -> Listener:
+    def join(self, *, reader: bool = False) -> LiveClient:
         """A new client."""
-        listener = Listener(reader=reader)
+        listener = LiveClient(reader=reader)
         self._listeners.add(listener)
         return listener
 
-    def leave(self, listener: Listener) -> None:
+    def leave(self, listener: LiveClient) -> None:
         """A client that has gone."""
         self._listeners.discard(listener)
 

@@ -1,7 +1,7 @@
 """The measurements of the daemon: kept in the store, carried on after every start, ended in order.
 
-Each is a :class:`Job` of the room ``measure``; here it gets its nodes (nothing else is done with them meanwhile), its
-watchers (the live channel, the roster), and the sinks that the daemon was started with.
+Each is a :class:`MeasurementJob` of the room ``measure``; here it gets its nodes (nothing else is done with them
+meanwhile), its watchers (the live channel, the roster), and the sinks that the daemon was started with.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from teds_provision.errors import (
     TedsProvisionError,
     UsageFailure,
 )
-from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport, StationFacts
+from teds_provision.measure.blocks import ChannelFacts, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.lookout import Lookout
 from teds_provision.measure.matching import Match, Of, Unsigned, why_not_measured
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
-from teds_provision.measure.running.job import Job
+from teds_provision.measure.running.job import MeasurementJob
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.sinks.base import BUDGET
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
@@ -37,9 +37,9 @@ from teds_provision.ncap.live import Live
 from teds_provision.ncap.newcomers import Newcomers
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import as_problem
-from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
-from teds_provision.protocol.operation.stream_commands import Kind
+from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.station.station import Station
 from teds_provision.store import KeptMeasurement
 from teds_provision.teds.image import Image
@@ -60,7 +60,7 @@ class Running:
     kept: KeptMeasurement
     uuids: tuple[str, ...]  # of one that takes in whoever comes: those that are in
     newcomers: Newcomers | None = None
-    job: Job | None = None
+    job: MeasurementJob | None = None
     state: str = "starting"
     why: str = ""
     reports: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -86,12 +86,12 @@ class Measuring:
     def __init__(
         self,
         station: Station,
-        roster: Roster,
+        roster: NodeDirectory,
         live: Live,
         turns: Turns,
         buses: Buses,
         sinks: DaemonSinks,
-        admits: Callable[[Command], bool],
+        admits: Callable[[SetPointCommand], bool],
         *,
         dead_man: int = DEAD_MAN,
     ) -> None:
@@ -258,7 +258,7 @@ class Measuring:
         image = self._station.nodes.datasheet(uuid)
         if image is None:
             return
-        kind = None if kept.kind is None else Kind[kept.kind.upper()]
+        kind = None if kept.kind is None else StreamKind[kept.kind.upper()]
         channels = Sheet.of(image).channels
         if self._sinks.moves(kept) and channels and all(one.actuator for one in channels):
             return  # it has nothing to measure; set points come for it
@@ -307,7 +307,7 @@ class Measuring:
         with self._guard:
             return any(one.kept.group == name for one in self._running.values())
 
-    def _job_of(self, uuid: str) -> Job | None:
+    def _job_of(self, uuid: str) -> MeasurementJob | None:
         with self._guard:
             return next((one.job for one in self._running.values() if uuid in one.uuids), None)
 
@@ -480,8 +480,8 @@ class Measuring:
             return False
         return not self._unverified.why_not(self._station, bytes.fromhex(uuid))
 
-    def _new_job(self, one: Running, *, unverified: bool = False) -> Job:
-        return Job(
+    def _new_job(self, one: Running, *, unverified: bool = False) -> MeasurementJob:
+        return MeasurementJob(
             self._station,
             one.kept,
             more=lambda take: self._sinks.more(one.kept, take),
@@ -654,7 +654,7 @@ class Measuring:
         self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=why)
 
 
-def _state_of_open(one: Running, job: Job) -> tuple[str, str]:
+def _state_of_open(one: Running, job: MeasurementJob) -> tuple[str, str]:
     if any(one.reports.get(uuid, {}).get("state") == "running" for uuid in one.uuids):
         return "running", ""
     if job.error is not None:
@@ -665,7 +665,7 @@ def _state_of_open(one: Running, job: Job) -> tuple[str, str]:
     return "waiting", "no matching node is present"
 
 
-def _state_of(one: Running, job: Job) -> tuple[str, str]:
+def _state_of(one: Running, job: MeasurementJob) -> tuple[str, str]:
     states = {report["state"] for report in one.reports.values()}
     if "running" in states:
         lacking = [uuid for uuid in one.uuids if one.reports.get(uuid, {}).get("state") != "running"]

@@ -11,7 +11,7 @@ from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.running.job import station_facts
 from teds_provision.measure.sinks.names import Topics, is_topic
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.station.station import Station
 
 
@@ -25,7 +25,7 @@ class Names:
     def __init__(
         self,
         station: Station,
-        roster: Roster,
+        roster: NodeDirectory,
         live: Live,
         is_measured: Callable[[str], bool],
         in_use: Callable[[str], StationFacts | None],

@@ -36,7 +36,7 @@ class NodeHandler(Protocol):
         """Whether a session claims an actuator, so that the node keeps its CAN address whoever claims it."""
 
 
-class Measuring(Protocol):
+class MeasuringHandler(Protocol):
     """What a bus tells a node that measures, beside its commands (operation.md, sections 3 to 6). Thread-safe."""
 
     def tick(self, at: float = 0.0) -> int:
@@ -68,7 +68,7 @@ class Measuring(Protocol):
         """A Drive frame of this link's station came."""
 
 
-class InTheAir(NodeHandler, Measuring, Protocol):
+class InTheAir(NodeHandler, MeasuringHandler, Protocol):
     """What a node's BLE asks beside (profile.md, "BLE")."""
 
     def in_factory_state(self) -> bool:
@@ -106,9 +106,9 @@ class Crew:
         self._free = 0  # threads without a job, less the jobs that wait for one
         self._ended = False
 
-    def turns(self) -> Turns:
+    def turns(self) -> JobQueue:
         """Return a new queue whose jobs are run one after another."""
-        return Turns(self.run)
+        return JobQueue(self.run)
 
     def run(self, job: Job) -> None:
         """Have a thread run ``job`` as soon as one is free; nothing happens once the crew has ended."""
@@ -146,7 +146,7 @@ class Crew:
                 self._free += 1
 
 
-class Turns:
+class JobQueue:
     """Jobs of one line in the order in which they came. Thread-safe."""
 
     def __init__(self, run: Callable[[Job], None]) -> None:

@@ -32,13 +32,13 @@ from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import find_job, roster_of
 from teds_provision.plant.post import SMALL, Parcel, Post
 from teds_provision.protocol import datasheet
-from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, time_text
 from teds_provision.protocol.keys import fingerprint, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
-from teds_provision.protocol.plant.document import SIGNED, Kind, hash_of
+from teds_provision.protocol.plant.document import SIGNED, DocumentKind, hash_of
 from teds_provision.protocol.plant.job import Job
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.protocol.plant.signing import (
@@ -66,7 +66,7 @@ _LOOK_SECONDS: Final = 0.05
 _MOST_LOOK_SECONDS: Final = 1.0
 
 
-class Refused(PolicyRefused):
+class OfficeRefused(PolicyRefused):
     """The office signs nothing; its reason stands in the message."""
 
     code = "office-refused"
@@ -117,7 +117,7 @@ class Inbox:
     ``wait`` are for one thread at a time.
     """
 
-    def __init__(self, station: Station, post: Post, kind: Kind) -> None:
+    def __init__(self, station: Station, post: Post, kind: DocumentKind) -> None:
         self._station, self._post, self._kind = station, post, kind
         self._known: set[str] = set()
         self._listener: postgres.Registry | None = None
@@ -292,7 +292,7 @@ class Wanted:
 
 
 def by_office(
-    station: Station, office: Office, node: Conversation, keys: NodeKeys, wanted: Wanted, on_node: bytes | None
+    station: Station, office: Office, node: Conversation, keys: SignedNodeKey, wanted: Wanted, on_node: bytes | None
 ) -> Signed:
     """Have the office sign. What it signed before, and what the node has, is not asked for again.
 
@@ -370,7 +370,7 @@ def sign_by_office(station: Station, links: LinkSettings, order: SignBy, reporte
         with at_node(station, links, uuid, reporter, unlock="always") as visit:
             visit.session()
             identity, image = read_identity(visit.node), Image(uuid, draft.image.unsigned_blocks())
-            keys = NodeKeys(uuid, visit.who.point, visit.who.key_signature)
+            keys = SignedNodeKey(uuid, visit.who.point, visit.who.key_signature)
             octets = read_limited(order.calibration, 1 << 20, "calibration") if order.calibration is not None else None
             name = own_name(station, image, draft.profile)
             wanted = Wanted(job.id, job.office, image, name, octets, identity.epoch, identity.sequence)
@@ -392,7 +392,7 @@ def _earlier(station: Station, wanted: Wanted) -> SignRequestRow | None:
     return None
 
 
-def _new_request(station: Station, node: Conversation, keys: NodeKeys, wanted: Wanted) -> SignRequest:
+def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, wanted: Wanted) -> SignRequest:
     """A new request, which the board signed; kept before anybody sees it."""
     nonce, key = os.urandom(NONCE_OCTETS), station.credentials().key
     blocks = wanted.image.unsigned_blocks()
@@ -424,7 +424,9 @@ def _new_request(station: Station, node: Conversation, keys: NodeKeys, wanted: W
     return request
 
 
-def _taken(station: Station, roster: Roster, keys: NodeKeys, wanted: Wanted, request: bytes, octets: bytes) -> Signed:
+def _taken(
+    station: Station, roster: Roster, keys: SignedNodeKey, wanted: Wanted, request: bytes, octets: bytes
+) -> Signed:
     """The image with what the office signed; raises Refused, NotAuthentic (not its word, or something else)."""
     office = roster.point_of(wanted.office)
     answer = open_answer(octets, lambda kid: office if kid == wanted.office else None)
@@ -446,14 +448,14 @@ def _refusal(roster: Roster, wanted: Wanted, answer: Answer) -> TedsProvisionErr
         "differs": "Station and office need the same profile and version of the program.",
         "sequence": "A person at the office has to look: signer once FILE --jump",
     }
-    return Refused(
+    return OfficeRefused(
         f"The office {roster.name_of(wanted.office)} does not sign ({answer.refused}): {answer.why.rstrip('.')}.",
         hint=hints.get(answer.refused, ""),
     )
 
 
 def _says_the_same(
-    station: Station, roster: Roster, keys: NodeKeys, wanted: Wanted, octets: bytes, *, by: str | None = None
+    station: Station, roster: Roster, keys: SignedNodeKey, wanted: Wanted, octets: bytes, *, by: str | None = None
 ) -> bool:
     """Whether a Security TEDS signs exactly this for this board and epoch, by a member with ``sign`` (or ``by``)."""
     try:

@@ -13,7 +13,7 @@ from teds_provision.files import SHARED, holds, write_whole
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
-from teds_provision.protocol.plant.evidence import NONCE_OCTETS, Claim, seal
+from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
 from teds_provision.store import EvidenceRow, LineTables, utc_now
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.codec import security
@@ -22,7 +22,12 @@ TOOL = f"teds-provision {__version__}"
 
 
 def sign_evidence(
-    node: Conversation, credentials: Credentials, claim: Claim, *, operator: str | None = None, finished: str = ""
+    node: Conversation,
+    credentials: Credentials,
+    claim: EvidenceClaim,
+    *,
+    operator: str | None = None,
+    finished: str = "",
 ) -> bytes:
     """Have the board sign the facts of ``claim``, and return the envelope that the station signed over both.
 
@@ -47,7 +52,7 @@ def sign_evidence(
     )
 
 
-def prove_claim(node: Conversation, claim: Claim, nonce: bytes) -> bytes:
+def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes:
     """The board's signature over the facts (128.8); raises NotAuthentic where it is not that of field 101."""
     asked = claim.challenge(nonce)
     proof = node.ask(security_command(Function.PROVE, asked), "to sign the evidence")

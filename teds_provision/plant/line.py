@@ -16,14 +16,14 @@ from teds_provision.plant.asking import Office, Wanted, by_office
 from teds_provision.plant.evidence import TOOL, make_folder, sign_evidence
 from teds_provision.plant.folding import heads_digest
 from teds_provision.plant.jobs import digest_of_file, profile_file, require_adopted, require_open
-from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.plant.evidence import FAILED, PASSED, Claim, Facts, blocks_of
+from teds_provision.protocol.plant.evidence import FAILED, PASSED, BoardFacts, EvidenceClaim, blocks_of
 from teds_provision.protocol.plant.job import WORTH, Job
 from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.station import Station
-from teds_provision.steps.batch_sheet import Board
+from teds_provision.steps.batch_sheet import BoardResult
 from teds_provision.steps.board_type import WrongBoard
 from teds_provision.steps.build import BuildOrder, Prepared, Proposal, prepare
 from teds_provision.steps.identify import Identified
@@ -272,7 +272,7 @@ class LineRun:
             )
         return UnitRow(job.id, uuid, greatest + 1, utc_now())
 
-    def keep(self, document: bytes, claim: Claim, finished: str, unit: LineUnit) -> None:
+    def keep(self, document: bytes, claim: EvidenceClaim, finished: str, unit: LineUnit) -> None:
         """Keep the evidence of a claim, whole, and whether the unit passed."""
         digest, uuid, facts = hashlib.sha256(document).hexdigest(), claim.uuid, claim.facts
         passed, tables = facts.failure is None, self.station.plant.line
@@ -369,7 +369,7 @@ class LineUnit:
     assurance: str
     begun: str
 
-    def sign(self, node: Conversation, keys: NodeKeys, proposal: Proposal, present: Survey) -> Signed | None:
+    def sign(self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: Survey) -> Signed | None:
         """The datasheet signed by the job's office; None where this station signs."""
         job, station = self.run.job, self.run.station
         if job is None or job.office in (None, station.identity.fingerprint):
@@ -395,7 +395,7 @@ class LineUnit:
 
     def ended(self, node: Conversation, done: Provisioned) -> None:
         """Have the board sign the facts, and keep the evidence; without one, note that the unit passed."""
-        failure = Board(done.who.uuid, 0.0, done).failure
+        failure = BoardResult(done.who.uuid, 0.0, done).failure
         teds = done.image.security
         assert teds is not None, "what was verified has a Security TEDS"
         if self._wanted:
@@ -424,7 +424,7 @@ class LineUnit:
         station, shown = self.run.station, security.decode(teds)
         job, row = self.run.job, station.nodes.get(uuid)
         credentials = station.credentials(uuid)
-        facts = Facts(
+        facts = BoardFacts(
             station=fingerprint(credentials.key.point),
             job=job.id if job is not None else None,
             unit=self.row.unit if self.row is not None else None,
@@ -441,7 +441,7 @@ class LineUnit:
             begun=self.begun,
             heads=heads_digest(station) if station.plant.joined is not None else None,
         )
-        claim, finished = Claim(uuid, teds, facts), utc_now()
+        claim, finished = EvidenceClaim(uuid, teds, facts), utc_now()
         document = sign_evidence(node, credentials, claim, operator=self.run.operator, finished=finished)
         self.run.keep(document, claim, finished, self)
 

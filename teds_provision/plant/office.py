@@ -25,7 +25,7 @@ from teds_provision.plant.jobs import (
     roster_of,
 )
 from teds_provision.plant.post import Post
-from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.plant.document import hash_of
@@ -150,7 +150,7 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
             station.nodes.remember(request.uuid, point=request.point)
         signed = sign(
             station,
-            NodeKeys(request.uuid, request.point, request.key_signature),
+            SignedNodeKey(request.uuid, request.point, request.key_signature),
             image,
             epoch=request.epoch,
             node_sequence=request.sequence,

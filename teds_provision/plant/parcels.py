@@ -52,18 +52,18 @@ Views = Callable[[Sequence[bytes]], Mapping[bytes, View]]
 
 
 @dataclass(frozen=True)
-class Received:
+class ParcelCounts:
     """How many parcels of a sync were dealt with, and how many wait for a person."""
 
     taken: int
     waiting: int
 
 
-def take_in(station: Station, post: Post, views: Views, now: datetime) -> Received:
+def take_in(station: Station, post: Post, views: Views, now: datetime) -> ParcelCounts:
     """Take in what lies there for this station; what needs a person is kept for ``import-keys --received``."""
     roster = station.plant.roster
     if roster is None:
-        return Received(0, 0)
+        return ParcelCounts(0, 0)
     _drop_outlived(station, now)
     reader = _Reader(station, roster, views, now)
     taken = sum(reader.again(row) for row in station.plant.parcels.parcels("in", "later"))
@@ -72,7 +72,9 @@ def take_in(station: Station, post: Post, views: Views, now: datetime) -> Receiv
         if done is not None:
             post.drop(parcel.id, station.fingerprint)
             taken += done
-    return Received(taken, sum(row.kind == "bundle" for row in station.plant.parcels.parcels("in", "waiting", "later")))
+    return ParcelCounts(
+        taken, sum(row.kind == "bundle" for row in station.plant.parcels.parcels("in", "waiting", "later"))
+    )
 
 
 def _drop_outlived(station: Station, now: datetime) -> None:

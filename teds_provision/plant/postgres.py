@@ -64,7 +64,7 @@ class Waiting:
 
 
 @dataclass(frozen=True)
-class Look:
+class DatabaseState:
     """What the database has at one moment, all of it unchecked.
 
     ``rosters`` are those that members posted, each once; ``posted`` is this station's own. ``heads`` are number and H
@@ -192,7 +192,7 @@ class Registry:
         if connection is not None:
             _shut(connection)
 
-    def look(self) -> Look:
+    def look(self) -> DatabaseState:
         """All that tells whether anything is new, in one round trip."""
         rows = self._rows(_LOOK, ())
         meta = next((row for row in rows if row[0] == "meta"), None)
@@ -203,7 +203,7 @@ class Registry:
                 f"The database has schema {meta[2]}; this program knows {schema.VERSION}.",
                 hint="Use a newer version of teds-provision.",
             )
-        return Look(
+        return DatabaseState(
             meta[3],
             tuple(row[3].encode() for row in rows if row[0] == "roster"),
             next((row[3].encode() for row in rows if row[0] == "roster" and row[2]), None),
@@ -311,7 +311,7 @@ class PostgresPost:
     def __init__(self, registry: Registry, where: str, station: str) -> None:
         self._registry, self._station = registry, station
         self.where = where
-        self._seen: Look | None = None
+        self._seen: DatabaseState | None = None
 
     def registry(self) -> str | None:
         """The registry that the database is of; looks anew, so a sync asks this first."""
@@ -377,7 +377,7 @@ class PostgresPost:
         self._registry.close()
 
     @property
-    def _look(self) -> Look:
+    def _look(self) -> DatabaseState:
         if self._seen is None:
             self.registry()
         assert self._seen is not None

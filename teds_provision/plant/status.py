@@ -22,7 +22,7 @@ SHORTEST: Final = 4
 
 
 @dataclass(frozen=True)
-class Standing:
+class StationStanding:
     """Where a station stands: its newest page that counts, since when (seconds), and in a word."""
 
     name: str
@@ -34,12 +34,12 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Status:
+class PlantStatus:
     """The plant at one moment; ``standings`` of members, then of removed ones."""
 
     record: PlantRecord
     roster: Roster
-    standings: tuple[Standing, ...]
+    standings: tuple[StationStanding, ...]
     unsent: int
     conflicts: int
     alarms: tuple[Alarm, ...]
@@ -68,11 +68,11 @@ def moment(roster: Roster) -> datetime:
     return max(now(), roster.created)
 
 
-def status(station: Station, record: PlantRecord, roster: Roster) -> Status:
+def status(station: Station, record: PlantRecord, roster: Roster) -> PlantStatus:
     """Look at the store alone; no connection is opened."""
     at = moment(roster)
     chains = station.plant.tables.chains()
-    return Status(
+    return PlantStatus(
         record,
         roster,
         tuple(_standing(station, one, chains.get(one.fingerprint), at) for one in roster.by_key.values()),
@@ -84,7 +84,7 @@ def status(station: Station, record: PlantRecord, roster: Roster) -> Status:
     )
 
 
-def _standing(station: Station, one: Any, chain: Chain | None, at: datetime) -> Standing:
+def _standing(station: Station, one: Any, chain: Chain | None, at: datetime) -> StationStanding:
     n = chain.counted[0] if chain is not None else 0
     age = None
     if chain is not None and n:
@@ -104,7 +104,7 @@ def _standing(station: Station, one: Any, chain: Chain | None, at: datetime) -> 
     else:
         state = "nothing said" if not n else "silent" if age is None or age > SILENT.total_seconds() else "heard"
     roles = tuple(role for role in ("keeper", "line", "sign", "base", "audit") if role in one.roles)
-    return Standing(one.name, one.fingerprint, roles, n, age, state)
+    return StationStanding(one.name, one.fingerprint, roles, n, age, state)
 
 
 @dataclass(frozen=True)

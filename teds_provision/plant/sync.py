@@ -33,7 +33,7 @@ from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import NewerFormat, hash_of
 from teds_provision.protocol.plant.evidence import PASSED
 from teds_provision.protocol.plant.fold import View
-from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Draft, Page, open_page, seal_page
+from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant import new_home
 from teds_provision.station.station import Station
@@ -355,7 +355,9 @@ def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page
             events.append((id, load_exact(text.encode(), "An event")))
         n, previous = chain.counted
         entry = station.audit_log.newest()
-        draft = Draft(roster.registry, n + 1, previous, station.plant.home, now(), _fresh_heads(station, chain), entry)
+        draft = PageDraft(
+            roster.registry, n + 1, previous, station.plant.home, now(), _fresh_heads(station, chain), entry
+        )
         octets = seal_page(draft, [one for _, one in events], station.vault.identity())
         page = open_page(octets, roster.registry, lambda kid: station.point)
         take_pages(station, roster, [page])

@@ -95,7 +95,7 @@ def _gone(roster: Roster, station: str, what: str) -> Iterator[str]:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedEvidence:
     """What became of one file: what it says, and what is wrong with it; ``exit_code`` as the command would end."""
 
     path: Path
@@ -142,18 +142,18 @@ class Judged:
 
 
 @dataclass
-class Totals:
+class EvidenceTotals:
     """How many files came to which word; ``exit_code`` is that of the worst."""
 
     files: int = 0
     words: dict[str, int] = field(default_factory=dict)
     exit_code: int = 0
 
-    def add(self, judged: Judged) -> None:
+    def add(self, judged: JudgedEvidence) -> None:
         """Count one in."""
-        self.join(Totals(1, {judged.word: 1}, judged.exit_code))
+        self.join(EvidenceTotals(1, {judged.word: 1}, judged.exit_code))
 
-    def join(self, others: Totals) -> None:
+    def join(self, others: EvidenceTotals) -> None:
         """Count in what was counted elsewhere."""
         self.files += others.files
         for word, count in others.words.items():
@@ -166,13 +166,13 @@ class Totals:
 
 
 _WORST: Final = (0, 7, 3, 8, 1, 4)
-Tell = Callable[[Judged], str]
+Tell = Callable[[JudgedEvidence], str]
 """The line of one file, as it is shown; called in whichever process judged it."""
 
 
 def verify_evidence(
     grounds: Grounds, files: Sequence[str], tell: Tell, *, processes: int | None = None
-) -> Iterator[tuple[list[str], Totals]]:
+) -> Iterator[tuple[list[str], EvidenceTotals]]:
     """Judge every file, in order: what ``tell`` says of each, and their totals; a fault of one stops no other.
 
     More than a few files are shared among ``processes`` (as many as there are cores).
@@ -195,8 +195,8 @@ class _Work:
     tell: Tell
     files: Sequence[str]
 
-    def judge(self, places: range) -> tuple[list[str], Totals]:
-        lines, totals = [], Totals()
+    def judge(self, places: range) -> tuple[list[str], EvidenceTotals]:
+        lines, totals = [], EvidenceTotals()
         for judged in judge_files(self.grounds, [Path(self.files[place]) for place in places]):
             totals.add(judged)
             lines.append(self.tell(judged))
@@ -213,26 +213,26 @@ def _init_worker(work: _Work) -> None:
     gc.disable()  # documents are trees: their count of references alone frees them, a tenth of the time sooner
 
 
-def _judge_chunk(places: range) -> tuple[list[str], Totals]:
+def _judge_chunk(places: range) -> tuple[list[str], EvidenceTotals]:
     assert _work is not None
     return _work.judge(places)
 
 
-def judge_file(grounds: Grounds, path: Path) -> Judged:
+def judge_file(grounds: Grounds, path: Path) -> JudgedEvidence:
     """Judge one file; whatever is wrong with it is in what is returned."""
     return judge_files(grounds, [path])[0]
 
 
-def judge_files(grounds: Grounds, paths: Sequence[Path]) -> list[Judged]:
+def judge_files(grounds: Grounds, paths: Sequence[Path]) -> list[JudgedEvidence]:
     """Judge some files: all are read, then all signatures are checked in a row."""
     read = [_read(path) for path in paths]
     checked = [codec.check_signatures(one) if isinstance(one, Ready) else None for one in read]
     found = []
     for path, one, signatures in zip(paths, read, checked, strict=True):
         if isinstance(one, Ready) and signatures is not None:
-            found.append(Judged(path, one.evidence, tuple(grounds.faults_of(one, signatures))))
+            found.append(JudgedEvidence(path, one.evidence, tuple(grounds.faults_of(one, signatures))))
         elif isinstance(one, TedsProvisionError):
-            found.append(Judged(path, error=one))
+            found.append(JudgedEvidence(path, error=one))
     return found
 
 

@@ -71,7 +71,7 @@ def is_announce(identifier: int) -> bool:
 
 
 @dataclass
-class Claim:
+class AddressClaim:
     """One node's part: when to announce, and when to move. Times are monotonic seconds.
 
     ``crc`` of the node's UUID; ``uniform`` gives a random number between two bounds. :meth:`due` is asked before each

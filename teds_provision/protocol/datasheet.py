@@ -22,7 +22,7 @@ LAST_CHANNEL = 255
 
 
 @dataclass(frozen=True)
-class NodeKeys:
+class SignedNodeKey:
     """Fields 101 and 102 of a node: its key and the key's signature over itself, for one UUID."""
 
     uuid: bytes
@@ -41,7 +41,7 @@ def digests(blocks: Mapping[BlockId, bytes]) -> dict[BlockId, bytes]:
 
 
 def unsigned_datasheet(
-    node: NodeKeys, station: bytes, station_signature: bytes, listed: Mapping[BlockId, bytes], **values: object
+    node: SignedNodeKey, station: bytes, station_signature: bytes, listed: Mapping[BlockId, bytes], **values: object
 ) -> SecurityTeds:
     """Fill in everything but field 100; ``values`` are ca, last_modified, sequence, key_epoch."""
     return SecurityTeds(

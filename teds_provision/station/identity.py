@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
 from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
-from teds_provision.store import Facts, Store
+from teds_provision.store import StationRecord, Store
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys
@@ -20,7 +20,7 @@ else:  # cryptography: not for commands that only list
 DEFAULT_NAME = "station"
 
 
-class Identity:
+class StationIdentity:
     """The facts of one station, and the certificates (SIG104) that it knows; secrets come from the vault."""
 
     def __init__(self, store: Store, vault: Callable[[], Vault], seals: Seals) -> None:
@@ -43,7 +43,7 @@ class Identity:
 
     def found(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
         """Keep where the secrets of a new station lie, and the key for which it asks a certificate, if it does."""
-        self._store.put_facts(self._seals.facts(Facts(name or DEFAULT_NAME, keystore, keystore_why, requested)))
+        self._store.put_facts(self._seals.facts(StationRecord(name or DEFAULT_NAME, keystore, keystore_why, requested)))
 
     def complete(self, point: bytes, ca: bytes, signature: bytes) -> None:
         """Keep the station's key, its owner's CA and SIG104: init is finished."""
@@ -51,7 +51,7 @@ class Identity:
         self._store.put_facts(self._seals.facts(replace(self._facts, point=point, ca=ca, signature=signature)))
 
     @property
-    def _facts(self) -> Facts:
+    def _facts(self) -> StationRecord:
         facts = self._store.facts()
         if facts is None:
             raise NotFound(f"There is no base station in {self._store.home} yet.", hint="Make one: teds-provision init")
@@ -130,7 +130,7 @@ class Identity:
         """SIG104 of ``ca`` over a station's key as far as it is known here."""
         return self._certificate(self._facts, ca, point)
 
-    def _certificate(self, facts: Facts, ca: bytes, point: bytes) -> bytes | None:
+    def _certificate(self, facts: StationRecord, ca: bytes, point: bytes) -> bytes | None:
         if (ca, point) == (facts.ca, facts.point):
             return self._required(facts.signature)
         return self._store.certificate(keys.fingerprint(ca), keys.fingerprint(point))

@@ -18,7 +18,7 @@ from pathlib import Path
 from teds_provision.errors import Frozen, NotFound, PolicyRefused, UsageFailure
 from teds_provision.station.groups import Groups
 from teds_provision.store import Store
-from teds_provision.store.lock import Mark, Taken
+from teds_provision.store.lock import Mark, MarkTaken
 from teds_provision.store.records import DetectionMode, KeptMeasurement
 
 FOLDER = "measuring"  # of the home: who measures what now
@@ -92,7 +92,7 @@ class Measurements:
             for uuid in sorted(set(uuids)):
                 try:
                     stack.enter_context(self._mark(uuid, what))
-                except Taken as taken:
+                except MarkTaken as taken:
                     raise PolicyRefused(f"Node {uuid.hex()} is held by {taken.holder}.", hint="Try again.") from taken
             yield
 

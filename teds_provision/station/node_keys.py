@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import NoKeyring, UnknownMaster, VaultChanged, VaultFailure, WrongPassphrase
-from teds_provision.station.identity import Identity
+from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant import Plant
 from teds_provision.station.seals import Seals
 from teds_provision.store import Holder, KeyRecord, Marks, Store, pages, utc_now
@@ -49,7 +49,7 @@ class NodeKeys:
         self,
         store: Store,
         vault: Callable[[], Vault],
-        identity: Identity,
+        identity: StationIdentity,
         seals: Seals,
         reopened: Callable[[], Vault],
         plant: Plant,

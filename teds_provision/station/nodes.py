@@ -14,12 +14,12 @@ from teds_provision.station.seals import Seals
 from teds_provision.store import (
     DatasheetRecord,
     Draft,
+    ExportFacts,
     Handed,
-    Known,
+    NodeOverview,
+    NodeReading,
     NodeRecord,
-    Reading,
     Search,
-    Shown,
     Store,
     pages,
 )
@@ -45,7 +45,7 @@ class Nodes:
         """All nodes, by UUID."""
         return self._store.nodes()
 
-    def each_shown(self) -> Iterator[Shown]:
+    def each_shown(self) -> Iterator[ExportFacts]:
         """Identity key of all nodes, and whether each was retired, by UUID, a page at a time."""
         return self._store.each_shown()
 
@@ -116,7 +116,7 @@ class Nodes:
         """UUIDs of the nodes that are meant, ascending; of all that is known, imported and merely listed ones too."""
         return self._store.find(search)
 
-    def overview(self, uuids: Sequence[bytes]) -> Iterator[Known]:
+    def overview(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
         """All that is known of these nodes, in their order, a page at a time."""
         return self._store.overview(uuids)
 
@@ -165,7 +165,7 @@ class Nodes:
 
     # -- readings --------------------------------------------------------------------------------------------------
 
-    def reading(self, uuid: bytes) -> Reading | None:
+    def reading(self, uuid: bytes) -> NodeReading | None:
         """What was read of a node last, which its verdict is judged from; None where nothing was."""
         return self._store.reading_of(uuid)
 
@@ -174,11 +174,11 @@ class Nodes:
         row = self.reading(uuid)
         return row is not None and row.in_session and not row.failed
 
-    def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, Reading]:
+    def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeReading]:
         """What was read last of a page of nodes, by UUID."""
         return self._store.readings_of(uuids)
 
-    def keep_reading(self, reading: Reading, image: Image | None = None, profile: str | None = None) -> bool:
+    def keep_reading(self, reading: NodeReading, image: Image | None = None, profile: str | None = None) -> bool:
         """Keep what was read of a node, with the datasheet where that is worth keeping, at one moment.
 
         Only a reading in a session replaces one made in a session: False where it did not.

@@ -11,7 +11,7 @@ from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.plant import Plant
 from teds_provision.station.seals import Seals
-from teds_provision.store import NodeRecord, Shown, Store, WhitelistEntry
+from teds_provision.store import ExportFacts, NodeRecord, Store, WhitelistEntry
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys
@@ -55,7 +55,7 @@ class Pins:
         """Fingerprint of every pinned UUID; ``nodes`` are all of the store where they have been read already."""
         return self.among(self._store.nodes() if nodes is None else nodes, self.whitelist())
 
-    def among(self, nodes: Iterable[NodeRecord | Shown], entries: Iterable[WhitelistEntry]) -> dict[bytes, str]:
+    def among(self, nodes: Iterable[NodeRecord | ExportFacts], entries: Iterable[WhitelistEntry]) -> dict[bytes, str]:
         """Fingerprint of each of these nodes and entries that is pinned, by UUID."""
         pins: dict[bytes, str] = {}
         for node in nodes:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import PolicyRefused, StoreChanged, StoreFailure
 from teds_provision.files import read_limited, write_whole
 from teds_provision.lazy import late
-from teds_provision.station.identity import Identity
+from teds_provision.station.identity import StationIdentity
 from teds_provision.station.seals import Seals
 from teds_provision.store import LineTables, Store, utc_now
 from teds_provision.store.tables.parcels import ParcelTables
@@ -82,7 +82,7 @@ class Plant:
     ``tables`` are its rows, ``parcels`` those of what leaves and comes, ``line`` those of jobs and proof.
     """
 
-    def __init__(self, store: Store, vault: Callable[[], Vault], identity: Identity, seals: Seals) -> None:
+    def __init__(self, store: Store, vault: Callable[[], Vault], identity: StationIdentity, seals: Seals) -> None:
         self.tables: Store = store
         self._vault = vault
         self.line: LineTables = store

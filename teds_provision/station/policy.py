@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import NotWhitelisted, PolicyRefused
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.station.identity import Identity
+from teds_provision.station.identity import StationIdentity
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
 from teds_provision.station.plant import Plant, SignerRules
 from teds_provision.station.seals import Seals
-from teds_provision.store import Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
+from teds_provision.store import RevocationRecord, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.store.records import TrustRole
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class Policy:
     """What this station trusts and refuses."""
 
     def __init__(
-        self, store: Store, identity: Identity, keys: NodeKeys, pins: Pins, seals: Seals, plant: Plant
+        self, store: Store, identity: StationIdentity, keys: NodeKeys, pins: Pins, seals: Seals, plant: Plant
     ) -> None:
         self._plant = plant
         self._store = store
@@ -121,19 +121,19 @@ class Policy:
 
     # -- nodes that are refused ------------------------------------------------------------------------------------
 
-    def revocations(self) -> list[Revocation]:
+    def revocations(self) -> list[RevocationRecord]:
         """The deny list, by UUID."""
         return self._store.revocations()
 
-    def revocation(self, uuid: bytes) -> Revocation | None:
+    def revocation(self, uuid: bytes) -> RevocationRecord | None:
         """Why a node is denied, None if it is not."""
         return self._store.revocation(uuid)
 
-    def revocations_of(self, uuids: Sequence[bytes]) -> dict[bytes, Revocation]:
+    def revocations_of(self, uuids: Sequence[bytes]) -> dict[bytes, RevocationRecord]:
         """Those of a page of nodes that are denied, with why."""
         return {one.uuid: one for one in self._store.revocations_of(uuids)}
 
-    def deny(self, revocation: Revocation) -> None:
+    def deny(self, revocation: RevocationRecord) -> None:
         """Put a node on the deny list."""
         self._store.put_revocation(revocation)
 
@@ -160,7 +160,7 @@ class Policy:
         names = (_digest(statement), event.hash_of_statement(statement)) if lifted else ()
         return any(name in lifted and self._seals.noted("lifted", name, lifted[name]) for name in names)
 
-    def denied(self, uuid: bytes, key: str | None) -> Revocation | None:
+    def denied(self, uuid: bytes, key: str | None) -> RevocationRecord | None:
         """Why a node with this key (fingerprint, None: not known) is denied; a ban of another key is none."""
         entry = self.revocation(uuid)
         return None if entry is None or (key and entry.fingerprint and not same_key(entry.fingerprint, key)) else entry

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import StoreChanged
-from teds_provision.store import Facts, NodeRecord, Shown, Store, TrustRecord, WhitelistEntry
+from teds_provision.store import ExportFacts, NodeRecord, StationRecord, Store, TrustRecord, WhitelistEntry
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
@@ -51,7 +51,7 @@ class Seals:
 
     # -- making ----------------------------------------------------------------------------------------------------
 
-    def facts(self, facts: Facts) -> Facts:
+    def facts(self, facts: StationRecord) -> StationRecord:
         """The station's facts with their seal, and a seal key if there is none yet."""
         if facts.seal_key is None:
             key = os.urandom(_KEY_OCTETS)
@@ -91,7 +91,7 @@ class Seals:
             raise changed([f"the whitelist entry of {entry.uuid.hex()}"], "Take it off the whitelist, and add it anew.")
         return entry
 
-    def check_point(self, node: NodeRecord | Shown) -> None:
+    def check_point(self, node: NodeRecord | ExportFacts) -> None:
         """Raise StoreChanged where a node's sealed identity key was changed."""
         bad = node.point is not None and node.point_mac is not None
         if bad and self.active and not self._holds(node.point_mac, "node", (node.uuid, node.point)):
@@ -223,7 +223,7 @@ def _keyed(key: bytes) -> hmac.HMAC:
     return hmac.new(key, digestmod="sha256")
 
 
-def _facts(facts: Facts) -> _Values:
+def _facts(facts: StationRecord) -> _Values:
     # The last is the column taken_over, which is no longer written: seals that were made over it go on holding.
     return (facts.requested, facts.point, facts.ca, facts.signature, None)
 

@@ -31,7 +31,7 @@ from teds_provision import vault as vaults
 from teds_provision.errors import NotFound, UnknownMaster, VaultFailure
 from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
-from teds_provision.station.identity import DEFAULT_NAME, Identity
+from teds_provision.station.identity import DEFAULT_NAME, StationIdentity
 from teds_provision.station.measurements import Measurements
 from teds_provision.station.node_keys import NodeKey, NodeKeys
 from teds_provision.station.nodes import Nodes
@@ -113,7 +113,7 @@ class Station:
         """Whether what ``unlock`` holds open opens the vault; False where the passphrase itself is asked for."""
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
         self.seals = Seals(store, self._opened, tell)
-        self.identity = Identity(store, self._opened, self.seals)
+        self.identity = StationIdentity(store, self._opened, self.seals)
         self.plant = Plant(store, self._opened, self.identity, self.seals)
         self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened, self.plant)
         self.pins = Pins(store, self.keys, self.seals, self.plant)

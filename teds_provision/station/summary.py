@@ -24,14 +24,14 @@ class ChannelSummary:
 
 
 @dataclass(frozen=True)
-class Summary:
+class NodeSummary:
     """Name of the node and its channels, as its datasheet says."""
 
     name: str | None
     channels: tuple[ChannelSummary, ...]
 
 
-def summarise(image: Image, units: Mapping[int, str] | None = None) -> Summary:
+def summarise(image: Image, units: Mapping[int, str] | None = None) -> NodeSummary:
     """Decode what a person wants to see; never raises on any octets.
 
     ``units``: in which ones the values of channels are shown, where that is not for the datasheet to say.
@@ -40,7 +40,7 @@ def summarise(image: Image, units: Mapping[int, str] | None = None) -> Summary:
     channels = [
         _channel(image, channel, shown.get(channel, "")) for channel, code in image if code == AccessCode.CHANNEL
     ]
-    return Summary(_name(image, 0), tuple(channels))
+    return NodeSummary(_name(image, 0), tuple(channels))
 
 
 def _name(image: Image, channel: int) -> str | None:

@@ -22,10 +22,10 @@ from teds_provision.steps.adopting import Adopt, brought_by, nobody_adopts
 from teds_provision.steps.agree import TakeOver
 from teds_provision.steps.batch_sheet import (
     About,
-    Board,
+    BatchTotals,
+    BoardResult,
     Progress,
-    Row,
-    Totals,
+    SheetRow,
     check_report,
     mean_steps,
     read_sheet,
@@ -45,12 +45,12 @@ from teds_provision.steps.build import (
     propose,
 )
 from teds_provision.steps.identify import Identified, examine
-from teds_provision.steps.provision import Accept, Line, Provisioned, inspect, provision
+from teds_provision.steps.provision import Accept, ProductionLine, Provisioned, inspect, provision
 from teds_provision.steps.read import survey
 from teds_provision.steps.reading import verdict_of
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
-from teds_provision.talk.meeting import Patience, meet, onward, refuse_twins, watch_nodes, without_twins
+from teds_provision.talk.meeting import IdleStop, meet, onward, refuse_twins, watch_nodes, without_twins
 from teds_provision.talk.progress import OfNode, Reporter
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
@@ -62,7 +62,7 @@ _SHOWN: Final = 5
 
 
 @dataclass(frozen=True)
-class Request:
+class ProvisionRequest:
     """What ``provision`` is asked for: one node (None: the one that is there), or many.
 
     ``watch``: tap after tap. ``everyone``: every node of the bus that is not finished. ``sheet``: what each board gets.
@@ -105,7 +105,7 @@ class Questions:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ProvisionPlan:
     """What ``provision`` would do (``--dry-run``): its steps, and the changes in physical units, a sentence each."""
 
     uuid: bytes
@@ -125,10 +125,10 @@ class Boards:
         self,
         station: Station,
         links: LinkSettings,
-        request: Request,
+        request: ProvisionRequest,
         reporter: Reporter,
         *,
-        line: Line | None = None,
+        line: ProductionLine | None = None,
     ) -> None:
         self._station, self._request, self._reporter = station, request, reporter
         self._links = replace(links, via_chosen=True)  # a new board is tapped, unless a bus is named
@@ -143,10 +143,10 @@ class Boards:
             named_for(station, self.node, self.prepared)
         self.progress = _progress(station, request, order)
         self.expected = 0  # how many boards of a bus are worked on, once they were found
-        self.stop = Patience(links.timeout if self.progress is not None and not request.watch else None)
+        self.stop = IdleStop(links.timeout if self.progress is not None and not request.watch else None)
         self._turn = threading.Lock()
-        self._rows: dict[bytes, Row] = {}
-        self._boards: list[Board] = []
+        self._rows: dict[bytes, SheetRow] = {}
+        self._boards: list[BoardResult] = []
         self._began = time.monotonic()
 
     @property
@@ -167,12 +167,12 @@ class Boards:
         with meet(self._station, self._links, self.node, self._reporter, before=self._station.unlock) as node:
             return self._provision(node, questions)
 
-    def plan(self) -> Plan:
+    def plan(self) -> ProvisionPlan:
         """Look at the one node, plainly, and say what would be done; changes nothing anywhere."""
         with meet(self._station, self._links, self.node, self._reporter) as node:
             return self._plan_for(node)
 
-    def _plan_for(self, node: Conversation) -> Plan:
+    def _plan_for(self, node: Conversation) -> ProvisionPlan:
         who = examine(self._station, node)
         steps = ["identify"]
         steps += [] if who.whitelisted else ["whitelist"]
@@ -181,12 +181,12 @@ class Boards:
         named = named_for(self._station, who.uuid, self._for(who))
         if named.order.adopt and found.identity.state != NodeState.PROVISIONED:
             brought = brought_by(self._station, found.image, name=named.order.name)
-            return Plan(who.uuid, who.state, (*steps, *_AFTER), (), (*brought.errors, *brought.warnings))
+            return ProvisionPlan(who.uuid, who.state, (*steps, *_AFTER), (), (*brought.errors, *brought.warnings))
         proposal = propose(self._station, named, found, record=False)
         changes = tuple(change.text for change in proposal.changes)
         other = () if named.order.retype else differences(found.image.blocks, proposal.image)
         steps += _AFTER
-        return Plan(who.uuid, who.state, tuple(steps), changes, merged((*proposal.warnings, *other)))
+        return ProvisionPlan(who.uuid, who.state, tuple(steps), changes, merged((*proposal.warnings, *other)))
 
     # -- many ------------------------------------------------------------------------------------------------------
 
@@ -224,20 +224,20 @@ class Boards:
         return self.line is not None and self.line.total > 0
 
     @property
-    def next_row(self) -> Row | None:
+    def next_row(self) -> SheetRow | None:
         """The row that the next board may be of."""
         return self.progress.next_row if self.progress is not None else None
 
-    def board_of(self, row: Row) -> str | None:
+    def board_of(self, row: SheetRow) -> str | None:
         """UUID of the board that had this row before, None where none had."""
         return self.progress.board_of(row) if self.progress is not None else None
 
-    def row(self, number: int) -> Row:
+    def row(self, number: int) -> SheetRow:
         """The row of the sheet with that number, from 1."""
         assert self.progress is not None
         return self.progress.sheet.rows[number - 1]
 
-    def plans(self) -> Iterator[Plan | Board]:
+    def plans(self) -> Iterator[ProvisionPlan | BoardResult]:
         """The plan of every node of the bus that is meant, one after the other; a board that was refused says why."""
         port = open_port(self._links)
         try:
@@ -251,12 +251,12 @@ class Boards:
                     error = lost.cause
                 except TedsProvisionError as failure:
                     error = failure
-                self._boards.append(Board(uuid, time.monotonic() - began, None, error, None, port.place))
+                self._boards.append(BoardResult(uuid, time.monotonic() - began, None, error, None, port.place))
                 yield self._boards[-1]
         finally:
             port.close()
 
-    def many(self, questions: Questions) -> Iterator[Board]:
+    def many(self, questions: Questions) -> Iterator[BoardResult]:
         """Provision board after board, or all at once; one that fails does not end it. At the end comes the report."""
         try:
             if self.progress is not None and not self.progress.open:
@@ -274,7 +274,7 @@ class Boards:
         station = self._station
         return About(station.name, station.fingerprint, operator, f"teds-provision {__version__}")
 
-    def totals(self) -> Totals:
+    def totals(self) -> BatchTotals:
         """What it came to: the whole sheet over all runs, or the nodes of this run."""
         if self.progress is not None:
             if self.stop.ran_out:
@@ -285,21 +285,21 @@ class Boards:
         passed, seconds = results.count("passed"), round(time.monotonic() - self._began, 3)
         share = round(passed / len(results), 4) if results else None
         skipped = results.count("skipped")
-        return Totals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), self.worst)
+        return BatchTotals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), self.worst)
 
-    def _as_they_come(self, questions: Questions) -> Iterator[Board]:
+    def _as_they_come(self, questions: Questions) -> Iterator[BoardResult]:
         for arrival in watch_nodes(
             self._links, lambda node: self._provision(node, questions), self._reporter, self.stop
         ):
             row = self._rows.pop(arrival.uuid, None)
             number = row.number if row is not None else None
-            board = Board(arrival.uuid, arrival.seconds, arrival.result, arrival.error, number, arrival.place)
+            board = BoardResult(arrival.uuid, arrival.seconds, arrival.result, arrival.error, number, arrival.place)
             self.stop.renew()
             yield board
             if self.progress is not None and not (self.progress.open if self._request.watch else self.progress.untried):
                 self.stop.set()
 
-    def _all_at_once(self, questions: Questions) -> Iterator[Board]:
+    def _all_at_once(self, questions: Questions) -> Iterator[BoardResult]:
         port = open_port(self._links)
         try:
             everyone, contacts = self._on_the_bus(port)
@@ -320,7 +320,7 @@ class Boards:
             self._require_known(found)
         return everyone, contacts
 
-    def _side_by_side(self, port: Port, contacts: list[Contact], questions: Questions) -> Iterator[Board]:
+    def _side_by_side(self, port: Port, contacts: list[Contact], questions: Questions) -> Iterator[BoardResult]:
         """Each of these nodes in a thread, as many at a time as the bus and the token bear, until ``stop`` is set."""
         token = self._station.identity.keystore.startswith("pkcs11:")
         workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.max_parallel, len(contacts)))
@@ -369,7 +369,7 @@ class Boards:
         image = self._station.nodes.datasheet(uuid)
         return image is not None and self._lacks_calibration(uuid, image) is not None
 
-    def _board(self, contact: Contact, place: str, questions: Questions) -> Board:
+    def _board(self, contact: Contact, place: str, questions: Questions) -> BoardResult:
         began, uuid = time.monotonic(), contact.identity.uuid
         done: Provisioned | None = None
         error: TedsProvisionError | None = None
@@ -384,7 +384,7 @@ class Boards:
         except SessionLost as lost:
             error = lost.cause
         row = self._rows.pop(uuid, None)
-        return Board(uuid, time.monotonic() - began, done, error, row.number if row is not None else None, place)
+        return BoardResult(uuid, time.monotonic() - began, done, error, row.number if row is not None else None, place)
 
     # -- both ------------------------------------------------------------------------------------------------------
 
@@ -457,7 +457,7 @@ class Boards:
             self.progress.take(row, who.uuid)
         return row.prepared
 
-    def _note(self, board: Board) -> None:
+    def _note(self, board: BoardResult) -> None:
         self._boards.append(board)
         if self.progress is not None and board.row is not None:
             row = self.row(board.row)
@@ -467,7 +467,7 @@ class Boards:
                 self.progress.note(row, board)
 
 
-def _progress(station: Station, request: Request, order: BuildOrder) -> Progress | None:
+def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) -> Progress | None:
     """The sheet that was named, with what became of it in earlier runs; None without one."""
     if request.sheet is None:
         return None
@@ -477,7 +477,7 @@ def _progress(station: Station, request: Request, order: BuildOrder) -> Progress
     return Progress(station.home, sheet)
 
 
-def _require_consistent(request: Request, links: LinkSettings) -> None:
+def _require_consistent(request: ProvisionRequest, links: LinkSettings) -> None:
     if request.node is not None and request.several:
         raise UsageFailure(
             "A node is named, and many are asked for.", hint="Name the node, or say --watch, --batch or --all."

@@ -52,7 +52,7 @@ class Declined(PolicyRefused):
 
 
 @dataclass(frozen=True)
-class Board:
+class BoardResult:
     """The end of one board: what was done, or the error that ended it. ``row`` is that of a sheet, from 1."""
 
     uuid: bytes
@@ -83,7 +83,7 @@ class Board:
 
 
 @dataclass(frozen=True)
-class Totals:
+class BatchTotals:
     """What a batch came to: boards by result, seconds, and the share that passed at their first try (None: no try).
 
     ``steps`` are the mean seconds of each step over the boards that passed.
@@ -135,7 +135,7 @@ _FINGERPRINT = re.compile("[0-9a-f]{32,64}")
 
 
 @dataclass(frozen=True)
-class Row:
+class SheetRow:
     """One board of the sheet: ``number`` counts from 1, ``line`` is that of the file."""
 
     number: int
@@ -166,11 +166,11 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class BatchSheet:
     """All rows of one file, each found good."""
 
     path: Path
-    rows: tuple[Row, ...]
+    rows: tuple[SheetRow, ...]
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -184,7 +184,7 @@ class Sheet:
         return tuple(f"Row{'s' if len(rows) > 1 else ''} {_numbers(rows)}: {why}" for why, rows in found.items())
 
 
-def read_sheet(station: Station, path: Path, order: BuildOrder) -> Sheet:
+def read_sheet(station: Station, path: Path, order: BuildOrder) -> BatchSheet:
     """Read a sheet, and read, fit and guard all that it names; ``order`` is what rows get that leave it out.
 
     Raises NotFound (no such file), BadData with every line that is wrong.
@@ -198,7 +198,7 @@ def read_sheet(station: Station, path: Path, order: BuildOrder) -> Sheet:
         raise BadData(f"{shown}{more}.", hint="Nothing was provisioned. Mend the sheet and run the same command again.")
     if not reading.rows:
         raise BadData(f"{path} has no row.", hint=f"A header ({', '.join(COLUMNS)}) and a line per board.")
-    return Sheet(path, tuple(reading.rows))
+    return BatchSheet(path, tuple(reading.rows))
 
 
 def _numbers(numbers: Sequence[int]) -> str:
@@ -210,7 +210,7 @@ def _numbers(numbers: Sequence[int]) -> str:
 class _Reading:
     def __init__(self, station: Station, path: Path, order: BuildOrder) -> None:
         self.station, self.path, self.order = station, path, order
-        self.rows: list[Row] = []
+        self.rows: list[SheetRow] = []
         self.mistakes: dict[str, list[int]] = {}
         self.count = 0
         self._seen: dict[tuple[str, str], int] = {}
@@ -270,7 +270,7 @@ class _Reading:
         if self.count == before and prepared is not None:
             digest = hashlib.sha256("\0".join(cells).encode()).hexdigest()
             number = len(self.rows) + 1
-            self.rows.append(Row(number, line, bytes.fromhex(uuid) if uuid else None, pin, prepared, digest))
+            self.rows.append(SheetRow(number, line, bytes.fromhex(uuid) if uuid else None, pin, prepared, digest))
 
     def _take_label(self, line: int, values: dict[str, str]) -> None:
         """A label that was scanned into the cell of UUID or fingerprint says both; another cell may not contradict."""
@@ -353,7 +353,7 @@ class Attempted:
 class Progress:
     """The rows of one sheet with what became of them; durable after each board."""
 
-    def __init__(self, home: Path, sheet: Sheet) -> None:
+    def __init__(self, home: Path, sheet: BatchSheet) -> None:
         self.sheet = sheet
         name = hashlib.sha256(str(sheet.path.resolve()).encode()).hexdigest()[:32]
         self._path = home / FOLDER / f"{name}.json"
@@ -372,7 +372,7 @@ class Progress:
         return rows if isinstance(rows, dict) else {}
 
     @staticmethod
-    def _attempted(row: Row, kept: Any) -> Attempted:
+    def _attempted(row: SheetRow, kept: Any) -> Attempted:
         if not isinstance(kept, dict) or kept.get("digest") != row.digest:
             return Attempted(row.digest)
         try:
@@ -380,7 +380,7 @@ class Progress:
         except TypeError:  # of another version of this tool
             return Attempted(row.digest)
 
-    def save(self, *changed: Row) -> None:
+    def save(self, *changed: SheetRow) -> None:
         """Put these rows (all, where none is named) onto the disk, beside what another run of this sheet put there.
 
         Raises StoreFailure.
@@ -416,22 +416,22 @@ class Progress:
         write_whole(self._path, json.dumps(told, indent=1).encode())
 
     @property
-    def open(self) -> list[Row]:
+    def open(self) -> list[SheetRow]:
         """The rows whose board has not passed."""
         return [row for row in self.sheet.rows if self.rows[row.number].result != "passed"]
 
     @property
-    def untried(self) -> list[Row]:
+    def untried(self) -> list[SheetRow]:
         """The open rows that nobody tried in this run."""
         return [row for row in self.open if row.number not in self._tried]
 
     @property
-    def next_row(self) -> Row | None:
+    def next_row(self) -> SheetRow | None:
         """The row that the next board may be of."""
         rows = self.untried or self.open
         return rows[0] if rows else None
 
-    def row_for(self, uuid: bytes, fingerprint: str, *, busy: Collection[int] = ()) -> Row | None:
+    def row_for(self, uuid: bytes, fingerprint: str, *, busy: Collection[int] = ()) -> SheetRow | None:
         """The row of a board: that which names it or had it before, else the next in the order of the taps.
 
         One that had no board goes before one whose board did not pass: that is for a spare, once nothing else is left.
@@ -445,11 +445,11 @@ class Progress:
             rows, key=lambda row: (self.rows[row.number].uuid is not None, row.number in self._tried), default=None
         )
 
-    def board_of(self, row: Row) -> str | None:
+    def board_of(self, row: SheetRow) -> str | None:
         """The board that has the row, or was turned away from it in this run; None where there was none."""
         return self.rows[row.number].uuid or self._turned_away.get(row.number)
 
-    def take(self, row: Row, uuid: bytes) -> None:
+    def take(self, row: SheetRow, uuid: bytes) -> None:
         """Note that this board is the row's, before anything is done with it.
 
         Raises NodeBusy where another run of this sheet has given the row to another board meanwhile.
@@ -468,11 +468,11 @@ class Progress:
             attempted.uuid = uuid.hex()
             self._write()
 
-    def turn_away(self, row: Row, uuid: bytes) -> None:
+    def turn_away(self, row: SheetRow, uuid: bytes) -> None:
         """Note that this board was not given what the row says; the row stays free, and is tried again with it."""
         self._turned_away[row.number] = uuid.hex()
 
-    def not_this_board(self, row: Row, board: Board) -> None:
+    def not_this_board(self, row: SheetRow, board: BoardResult) -> None:
         """Note that another type of board was tapped for this row: nothing was written, the row waits for its own."""
         attempted = self.rows[row.number]
         attempted.uuid, attempted.time = None, board.time
@@ -480,7 +480,7 @@ class Progress:
         self.worst = worse(self.worst, board.failure)
         self.save(row)
 
-    def note(self, row: Row, board: Board) -> None:
+    def note(self, row: SheetRow, board: BoardResult) -> None:
         """Note how a board ended."""
         attempted = self.rows[row.number]
         attempted.tries += board.result != "skipped"  # a "no" says nothing of the board
@@ -501,13 +501,13 @@ class Progress:
             missed = ", ".join(str(row.number) for row in self.untried[:10])
             self.worst = worse(self.worst, NoNode(f"No board came within {seconds:.0f} s for row {missed}."))
 
-    def totals(self) -> Totals:
+    def totals(self) -> BatchTotals:
         """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""
         rows = list(self.rows.values())
         results = Counter(row.result for row in rows)
         passed, failed = results["passed"], results["failed"]
         firsts = [row.first for row in rows if row.tries and row.result != "skipped"]
-        return Totals(
+        return BatchTotals(
             passed,
             failed,
             len(rows) - passed - failed,
@@ -578,7 +578,7 @@ def _rows(progress: Progress) -> list[tuple[str, ...]]:
     return told
 
 
-def _totals(totals: Totals) -> list[tuple[str, str]]:
+def _totals(totals: BatchTotals) -> list[tuple[str, str]]:
     share = "" if totals.first_pass is None else f"{totals.first_pass:.4f}"
     told = [
         ("passed", str(totals.passed)),
@@ -590,7 +590,7 @@ def _totals(totals: Totals) -> list[tuple[str, str]]:
     return told + [(f"seconds of {name}", f"{seconds:.4f}") for name, seconds in totals.steps.items()]
 
 
-def _csv(rows: Sequence[Sequence[str]], totals: Totals) -> str:
+def _csv(rows: Sequence[Sequence[str]], totals: BatchTotals) -> str:
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_HEAD)
@@ -605,7 +605,7 @@ def _tame(cell: str) -> str:
     return f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell
 
 
-def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals, about: About) -> str:
+def _html(name: str, rows: Sequence[Sequence[str]], totals: BatchTotals, about: About) -> str:
     head = "".join(f"<th>{html.escape(cell.replace('_', ' '))}</th>" for cell in _HEAD)
     body = "".join(
         f'<tr class="{html.escape(row[_RESULT])}">'
@@ -627,7 +627,7 @@ def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals, about: About
     )
 
 
-def _sums(totals: Totals) -> list[tuple[str, str]]:
+def _sums(totals: BatchTotals) -> list[tuple[str, str]]:
     share = "none was tried" if totals.first_pass is None else f"{totals.first_pass:.1%}"
     counts = [("passed", totals.passed), ("failed", totals.failed), ("skipped or not reached", totals.skipped)]
     told = [(what, str(count)) for what, count in counts]

@@ -23,7 +23,7 @@ from teds_provision.protocol.operation.commands import (
     OPERATION,
     ChannelState,
     Operate,
-    Operation,
+    OperationReply,
     Sampled,
     idle,
     sample,
@@ -33,7 +33,7 @@ from teds_provision.steps.read import list_blocks, read_block
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import SampleForm
-from teds_provision.teds.channel import Kind
+from teds_provision.teds.channel import ChannelKind
 from teds_provision.teds.codec.model import AccessCode, Units
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile.model import ChannelProfile, Profile
@@ -143,7 +143,7 @@ _AMPERE: Final = units_of(amperes=1)
 
 
 def _kind(kind: int | None) -> str:
-    return f"an {Kind(kind).word}" if kind in (Kind.ACTUATOR, Kind.EVENT_SENSOR) else "a sensor"
+    return f"an {ChannelKind(kind).word}" if kind in (ChannelKind.ACTUATOR, ChannelKind.EVENT_SENSOR) else "a sensor"
 
 
 def _form(form: tuple[int, int]) -> str:
@@ -260,7 +260,7 @@ def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
 
 
 def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: bytes) -> Iterator[dict[str, Any]]:
-    told = Operation.decode(node.send(OPERATION, "to tell its mode")).channels
+    told = OperationReply.decode(node.send(OPERATION, "to tell its mode")).channels
     taken = {number for number, (state, _) in told.items() if state & ChannelState.CLAIMED_BY_OTHER}
     free = [one for one in sensors if one.number not in taken]
     readers = {one.number: ChannelInterpreter(sheet, one.number) for one in free}

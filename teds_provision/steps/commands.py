@@ -27,7 +27,7 @@ from teds_provision.errors import (
 from teds_provision.files import read_limited
 from teds_provision.links import LINKS, LinkSettings, Notice
 from teds_provision.links.ports import OnABus
-from teds_provision.protocol.datasheet import SEQUENCE_WINDOW, NodeKeys
+from teds_provision.protocol.datasheet import SEQUENCE_WINDOW, SignedNodeKey
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
@@ -135,7 +135,7 @@ def read_image_file(path: Path) -> Image:
 
 
 @dataclass(frozen=True)
-class Found:
+class ProvenNode:
     """A node that proved its key; ``identity`` is its plain Identify, a hint."""
 
     who: Identified
@@ -155,7 +155,7 @@ def identify_at(
     add: bool = False,
     watch: bool = False,
     stop: threading.Event | None = None,
-) -> Iterator[Arrival[Found]]:
+) -> Iterator[Arrival[ProvenNode]]:
     """Identify who is there, or (``watch``) whoever comes until ``stop``; ``add`` whitelists what proves its key.
 
     With ``watch`` an error ends one node only. Without it that is so where another node was identified, and it is told
@@ -170,7 +170,7 @@ def identify_at(
     identified = False
     with meet_everyone(links, reporter) as nodes:
         for node, found in _side_by_side(nodes, lambda node: _identified(station, node, add)):
-            if isinstance(found, Found):
+            if isinstance(found, ProvenNode):
                 identified = True
                 yield Arrival(node.uuid, links.places[0], 0.0, found)
                 continue
@@ -183,11 +183,11 @@ def identify_at(
 
 
 def _side_by_side(
-    nodes: list[Conversation], work: Callable[[Conversation], Found]
-) -> Iterator[tuple[Conversation, Found | TedsProvisionError]]:
+    nodes: list[Conversation], work: Callable[[Conversation], ProvenNode]
+) -> Iterator[tuple[Conversation, ProvenNode | TedsProvisionError]]:
     """What became of each node, in their order: as many at a time as the link bears, as a mute one takes 40 s."""
 
-    def one(node: Conversation) -> Found | TedsProvisionError:
+    def one(node: Conversation) -> ProvenNode | TedsProvisionError:
         try:
             return work(node)
         except TedsProvisionError as error:
@@ -204,7 +204,7 @@ def _side_by_side(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _identified(station: Station, node: Conversation, add: bool) -> Found:
+def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
     who = identify(station, node)
     described = describe(node)
     entry = who.whitelisted
@@ -223,7 +223,7 @@ def _identified(station: Station, node: Conversation, add: bool) -> Found:
         station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
     charging = node.contact.charging.to_json() if node.contact.charging else None
     ble = node.contact.ble.text if node.contact.ble else None
-    return Found(who, node.identity, entry is not None, described.channels, name, charging, ble)
+    return ProvenNode(who, node.identity, entry is not None, described.channels, name, charging, ble)
 
 
 # -- agree, address ----------------------------------------------------------------------------------------------------
@@ -716,7 +716,7 @@ def bring_back(
         changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
         signed = sign(
             station,
-            NodeKeys(uuid, visit.who.point, visit.who.key_signature),
+            SignedNodeKey(uuid, visit.who.point, visit.who.key_signature),
             image,
             epoch=present.identity.epoch,
             node_sequence=present.identity.sequence,

@@ -15,11 +15,11 @@ from teds_provision.errors import NotFound, PolicyRefused
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.store import Known, Search
+from teds_provision.store import NodeOverview, Search
 
 if TYPE_CHECKING:
     from teds_provision.steps import reading
-    from teds_provision.steps.reading import Judged
+    from teds_provision.steps.reading import NodeVerdict
     from teds_provision.teds.fits import Fit, Requirement
 else:  # cryptography: a list of nodes that nobody verified yet needs none
     reading = late("teds_provision.steps.reading")
@@ -60,7 +60,7 @@ def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[dict[str, An
     return (node for node, _ in with_verdicts(station, uuids))
 
 
-def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[dict[str, Any], Judged | None]]:
+def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[dict[str, Any], NodeVerdict | None]]:
     """As :func:`inventory`, each with the whole verdict; None where no datasheet of the node was read."""
     known = station.nodes.overview(uuids)
     while page := list(islice(known, PAGE)):
@@ -71,7 +71,7 @@ def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[di
             yield _described(one, found), found
 
 
-def _described(known: Known, judged: Judged | None) -> dict[str, Any]:
+def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any]:
     node, entry, moved, revoked = known.node or {}, known.whitelist or {}, known.moved, known.revoked
     point = node.get("point")
     groups = list(dict.fromkeys((*json.loads(node.get("groups", "[]")), *known.groups)))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError
-from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
@@ -74,7 +74,7 @@ class Provisioned:
     """One reading of each sensor at the end: channel, name, value and unit (SI), valid."""
 
 
-def inspect(station: Station, node: Conversation, line: Line, reporter: Reporter) -> Provisioned:
+def inspect(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> Provisioned:
     """Test one board that another station made: identify, verify, check; nothing is written, proof is left.
 
     Raises what :func:`provision` raises; a board that is not authentic is told by its verdict.
@@ -120,7 +120,7 @@ class Unit(Protocol):
     prepared: Prepared
     """What it gets, its name included."""
 
-    def sign(self, node: Conversation, keys: NodeKeys, proposal: Proposal, present: Survey) -> Signed | None:
+    def sign(self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: Survey) -> Signed | None:
         """The datasheet signed elsewhere; None where this station signs."""
 
     def ended(self, node: Conversation, done: Provisioned) -> None:
@@ -132,7 +132,7 @@ class Unit(Protocol):
         """Leave proof of an attempt that ended with an error in ``step``, as far as the board still answers."""
 
 
-class Line(Protocol):
+class ProductionLine(Protocol):
     """What every board of a run belongs to."""
 
     @property
@@ -182,7 +182,7 @@ def provision(
     low: Low = wait_for_charge,
     take_over: TakeOver | None = None,
     retype: Retype | None = None,
-    line: Line | None = None,
+    line: ProductionLine | None = None,
     adopt: Adopt = nobody_adopts,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
@@ -217,7 +217,7 @@ class _Run:
         low: Low,
         take_over: TakeOver | None,
         retype: Retype | None,
-        line: Line | None,
+        line: ProductionLine | None,
         adopt: Adopt,
     ) -> None:
         self.station, self.node, self.order = station, node, order
@@ -343,7 +343,7 @@ class _Run:
 
     def _sign(self, who: Identified, proposal: Proposal, present: Survey) -> Signed:
         with self.steps.step("sign") as step:
-            keys = NodeKeys(who.uuid, who.point, who.key_signature)
+            keys = SignedNodeKey(who.uuid, who.point, who.key_signature)
             elsewhere = None if self.unit is None else self.unit.sign(self.node, keys, proposal, present)
             if elsewhere is not None:
                 step.result = NOTHING if elsewhere.reused else DONE

@@ -30,7 +30,7 @@ from teds_provision.steps.verify import (
     session,
     what_octets_say,
 )
-from teds_provision.store import Reading, utc_now
+from teds_provision.store import NodeReading, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, Image
 
@@ -40,7 +40,7 @@ _IN_SESSION = "opened under the key that is held here"
 
 
 @dataclass(frozen=True)
-class Judged:
+class NodeVerdict:
     """The verdict on a node, and what it rests on.
 
     ``origin``: every TEDS was read in a ``session`` since the node last started; or ``kept``: the Security TEDS was,
@@ -69,7 +69,7 @@ def keep(
     c: bytes | None = None,
     more: Sequence[Check] = (),
     profile: str | None = None,
-) -> Judged:
+) -> NodeVerdict:
     """Keep what was read of a node, all of it; the datasheet too, where it was read in a session and is worth it.
 
     ``c`` is that of the session in which the reading began, where the one that is open now may be a later one. ``more``
@@ -78,7 +78,7 @@ def keep(
     said, signers = what_octets_say(image, known)
     octets = [*said, *more]
     c = (c or node.c) if node.sealed else None
-    row = Reading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
+    row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
     judged = _judged(station, row, keyed=is_keyed(station, image.uuid))
     worth = c is not None and judged.verified.verdict != "not authentic"  # else what it had stays known
     station.nodes.keep_reading(row, image if worth else None, profile)
@@ -89,7 +89,7 @@ def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) 
     """Keep the Security TEDS that a node showed in no session: its key, for who builds; it is no datasheet."""
     image = Image(uuid, {SECURITY: security_teds})
     signers = what_octets_say(image, None)[1]
-    station.nodes.keep_reading(Reading(uuid, utc_now(), by, None, False, _packed(image), *signers))
+    station.nodes.keep_reading(NodeReading(uuid, utc_now(), by, None, False, _packed(image), *signers))
 
 
 def is_known(station: Station, node: Conversation, image: Image) -> bool:
@@ -123,7 +123,7 @@ def stands(station: Station, node: Conversation, security_teds: bytes, known: Kn
     return image
 
 
-def verdict_of(station: Station, uuid: bytes) -> Judged | None:
+def verdict_of(station: Station, uuid: bytes) -> NodeVerdict | None:
     """The verdict on a node today: from its row of reading; None where no datasheet of it was read."""
     row = station.nodes.reading(uuid)
     if row is None or not row.is_datasheet:
@@ -136,7 +136,7 @@ def is_keyed(station: Station, uuid: bytes) -> bool:
     return bool(station.keys.held(uuid)) and station.policy.tombstone(uuid) is None
 
 
-def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]) -> dict[bytes, Judged]:
+def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]) -> dict[bytes, NodeVerdict]:
     """As :func:`verdict_of`, of a page of nodes; ``keyed`` are those of which a key is held."""
     rows = [row for row in station.nodes.readings_of(uuids).values() if row.is_datasheet]
     if not rows:
@@ -151,14 +151,14 @@ def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]
     return found
 
 
-def _judged_or_not(station: Station, row: Reading, *, keyed: bool) -> Judged:
+def _judged_or_not(station: Station, row: NodeReading, *, keyed: bool) -> NodeVerdict:
     try:
         return _judged(station, row, keyed=keyed)
     except StoreChanged as error:
-        return Judged(Verified(row.uuid, (Check("node key", "failed", error.message),)), "plain", row.at, row.by)
+        return NodeVerdict(Verified(row.uuid, (Check("node key", "failed", error.message),)), "plain", row.at, row.by)
 
 
-def _judged(station: Judging, row: Reading, *, keyed: bool) -> Judged:
+def _judged(station: Judging, row: NodeReading, *, keyed: bool) -> NodeVerdict:
     signers = Signers(row.node_key, row.node_key_signature, row.station_key, row.station_key_signature)
     checks = judge(station, row.uuid, _read(row.checks), signers, digests_of(row).get(SECURITY))
     if row.station_key is None and all(check.result != "failed" for check in checks):  # a row of no reading of ours
@@ -169,10 +169,10 @@ def _judged(station: Judging, row: Reading, *, keyed: bool) -> Judged:
     if not row.whole:
         checks = [check._replace(kept=True) if check.name in ABOUT_THE_REST else check for check in checks]
     origin: Origin = "plain" if not row.in_session else "session" if row.whole else "kept"
-    return Judged(Verified(row.uuid, tuple(checks)), origin, row.at, row.by)
+    return NodeVerdict(Verified(row.uuid, tuple(checks)), origin, row.at, row.by)
 
 
-def digests_of(row: Reading) -> dict[tuple[int, int], bytes]:
+def digests_of(row: NodeReading) -> dict[tuple[int, int], bytes]:
     """The digest of each TEDS that was read, by channel and access code."""
     places = range(0, len(row.digests), _DIGEST)
     parts = [row.digests[place : place + _DIGEST] for place in places]

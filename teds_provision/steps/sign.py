@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
 from teds_provision.protocol.datasheet import (
-    NodeKeys,
+    SignedNodeKey,
     can_be_stored,
     digests,
     passes_own_check,
@@ -42,15 +42,15 @@ class Signed:
         return signature
 
 
-def node_keys_of(uuid: bytes, security_teds: bytes) -> NodeKeys:
+def node_keys_of(uuid: bytes, security_teds: bytes) -> SignedNodeKey:
     """Take fields 101 and 102 from a Security TEDS of the node; raises BadData where 102 is not over this UUID."""
     shown = security.decode(security_teds)
     if not node_key_good(uuid, shown.node_key, shown.node_key_signature):
         raise BadData(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
-    return NodeKeys(uuid, shown.node_key, shown.node_key_signature)
+    return SignedNodeKey(uuid, shown.node_key, shown.node_key_signature)
 
 
-def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -> NodeKeys:
+def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -> SignedNodeKey:
     """The node's key and its signature, from the image at hand or from what was last read; raises NotFound."""
     for source in (image, known_image(station, uuid)):
         if source is not None and source.security is not None:
@@ -62,7 +62,7 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
         if not node_key_good(uuid, row.node_key, row.node_key_signature):
             raise BadData(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
         station.pins.check(uuid, row.node_key)
-        return NodeKeys(uuid, row.node_key, row.node_key_signature)
+        return SignedNodeKey(uuid, row.node_key, row.node_key_signature)
     raise NotFound(
         f"The key of node {uuid.hex()} is not known yet.",
         hint="Identify it first: teds-provision identify",
@@ -74,7 +74,7 @@ def known_image(station: Station, uuid: bytes) -> Image | None:
     return station.nodes.datasheet(uuid)
 
 
-def unsigned_security(station: Station, keys: NodeKeys, image: Image) -> bytes:
+def unsigned_security(station: Station, keys: SignedNodeKey, image: Image) -> bytes:
     """The Security TEDS of a built image: everything but the signature, sequence and epoch as they are now."""
     node = station.nodes.get(keys.uuid)
     return unsigned_datasheet(
@@ -90,7 +90,7 @@ def unsigned_security(station: Station, keys: NodeKeys, image: Image) -> bytes:
 
 def sign(
     station: Station,
-    keys: NodeKeys,
+    keys: SignedNodeKey,
     image: Image,
     *,
     epoch: int,
@@ -153,7 +153,7 @@ def sign(
     return Signed(made, number, reused=False)
 
 
-def _sequence_if_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes, epoch: int) -> int | None:
+def _sequence_if_the_same(station: Station, keys: SignedNodeKey, image: Image, octets: bytes, epoch: int) -> int | None:
     """The sequence of a Security TEDS that says the same of this image: content, epoch and signer unchanged."""
     try:
         found = security.decode(octets)

@@ -17,7 +17,7 @@ from teds_provision.protocol.plant.signer import Signing
 from teds_provision.station.plant import SignerRules
 from teds_provision.station.station import Station
 from teds_provision.steps.sign import known_image
-from teds_provision.store import Revocation, WhitelistEntry
+from teds_provision.store import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
@@ -39,7 +39,7 @@ class PinsAsked(Protocol):
 class PolicyAsked(Protocol):
     """Whose signatures count, and who is denied."""
 
-    def revocation(self, uuid: bytes) -> Revocation | None:
+    def revocation(self, uuid: bytes) -> RevocationRecord | None:
         """Why a node is denied, None if it is not."""
 
     def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
@@ -84,13 +84,13 @@ class _Pins:
 
 @dataclass(frozen=True)
 class _Policy:
-    denied: Mapping[bytes, Revocation]
+    denied: Mapping[bytes, RevocationRecord]
     cas: tuple[bytes, ...]
     cas_of_nodes: Mapping[bytes, bytes]
     stations: tuple[bytes, ...]
     rules: SignerRules | None
 
-    def revocation(self, uuid: bytes) -> Revocation | None:
+    def revocation(self, uuid: bytes) -> RevocationRecord | None:
         return self.denied.get(uuid)
 
     def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
@@ -105,7 +105,7 @@ class _Policy:
 
 
 @dataclass(frozen=True)
-class Remembered:
+class StationSnapshot:
     """What a station said at one moment: plain data, so that other processes can judge by it too."""
 
     point: bytes
@@ -113,9 +113,9 @@ class Remembered:
     policy: _Policy
 
 
-def remember(station: Station) -> Remembered:
+def remember(station: Station) -> StationSnapshot:
     """Take down everything that judging images asks a station for; raises StoreChanged as the station does."""
-    return Remembered(
+    return StationSnapshot(
         station.point,
         _Pins(station.pins.all(), {entry.uuid: entry for entry in station.pins.whitelist()}),
         _Policy(
@@ -128,10 +128,10 @@ def remember(station: Station) -> Remembered:
     )
 
 
-def remember_page(station: Station, uuids: Sequence[bytes]) -> Remembered:
+def remember_page(station: Station, uuids: Sequence[bytes]) -> StationSnapshot:
     """As :func:`remember`, of what is asked for a page of nodes alone: a list of 100,000 is never held whole."""
     entries = station.pins.of_page(uuids)
-    return Remembered(
+    return StationSnapshot(
         station.point,
         _Pins(station.pins.among(station.nodes.of_page(uuids).values(), entries.values()), entries),
         _Policy(

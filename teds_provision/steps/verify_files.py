@@ -51,7 +51,7 @@ class FileVerdict:
 
 
 @dataclass
-class Totals:
+class VerdictTotals:
     """How many files came to which verdict; ``exit_code`` is that of the worst."""
 
     files: int = 0
@@ -66,7 +66,7 @@ class Totals:
         if verdict.exit_code:
             self.exit_code = max(self.exit_code, verdict.exit_code, key=_WORST.index)
 
-    def join(self, others: Totals) -> None:
+    def join(self, others: VerdictTotals) -> None:
         """Count in what was counted elsewhere."""
         self.files += others.files
         for word, count in others.verdicts.items():
@@ -87,7 +87,7 @@ _WORST: Final = (0, 6, 7, 3, 8, 1, 4)
 
 def verify_files(
     station: Station, files: Sequence[str], tell: Tell, *, processes: int | None = None
-) -> Iterator[tuple[list[str], Totals]]:
+) -> Iterator[tuple[list[str], VerdictTotals]]:
     """Judge every file, in order, some at a time: what ``tell`` says of each, and their totals.
 
     A fault of one is its verdict and stops no other. More than a few files are shared among ``processes`` (as many as
@@ -113,9 +113,9 @@ class _Work:
     tell: Tell
     files: Sequence[str]
 
-    def judge(self, places: range) -> tuple[list[str], Totals]:
+    def judge(self, places: range) -> tuple[list[str], VerdictTotals]:
         """Judge the files at these places of the list, which every process has."""
-        lines, totals = [], Totals()
+        lines, totals = [], VerdictTotals()
         for some in _some([Path(self.files[place]) for place in places]):
             for found in _judged(self.judging, some):
                 totals.add(found)
@@ -132,7 +132,7 @@ def _init_worker(work: _Work) -> None:
     gc.freeze()  # the whole program is there before the first image: not looked through again for each few of them
 
 
-def _judge_chunk(places: range) -> tuple[list[str], Totals]:
+def _judge_chunk(places: range) -> tuple[list[str], VerdictTotals]:
     assert _work is not None
     return _work.judge(places)
 

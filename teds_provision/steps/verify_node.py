@@ -12,7 +12,7 @@ from teds_provision.steps import reading
 from teds_provision.steps.agree import agreed_elsewhere, proof_of_reset, session_if_keyed
 from teds_provision.steps.identify import Identified, prove
 from teds_provision.steps.read import read_block, read_identity, read_image
-from teds_provision.steps.reading import Judged
+from teds_provision.steps.reading import NodeVerdict
 from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import HEARD, Conversation
@@ -25,7 +25,7 @@ class Looked:
     """A node's TEDS, and what they are worth."""
 
     image: Image
-    judged: Judged
+    judged: NodeVerdict
 
     @property
     def verified(self) -> Verified:
@@ -105,7 +105,7 @@ def verify_node(
     why: str = "",
     by: str = "verify",
     c: bytes | None = None,
-) -> Judged:
+) -> NodeVerdict:
     """Check what was read off a node, have it prove its key, and keep the reading. Raises only for the link.
 
     ``why`` says why there is no session although a key is held: then nothing of what was read is kept. ``by`` is the
@@ -118,7 +118,7 @@ def verify_node(
         with station.reading():
             verified = Verified(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
         station.audit("verify", node.uuid, verified.verdict, why=why)
-        return Judged(verified, "plain", utc_now(), by)
+        return NodeVerdict(verified, "plain", utc_now(), by)
     more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
     with station.durable("verify"):
         judged = reading.keep(station, node, image, by=by, known=known, c=c, more=more)

@@ -47,7 +47,7 @@ _ALIASES = {"id": "uuid", "uid": "uuid"}
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListedNode:
     """One entry of a file: the UUID, and the key and name that it gives where it gives them."""
 
     line: int
@@ -61,7 +61,7 @@ class _Reading:
     """What has been read so far, and every mistake with its line and field."""
 
     file: str
-    entries: dict[bytes, Listed] = field(default_factory=dict)
+    entries: dict[bytes, ListedNode] = field(default_factory=dict)
     mistakes: list[str] = field(default_factory=list)
     count: int = 0
 
@@ -81,7 +81,7 @@ class _Reading:
         if not _is_name(name):
             self.wrong(line, "name", _NAME_RULE)
         if len(self.mistakes) == before and uuid is not None:
-            self._join(Listed(line, bytes.fromhex(uuid), pin, name))
+            self._join(ListedNode(line, bytes.fromhex(uuid), pin, name))
 
     def _digits(self, line: int, what: str, text: str, length: int) -> str | None:
         digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
@@ -97,14 +97,14 @@ class _Reading:
             self.wrong(line, "fingerprint", f"32 to 64 hex digits are needed, here is {text[:80]!a}")
         return digits
 
-    def _join(self, entry: Listed) -> None:
+    def _join(self, entry: ListedNode) -> None:
         known = self.entries.get(entry.uuid)
         pins = [one.fingerprint for one in (known, entry) if one is not None and one.fingerprint]
         if known is not None and len(pins) == 2 and not same_key(*pins):
             self.wrong(entry.line, "fingerprint", f"the same UUID has another key in line {known.line}")
             return
         if known is not None:
-            entry = Listed(known.line, known.uuid, max(pins, key=len, default=None), known.name or entry.name)
+            entry = ListedNode(known.line, known.uuid, max(pins, key=len, default=None), known.name or entry.name)
         self.entries[entry.uuid] = entry
 
 
@@ -117,7 +117,7 @@ def uuid_of_eui64(text: str) -> str:
     return f"{EUI64_PREFIX}{digits}" if re.fullmatch("[0-9a-f]{16}", digits) else text
 
 
-def read_whitelist(path: Path, form: str | None = None) -> list[Listed]:
+def read_whitelist(path: Path, form: str | None = None) -> list[ListedNode]:
     """Read a whitelist file; the format is ``form``, else the file's extension, else what its content looks like.
 
     Raises NotFound, or BadData that names file, line and field of every mistake (the first ten in full).
@@ -386,7 +386,7 @@ def _with_lines(text: str, *, inside: bool) -> Iterator[tuple[int, Any]]:
 
 
 @dataclass(frozen=True)
-class Plan:
+class WhitelistPlan:
     """What adding some entries would do: the ones to write, how many of them are new, and how many stay."""
 
     write: tuple[WhitelistEntry, ...]
@@ -394,7 +394,7 @@ class Plan:
     unchanged: int
 
 
-def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
+def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPlan:
     """Hold entries against what is known; changes nothing.
 
     Raises OtherKey where a UUID is pinned to another key, PolicyRefused for a revoked node: then none may be added.
@@ -405,7 +405,7 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
         shown = ", ".join(f"{uuid.hex()} ({revoked[uuid]})" for uuid in uuids[:_SHOWN])
         raise PolicyRefused(f"Revoked nodes are not whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
     write: list[WhitelistEntry] = []
-    conflicts: list[tuple[Listed, str]] = []
+    conflicts: list[tuple[ListedNode, str]] = []
     new = 0
     for page in pages(listed):
         uuids = [entry.uuid for entry in page]
@@ -421,10 +421,10 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
                 write.append(wanted)
                 new += known is None
     _refuse_conflicts(conflicts)
-    return Plan(tuple(write), new, len(listed) - len(write))
+    return WhitelistPlan(tuple(write), new, len(listed) - len(write))
 
 
-def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:
+def _merged(known: WhitelistEntry | None, entry: ListedNode) -> WhitelistEntry:
     if known is None:
         assurance = "uuid" if entry.fingerprint is None else "import"
         return WhitelistEntry(entry.uuid, entry.fingerprint, assurance=assurance, name=entry.name)  # type: ignore[arg-type]
@@ -438,7 +438,7 @@ def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:
     )
 
 
-def _refuse_conflicts(conflicts: list[tuple[Listed, str]]) -> None:
+def _refuse_conflicts(conflicts: list[tuple[ListedNode, str]]) -> None:
     if conflicts:
         shown = "; ".join(
             f"{entry.uuid.hex()} is pinned to the key {pin[:32]}, not {str(entry.fingerprint)[:32]}"
@@ -455,7 +455,7 @@ def _more(items: Sequence[object]) -> str:
     return f" and {len(items) - _SHOWN} more" if len(items) > _SHOWN else ""
 
 
-def add(station: Station, plan: Plan, *, source: str | None = None) -> None:
+def add(station: Station, plan: WhitelistPlan, *, source: str | None = None) -> None:
     """Carry out a plan in one transaction, with one entry of the audit log; ``source`` is the file it came from."""
     if not plan.write:
         return

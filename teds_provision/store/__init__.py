@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from teds_provision.store.records import (
         DatasheetRecord,
         Draft,
-        Facts,
+        ExportFacts,
         Group,
         Handed,
         Handover,
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
         KeptMeasurement,
         KeyRecord,
         Marks,
+        NodeReading,
         NodeRecord,
-        Reading,
-        Revocation,
-        Shown,
+        RevocationRecord,
+        StationRecord,
         Tombstone,
         TrustRecord,
         WhitelistEntry,
@@ -30,17 +30,18 @@ if TYPE_CHECKING:
     from teds_provision.store.store import Store
     from teds_provision.store.tables.line import EvidenceRow, JobRow, LineTables, SignRequestRow, UnitRow
     from teds_provision.store.tables.nodes import Batch, pages
-    from teds_provision.store.tables.overview import Known, Search
+    from teds_provision.store.tables.overview import NodeOverview, Search
 else:
     __getattr__ = lazy(
         __name__,
         {
             "audit": "AuditEntry AuditLog AuditVerdict Choice is_failure",
             "lock": "NodeTurn StoreLock",
-            "records": "DatasheetRecord Draft Facts Group Handed Handover Holder KeyRecord Marks"
-            " KeptMeasurement NodeRecord Reading Revocation Shown Tombstone TrustRecord WhitelistEntry utc_now",
+            "records": "DatasheetRecord Draft ExportFacts Group Handed Handover Holder KeyRecord Marks"
+            " KeptMeasurement NodeReading NodeRecord RevocationRecord"
+            " StationRecord Tombstone TrustRecord WhitelistEntry utc_now",
             "store": "Store",
-            "tables.overview": "Known Search",
+            "tables.overview": "NodeOverview Search",
             "tables.line": "EvidenceRow JobRow LineTables SignRequestRow UnitRow",
             "tables.nodes": "Batch pages",
         },
@@ -55,7 +56,7 @@ __all__ = [
     "DatasheetRecord",
     "Draft",
     "EvidenceRow",
-    "Facts",
+    "ExportFacts",
     "Group",
     "Handed",
     "Handover",
@@ -63,16 +64,16 @@ __all__ = [
     "JobRow",
     "KeptMeasurement",
     "KeyRecord",
-    "Known",
     "LineTables",
     "Marks",
+    "NodeOverview",
+    "NodeReading",
     "NodeRecord",
     "NodeTurn",
-    "Reading",
-    "Revocation",
+    "RevocationRecord",
     "Search",
-    "Shown",
     "SignRequestRow",
+    "StationRecord",
     "Store",
     "StoreLock",
     "Tombstone",

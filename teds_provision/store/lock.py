@@ -136,9 +136,9 @@ class StoreLock(_HeldFile):
 class Mark(_HeldFile):
     """``with Mark(path, command="measure hand") as mark:`` something is taken, for as long as this process lives.
 
-    Does not wait: raises :class:`Taken`, which names the holder. Several may hold it together where each takes it as
-    ``shared``. ``left_behind`` says that the one before had no time to put its mark away (it was killed, or the power
-    failed).
+    Does not wait: raises :class:`MarkTaken`, which names the holder. Several may hold it together where each takes it
+    as ``shared``. ``left_behind`` says that the one before had no time to put its mark away (it was killed, or the
+    power failed).
     """
 
     def __init__(self, path: Path, *, command: str, shared: bool = False) -> None:
@@ -158,7 +158,7 @@ class Mark(_HeldFile):
             fcntl.flock(descriptor, (fcntl.LOCK_SH if self._shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = _holder(descriptor)
-            raise Taken(f"It is held by {holder}.", holder) from None
+            raise MarkTaken(f"It is held by {holder}.", holder) from None
         self.left_behind = bool(os.pread(descriptor, 1, 0))
         with suppress(OSError):  # as above
             os.ftruncate(descriptor, 0)
@@ -186,7 +186,7 @@ class Mark(_HeldFile):
         return _held_by(self._path, shared=True) is not None
 
 
-class Taken(StoreLocked):
+class MarkTaken(StoreLocked):
     """Somebody else holds a :class:`Mark`; ``holder`` names the process."""
 
     def __init__(self, message: str, holder: str) -> None:

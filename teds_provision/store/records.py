@@ -87,7 +87,7 @@ class NodeRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class NodeReading:
     """The one row that a node's verdict is judged from: what was read of it last, and what those octets say.
 
     ``at`` is when its TEDS were read, ``by`` the command that did; ``c`` (8 octets) that of the newest session with the
@@ -131,7 +131,7 @@ class Reading:
         return (int.from_bytes(c, "big") - int.from_bytes(self.c, "big")) % (1 << 64) < 1 << 32
 
 
-class Shown(NamedTuple):
+class ExportFacts(NamedTuple):
     """Of one node, what says whether it may leave: its identity key with its seal, and whether it was retired."""
 
     uuid: bytes
@@ -200,7 +200,7 @@ class DatasheetRecord:
 
 
 @dataclass(frozen=True)
-class Facts:
+class StationRecord:
     """What a station knows of itself: name, keystore, and the points (65 octets) and signature (64) of its key.
 
     ``requested`` is the point for which a certificate was asked; ``point``, ``ca`` and ``signature`` come together when
@@ -330,7 +330,7 @@ class Holder:
 
 
 @dataclass(frozen=True)
-class Revocation:
+class RevocationRecord:
     """A node (by UUID, and by key where known) that is trusted no more; ``statement`` is the signed text."""
 
     uuid: bytes

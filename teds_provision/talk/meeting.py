@@ -297,7 +297,7 @@ class Arrival(Generic[Result]):
     time: str = field(default_factory=utc_now)
 
 
-class Patience(threading.Event):
+class IdleStop(threading.Event):
     """A stop sign that shows by itself when nothing happened for ``seconds``; None waits for ever."""
 
     def __init__(self, seconds: float | None) -> None:

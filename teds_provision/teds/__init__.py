@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from teds_provision.teds.codec.keyforms import ReadKey, read_key
     from teds_provision.teds.codec.model import (
         AccessCode,
+        Conformity,
         Decoded,
         Edition,
         Field,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
         TimeInstance,
         Units,
         Value,
-        Verdict,
     )
     from teds_provision.teds.codec.tables import FieldSpec, Table, name_of, table
     from teds_provision.teds.codec.uuid import UuidParts, pack_uuid, unpack_uuid
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AccessCode",
+    "Conformity",
     "Decoded",
     "Edition",
     "Field",
@@ -60,7 +61,6 @@ __all__ = [
     "Units",
     "UuidParts",
     "Value",
-    "Verdict",
     "compose",
     "convert",
     "decode",
@@ -80,7 +80,7 @@ if not TYPE_CHECKING:
             "codec.composer": "compose convert encode recompose",
             "codec.decode": "decode",
             "codec.keyforms": "ReadKey read_key",
-            "codec.model": "AccessCode Decoded Edition Field Finding Severity TimeInstance Units Value Verdict",
+            "codec.model": "AccessCode Conformity Decoded Edition Field Finding Severity TimeInstance Units Value",
             "codec.tables": "FieldSpec Table name_of table",
             "codec.uuid": "UuidParts pack_uuid unpack_uuid",
             "sheet": "Sheet",

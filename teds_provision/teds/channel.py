@@ -63,7 +63,7 @@ def wrapped(values: NDArray[np.float64], low: Ends, high: Ends, turn: Ends) -> N
     return np.where(moved >= high, low, moved)
 
 
-class Kind(IntEnum):
+class ChannelKind(IntEnum):
     """ChanType (field 11 of the TransducerChannel TEDS): what a channel is."""
 
     SENSOR = 0
@@ -110,7 +110,7 @@ class Channel:
     number: int
     name: str = ""
     described: bool = False
-    kind: Kind | None = None
+    kind: ChannelKind | None = None
     units: Units = Units()  # noqa: RUF009 - frozen
     units_stated: bool = False
     low: float = NOT_STATED
@@ -128,7 +128,7 @@ class Channel:
     @property
     def actuator(self) -> bool:
         """Whether it acts; everything else gives values."""
-        return self.kind is Kind.ACTUATOR
+        return self.kind is ChannelKind.ACTUATOR
 
     @property
     def period(self) -> float:
@@ -239,7 +239,7 @@ def read_channel(number: int, name: str, teds: Decoded | None) -> Channel:
         number,
         name,
         described=True,
-        kind=Kind(kind) if kind in set(Kind) else None,
+        kind=ChannelKind(kind) if kind in set(ChannelKind) else None,
         units=units if isinstance(units, Units) else Units(),
         units_stated=isinstance(units, Units),
         low=number_of(teds, "LowLimit"),

@@ -34,7 +34,7 @@ FLOAT32_STEP: Final = 2.0**-23
 
 
 @dataclass(frozen=True)
-class Channel:
+class CurveChannel:
     """What is known of a channel, in SI units; NaN where it is not stated."""
 
     number: int
@@ -65,12 +65,12 @@ class Channel:
         return format_value(value, unit, difference=difference, digits=5)
 
 
-def channel_of(number: int, blocks: Mapping[BlockId, bytes], profile: Profile | None) -> Channel:
+def channel_of(number: int, blocks: Mapping[BlockId, bytes], profile: Profile | None) -> CurveChannel:
     """What TEDS and profile say of a channel; the limits are those of the TEDS."""
     own = described(number, blocks)
     said = profile.channel(number) if profile is not None else None
     ends = said.raw_range if said is not None else own.sample.raw_range if own.sample is not None else None
-    return Channel(
+    return CurveChannel(
         number,
         own.units if own.units_stated or said is None else said.units,
         own.low,
@@ -93,7 +93,7 @@ class Curve:
     """
 
     calibration: Calibration
-    channel: Channel
+    channel: CurveChannel
     axes: tuple[NDArray[np.float64], ...]
     main: int
 
@@ -155,8 +155,8 @@ class Curve:
 
 def curve_of(
     calibration: Calibration,
-    channel: Channel,
-    channels: Mapping[int, Channel],
+    channel: CurveChannel,
+    channels: Mapping[int, CurveChannel],
     *,
     also: Calibration | None = None,
     dense: bool = False,
@@ -197,7 +197,7 @@ def _straight(calibration: Calibration) -> bool:
 
 
 def _axis(
-    boundaries: tuple[float, ...], source: Channel | None, count: int, actuator: bool, unit: WrittenUnit
+    boundaries: tuple[float, ...], source: CurveChannel | None, count: int, actuator: bool, unit: WrittenUnit
 ) -> NDArray[np.float64]:
     """Samples of one input: every integer where there are few, else evenly spread; and both sides of each boundary.
 
@@ -212,7 +212,7 @@ def _axis(
 
 
 def _ends(
-    boundaries: tuple[float, ...], source: Channel | None, actuator: bool, unit: WrittenUnit
+    boundaries: tuple[float, ...], source: CurveChannel | None, actuator: bool, unit: WrittenUnit
 ) -> tuple[float, float, bool]:
     """Lowest and highest input, and whether it takes whole numbers alone."""
     ends = source.raw if source else None

@@ -21,7 +21,7 @@ from teds_provision.teds.show import Context, meaning_of, text_of
 if TYPE_CHECKING:
     import numpy as np
 
-    from teds_provision.teds.curve import Channel, Curve
+    from teds_provision.teds.curve import Curve, CurveChannel
 else:
     np = late("numpy")
 
@@ -228,7 +228,7 @@ def curve_change(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockI
     return ", ".join(parts)
 
 
-def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: Channel) -> Calibration | None:
+def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: CurveChannel) -> Calibration | None:
     try:
         decoded = decode(blocks[channel, AccessCode.CALIBRATION])
         found = from_decoded(decoded, channel=channel, units=own.units, actuator=own.actuator)

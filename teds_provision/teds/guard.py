@@ -18,15 +18,14 @@ from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate, residuals
 from teds_provision.teds.calibration.model import Calibration, from_decoded
 from teds_provision.teds.calibration.samples import Range
-from teds_provision.teds.channel import TURN
-from teds_provision.teds.channel import Channel as SheetChannel
+from teds_provision.teds.channel import TURN, Channel
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, Decoded
 from teds_provision.teds.curve import FLOAT32_STEP, Curve, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 
 if TYPE_CHECKING:
-    from teds_provision.teds.curve import Channel
+    from teds_provision.teds.curve import CurveChannel
     from teds_provision.teds.profile.model import ChannelProfile, Profile
 
 if TYPE_CHECKING:
@@ -305,7 +304,7 @@ def check_calibration(
     return sorted(plain, key=lambda finding: finding.severity != "error")
 
 
-def misfit(calibration: Calibration, had: SheetChannel, now: SheetChannel, of: ChannelProfile | None) -> str:
+def misfit(calibration: Calibration, had: Channel, now: Channel, of: ChannelProfile | None) -> str:
     """Why a calibration that was made for the channel ``had`` is none of the channel ``now``; "" where it fits.
 
     Looked at: ChanType, DatModel, ModLenth, dimension of the unit, method, raw range, and whether its points lie within
@@ -331,7 +330,7 @@ def misfit(calibration: Calibration, had: SheetChannel, now: SheetChannel, of: C
     return _beyond_raw_range(calibration, had, now, raw) or _points_beyond(calibration, had, now)
 
 
-def _beyond_raw_range(calibration: Calibration, had: SheetChannel, now: SheetChannel, raw: Range | None) -> str:
+def _beyond_raw_range(calibration: Calibration, had: Channel, now: Channel, raw: Range | None) -> str:
     """Another converter: it gives raw values that were never calibrated, or not those that were."""
     before = calibration.raw_range or (had.sample.raw_range if had.sample is not None else None)
     if raw is None or before is None:
@@ -348,7 +347,7 @@ def _beyond_raw_range(calibration: Calibration, had: SheetChannel, now: SheetCha
     return ""
 
 
-def _points_beyond(calibration: Calibration, had: SheetChannel, now: SheetChannel) -> str:
+def _points_beyond(calibration: Calibration, had: Channel, now: Channel) -> str:
     """Points of it that new limits leave out; the old limits are the guard's matter."""
     same = [one for one in ("low", "high") if getattr(had, one) == getattr(now, one)]
     part = calibration.inputs[0]
@@ -413,7 +412,7 @@ class _Judge:
         channel = self._channel(self.number, blocks)
         return from_decoded(decoded, channel=self.number, units=channel.units, actuator=channel.actuator)
 
-    def _channel(self, number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
+    def _channel(self, number: int, blocks: Mapping[BlockId, bytes]) -> CurveChannel:
         return channel_of(number, blocks, self.profile)
 
     def _damage(self, calibration: Calibration) -> Iterator[GuardFinding]:
@@ -443,7 +442,7 @@ class _Judge:
         for code, severity, message in check(curve, before, self.given):
             yield GuardFinding(self.number, code, message, severity)
 
-    def _demanded(self, channel: Channel, calibration: Calibration) -> Channel:
+    def _demanded(self, channel: CurveChannel, calibration: Calibration) -> CurveChannel:
         """Without a profile, what the Calibration TEDS itself carries of its type's demands counts."""
         if self.profile is not None and self.profile.channel(self.number) is not None:
             return channel
@@ -452,7 +451,7 @@ class _Judge:
             raw = max(raw[0], channel.raw[0]), min(raw[1], channel.raw[1])
         return replace(channel, monotone=calibration.monotone, raw=raw if raw and raw[0] < raw[1] else channel.raw)
 
-    def _before(self, channel: Channel) -> Calibration | None:
+    def _before(self, channel: CurveChannel) -> Calibration | None:
         """Calibration that the node has now; None where there is none that can be computed and compared."""
         octets = self.old.get((self.number, AccessCode.CALIBRATION))
         if octets is None:

@@ -102,7 +102,7 @@ def _hex(value: object, name: str) -> bytes:
 # One TEDS with its place, and cutting a run of framed TEDS apart.
 
 
-class Block(NamedTuple):
+class TedsBlock(NamedTuple):
     """A TEDS or bare data block: its channel and access code where they are known, and its octets as they are."""
 
     channel: int | None
@@ -135,11 +135,11 @@ def split_run(octets: bytes) -> list[bytes]:
     return pieces
 
 
-def with_class(octets: bytes) -> Block:
+def with_class(octets: bytes) -> TedsBlock:
     """Block whose access code is the class that its TEDSID names."""
-    return Block(None, class_of(octets), octets)
+    return TedsBlock(None, class_of(octets), octets)
 
 
-def is_run(blocks: Sequence[Block]) -> bool:
+def is_run(blocks: Sequence[TedsBlock]) -> bool:
     """Whether blocks put one after the other come apart again as they were."""
     return [block.octets for block in blocks] == split_run(b"".join(block.octets for block in blocks))

@@ -25,7 +25,7 @@ from teds_provision.teds.sheet import Sheet, name_among
 if TYPE_CHECKING:
     import numpy as np
 
-    from teds_provision.teds.curve import Channel, Curve
+    from teds_provision.teds.curve import Curve, CurveChannel
     from teds_provision.teds.profile.model import Profile
 else:
     np = late("numpy")
@@ -158,7 +158,7 @@ class _View:
 
         self.panel = panel
         curve = panel.curve
-        self.channel: Channel = curve.channel
+        self.channel: CurveChannel = curve.channel
         self.calibration = curve.calibration
         self.unit = curve.calibration.unit
         self.axis = curve.axes[curve.main]

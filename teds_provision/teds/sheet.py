@@ -18,7 +18,7 @@ from teds_provision.teds.calibration.model import Calibration, from_decoded, is_
 from teds_provision.teds.channel import (
     NOT_STATED,
     Channel,
-    Kind,
+    ChannelKind,
     Sampling,
     Timing,
     channel_from,
@@ -27,14 +27,14 @@ from teds_provision.teds.channel import (
     read_channel,
 )
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Decoded, Severity, Verdict
+from teds_provision.teds.codec.model import AccessCode, Conformity, Decoded, Severity
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
 
 __all__ = [
     "NOT_STATED",
     "Channel",
-    "Kind",
+    "ChannelKind",
     "Meta",
     "Sampling",
     "Sheet",
@@ -48,7 +48,7 @@ __all__ = [
     "node_name",
 ]
 
-_DAMAGED: Final = (Verdict.MALFORMED, Verdict.FRAME_BAD, Verdict.FRAME_AND_CONTENT_BAD, Verdict.MESSAGE)
+_DAMAGED: Final = (Conformity.MALFORMED, Conformity.FRAME_BAD, Conformity.FRAME_AND_CONTENT_BAD, Conformity.MESSAGE)
 
 
 @dataclass(frozen=True)

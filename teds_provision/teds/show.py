@@ -18,7 +18,7 @@ from teds_provision.teds.codec.keyforms import read_key
 from teds_provision.teds.codec.model import AccessCode, Decoded, Field, Finding, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.codec.uuid import unpack_uuid
-from teds_provision.teds.formats import Block
+from teds_provision.teds.formats import TedsBlock
 from teds_provision.teds.formats.jsonform import teds_to_json
 from teds_provision.teds.formats.tree import shortest
 from teds_provision.teds.sheet import channel_from, described
@@ -281,7 +281,7 @@ class ShownField:
 class Shown:
     """One TEDS for people; ``summary`` holds (label, text) lines about the whole."""
 
-    block: Block
+    block: TedsBlock
     decoded: Decoded
     fields: tuple[ShownField, ...]
     summary: tuple[Line, ...]
@@ -297,7 +297,7 @@ class Shown:
 
 
 def describe(
-    block: Block, beside: Mapping[tuple[int, int], bytes] | None = None, *, now: datetime | None = None
+    block: TedsBlock, beside: Mapping[tuple[int, int], bytes] | None = None, *, now: datetime | None = None
 ) -> Shown:
     """Decode a block and put it into words; ``beside`` are the framed TEDS that lie in the same image.
 
@@ -322,7 +322,7 @@ def _field(field: Field, known: Mapping[int, FieldSpec], context: Context) -> Sh
     return ShownField(field.type, field.name or f"type {field.type}", text, meaning, weak, field.offset, children)
 
 
-def _context(block: Block, decoded: Decoded, beside: dict[tuple[int, int], bytes]) -> Context:
+def _context(block: TedsBlock, decoded: Decoded, beside: dict[tuple[int, int], bytes]) -> Context:
     series = decoded.get("SUnits")
     return Context(
         _unit(block, decoded, beside),
@@ -333,7 +333,7 @@ def _context(block: Block, decoded: Decoded, beside: dict[tuple[int, int], bytes
     )
 
 
-def _unit(block: Block, decoded: Decoded, beside: Mapping[tuple[int, int], bytes]) -> WrittenUnit | None:
+def _unit(block: TedsBlock, decoded: Decoded, beside: Mapping[tuple[int, int], bytes]) -> WrittenUnit | None:
     """Unit of LowLimit, HiLimit and OError: the channel's, or the calibrated one; None where nothing names one."""
     if decoded.access_code == AccessCode.CHANNEL:
         channel = channel_from(decoded)

@@ -130,7 +130,7 @@ def main() -> None:
     harden()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, _end)
-    page = Page()
+    page = LockedPage()
     path = home / SOCKET
     try:
         page.read(0)
@@ -153,7 +153,7 @@ def main() -> None:
         page.wipe()
 
 
-class Page:
+class LockedPage:
     """One page of memory for one secret of at most 1024 octets."""
 
     def __init__(self) -> None:
@@ -184,7 +184,7 @@ class Page:
         self._length = 0
 
 
-def serve(listener: socket.socket, page: Page, until: float) -> None:
+def serve(listener: socket.socket, page: LockedPage, until: float) -> None:
     """Answer this user's commands until the time is over, or one says to end; the page is wiped then."""
     try:
         while (left := until - _now()) > 0:
@@ -197,7 +197,7 @@ def serve(listener: socket.socket, page: Page, until: float) -> None:
         page.wipe()
 
 
-def _answer(line: socket.socket, page: Page, until: float) -> bool:
+def _answer(line: socket.socket, page: LockedPage, until: float) -> bool:
     """Serve one command; False where the secret is to go."""
     line.settimeout(_CLIENT_SECONDS)
     if user_at(line) != os.geteuid():

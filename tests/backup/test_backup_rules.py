@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.backup.backup import backup
-from teds_provision.backup.content import Head
+from teds_provision.backup.content import BackupHead
 from teds_provision.backup.restore import rebuild
 from teds_provision.errors import PolicyRefused, StoreFailure, StoreLocked, UsageFailure
 from teds_provision.station.station import Station
@@ -73,7 +73,7 @@ def test_a_backup_that_does_not_open_again_is_not_kept(
 
 
 def test_the_age_of_a_backup() -> None:
-    made = Head("id", POINT, "n", "2026-01-01T00:00:00Z", "file", "")
+    made = BackupHead("id", POINT, "n", "2026-01-01T00:00:00Z", "file", "")
     assert made.age_days(datetime(2026, 1, 13, 12, tzinfo=UTC)) == 12
     assert replace(made, created="yesterday").age_days() == 0
 

@@ -14,7 +14,7 @@ from teds_provision.backup.restore import complete_vault, merge, open_present, r
 from teds_provision.errors import PolicyRefused, UsageFailure, VaultFailure
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station, initialise
-from teds_provision.store import Holder, NodeRecord, Revocation, Store, Tombstone, WhitelistEntry
+from teds_provision.store import Holder, NodeRecord, RevocationRecord, Store, Tombstone, WhitelistEntry
 from teds_provision.store.snapshot import Relation, place
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
@@ -65,7 +65,7 @@ def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(statio
 
 def test_a_revoked_node_stays_revoked_and_off_the_whitelist(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
-    station.policy.deny(Revocation(ONE, None, "stolen", "{}"))
+    station.policy.deny(RevocationRecord(ONE, None, "stolen", "{}"))
     station.pins.remove(ONE)
     station.keys.remove(ONE)
     station.audit("revoke", ONE, "done")

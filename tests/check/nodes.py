@@ -9,7 +9,7 @@ import pytest
 
 from teds_provision.check.probe import Probe
 from teds_provision.check.rule import Checked
-from teds_provision.check.run import Report, check_node
+from teds_provision.check.run import CheckReport, check_node
 from teds_provision.protocol.tim import Tim
 from teds_provision.station.station import Station
 from tests.protocol.operation.bench import FakeHardware, channel_teds
@@ -42,7 +42,7 @@ def made(over: str = "nfc", *, epoch: int = 4) -> Board:
 def checked(
     station: Station, patch: pytest.MonkeyPatch, board: Board | None = None, *, over: str = "nfc", factory: bool = True,
     explained: bool = False, line: FaultyLink | None = None, **link: Any,
-) -> Report:  # fmt: skip
+) -> CheckReport:  # fmt: skip
     """Run the rules; waits of theirs pass at once, for the node as well."""
     board = made(over) if board is None else board
 
@@ -55,11 +55,11 @@ def checked(
     return check_node(station, talk(board, line), factory=factory, explained=explained)
 
 
-def failed(report: Report) -> dict[str, Checked]:
+def failed(report: CheckReport) -> dict[str, Checked]:
     """The rules that the node breaks."""
     return {check.rule: check for check in report.checks if check.result == "failed"}
 
 
-def names(report: Report, result: str) -> set[str]:
+def names(report: CheckReport, result: str) -> set[str]:
     """The rules that ended so."""
     return {check.rule for check in report.checks if check.result == result}

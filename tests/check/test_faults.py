@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.check.rule import RULES
-from teds_provision.check.run import Report
+from teds_provision.check.run import CheckReport
 from teds_provision.station.station import Station
 
 from .faults import FAULTS, Faulty
@@ -15,7 +15,7 @@ OF_FRAMES = {"can-flow-control", "can-form", "nfc-wait-time", "nfc-wtx", "identi
 """Rules that hear frames, which a link in memory has none of: ``test_link_rules`` finds faults by them."""
 
 
-def run(station: Station, patch: pytest.MonkeyPatch, one: Faulty) -> Report:
+def run(station: Station, patch: pytest.MonkeyPatch, one: Faulty) -> CheckReport:
     if one.bend is not None:
         one.bend(patch)
     return checked(station, patch, over=one.over, fault=one.fault, **one.link)

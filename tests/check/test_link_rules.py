@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.check import sessions
-from teds_provision.check.run import Report, check_at
+from teds_provision.check.run import CheckReport, check_at
 from teds_provision.links import LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.talk.progress import Silent
@@ -47,16 +47,16 @@ def board(fault: str, link: str, *options: str) -> Iterator[LinkSettings]:
             process.stdin.close()
 
 
-def checked(station: Station, fault: str, link: str, *options: str, factory: bool = False) -> Report:
+def checked(station: Station, fault: str, link: str, *options: str, factory: bool = False) -> CheckReport:
     with board(fault, link, *options) as links:
         return check_at(station, links, Silent(), factory=factory)
 
 
-def results(report: Report) -> dict[str, str]:
+def results(report: CheckReport) -> dict[str, str]:
     return {check.rule: check.result for check in report.checks}
 
 
-def broken(report: Report) -> dict[str, str]:
+def broken(report: CheckReport) -> dict[str, str]:
     return {check.rule: check.detail for check in report.checks if check.result == "failed"}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision.check.agreement import Explained
 from teds_provision.check.rule import RULES, Stage
-from teds_provision.check.run import Report, check_node
+from teds_provision.check.run import CheckReport, check_node
 from teds_provision.errors import Garbled, NodeSilent, PolicyRefused, TooLongForNode
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
@@ -32,7 +32,7 @@ def patch(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def checked(station: Station, board: Board, *, factory: bool = True, **link: object) -> Report:
+def checked(station: Station, board: Board, *, factory: bool = True, **link: object) -> CheckReport:
     with pytest.MonkeyPatch.context() as patch:
         return nodes.checked(station, patch, board, factory=factory, **link)
 

@@ -9,7 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store import Group, Holder, KeyRecord, NodeRecord, Revocation, Store, Tombstone, WhitelistEntry
+from teds_provision.store import (
+    Group,
+    Holder,
+    KeyRecord,
+    NodeRecord,
+    RevocationRecord,
+    Store,
+    Tombstone,
+    WhitelistEntry,
+)
 from tests.terminal import on_terminal
 
 from .shell import call, python
@@ -44,7 +53,7 @@ def known(home: Path) -> Path:
         store.put_holder(Holder(ONE, STATION))
         store.put_node(NodeRecord(TWO, POINT))
         store.put_tombstone(Tombstone(TWO, STATION, "an-id"))
-        store.put_revocation(Revocation(TWO, None, "lost", "{}"))
+        store.put_revocation(RevocationRecord(TWO, None, "lost", "{}"))
     return home
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import pytest
 from rich.console import Console
 
-from teds_provision.cli.provision import OperatorScreen, Watched
+from teds_provision.cli.provision import BoardReporter, OperatorScreen
 from teds_provision.errors import NodeSilent, TedsProvisionError
-from teds_provision.steps.batch_sheet import Board, Declined, Row
+from teds_provision.steps.batch_sheet import BoardResult, Declined, SheetRow
 from teds_provision.steps.build import BuildOrder, Prepared
 from teds_provision.talk.progress import Silent
 
@@ -23,22 +23,22 @@ class Batch:
     """Fifty boards; the next one is named by its order, its UUID or its key."""
 
     passed: int = 0
-    next_row: Row | None = None
+    next_row: SheetRow | None = None
     had: str | None = None
     of_a_job: bool = False
 
-    def board_of(self, row: Row) -> str | None:
+    def board_of(self, row: SheetRow) -> str | None:
         return self.had
 
     def __len__(self) -> int:
         return 50
 
-    def row(self, number: int) -> Row:
+    def row(self, number: int) -> SheetRow:
         return row(number)
 
 
-def row(number: int, *, name: str = LONG, uuid: bytes | None = None, fingerprint: str | None = None) -> Row:
-    return Row(number, number + 1, uuid, fingerprint, Prepared(BuildOrder(name=name)), "")
+def row(number: int, *, name: str = LONG, uuid: bytes | None = None, fingerprint: str | None = None) -> SheetRow:
+    return SheetRow(number, number + 1, uuid, fingerprint, Prepared(BuildOrder(name=name)), "")
 
 
 class Terminal:
@@ -62,8 +62,8 @@ class Terminal:
         return [line.rstrip() for line in self.out.getvalue().rpartition("\x1b[H")[2].splitlines()]
 
 
-def failed(number: int, error: TedsProvisionError) -> Board:
-    return Board(UUID, 12.3, error=error, row=number, time="2026-11-22T12:34:56Z")
+def failed(number: int, error: TedsProvisionError) -> BoardResult:
+    return BoardResult(UUID, 12.3, error=error, row=number, time="2026-11-22T12:34:56Z")
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def failed(number: int, error: TedsProvisionError) -> Board:
     ],
     ids=["order", "uuid", "label", "done"],
 )
-def test_it_says_what_to_do_now(next_row: Row | None, told: str) -> None:
+def test_it_says_what_to_do_now(next_row: SheetRow | None, told: str) -> None:
     assert told in Terminal(Batch(next_row=next_row)).lines
 
 
@@ -89,7 +89,7 @@ def test_a_board_that_did_not_pass_is_asked_for_by_its_uuid() -> None:
 def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> None:
     """Else an operator takes the board away: the large letters were those of the last one."""
     terminal = Terminal(Batch(next_row=row(1)))
-    reporter = Watched(Silent())
+    reporter = BoardReporter(Silent())
     reporter.begun = terminal.screen.begun
     terminal.screen.ended(failed(1, NodeSilent("It is silent.")))
     ended = terminal.lines

@@ -15,7 +15,7 @@ from teds_provision.cli.provision import _questions
 from teds_provision.cli.rendering import LiveReporter, tidy
 from teds_provision.errors import NotAuthentic
 from teds_provision.links import Notice
-from teds_provision.links.nfc.message import Record
+from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.commands import SignOrder, sign_image
@@ -79,7 +79,7 @@ def test_the_store_is_free_while_a_person_is_asked(tmp_path: Path, monkeypatch: 
 
 
 def test_nothing_that_a_tag_says_steers_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    hostile = Record(4, b"x\x1b]0;mine\x07[red]").name
+    hostile = NdefRecord(4, b"x\x1b]0;mine\x07[red]").name
     assert hostile == "urn:nfc:ext:x\\x1b]0;mine\\x07[red]"
     app = App()
     app.note("a\x1b[2Jb\u202ec\u009b")

@@ -13,7 +13,7 @@ from teds_provision.limits import LIMITS
 from teds_provision.protocol.handover.jose import encrypt
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.teds.codec.security import initial
-from teds_provision.teds.formats import Block, read_blocks, write_blocks
+from teds_provision.teds.formats import TedsBlock, read_blocks, write_blocks
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 
@@ -403,4 +403,4 @@ def test_control_characters_in_a_name_do_not_reach_the_terminal(show, tmp_path):
 
 
 def test_written_hex_of_one_teds_needs_no_place():
-    assert write_blocks([Block(None, 12, teds.compose(12, {"Format": 0, "TCName": "a"}))], "hex").count("#") == 0
+    assert write_blocks([TedsBlock(None, 12, teds.compose(12, {"Format": 0, "TCName": "a"}))], "hex").count("#") == 0

@@ -23,7 +23,7 @@ from teds_provision.doctor.links import READERS
 from teds_provision.doctor.registry import CHECKS, Finding, System, examine, exit_code
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.protocol.keys import SoftwareKey, to_pem
-from teds_provision.store import Draft, Facts, KeyRecord, Marks, NodeRecord, Store, StoreLock, WhitelistEntry
+from teds_provision.store import Draft, KeyRecord, Marks, NodeRecord, StationRecord, Store, StoreLock, WhitelistEntry
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 from tests.bench import PASSPHRASE, make_station
@@ -354,7 +354,7 @@ def test_nodes_without_a_backup_are_a_warning(stationed: System) -> None:
 def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={stationed.home}/no-bus")
     with Store.open(stationed.home) as store:
-        store.put_facts(Facts("bench", "keyring"))
+        store.put_facts(StationRecord("bench", "keyring"))
     found = by_name(stationed)
     assert (found["keyring"].result, found["vault"].result) == ("failed", "failed")
     monkeypatch.setenv("PYTHON_KEYRING_BACKEND", "keyring.backends.null.Keyring")
@@ -363,7 +363,7 @@ def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: System, monkeyp
 
 def test_a_token_whose_module_is_missing_is_a_failure(stationed: System) -> None:
     with Store.open(stationed.home) as store:
-        store.put_facts(Facts("bench", "pkcs11:token=bench?module-path=/nowhere/module.so"))
+        store.put_facts(StationRecord("bench", "pkcs11:token=bench?module-path=/nowhere/module.so"))
     vault = by_name(stationed)["vault"]
     assert (vault.result, "module" in vault.why) == ("failed", True)
 

@@ -16,7 +16,7 @@ from teds_provision.errors import LinkFailure
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import port
 from teds_provision.station.station import Station as BaseStation
-from teds_provision.steps.batch import Boards, Questions, Request
+from teds_provision.steps.batch import Boards, ProvisionRequest, Questions
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.inventory import inventory
 from teds_provision.talk.progress import Silent
@@ -54,7 +54,7 @@ class Pulling(Silent):
 def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str]]) -> None:
     station = BaseStation.open(home, ask=lambda prompt, confirm: PASSPHRASE)
     pulling = Pulling(field)
-    request = Request(order=BuildOrder(ANGLE), watch=True)
+    request = ProvisionRequest(order=BuildOrder(ANGLE), watch=True)
     run = Boards(station, LinkSettings("nfc", path, timeout=30.0), request, pulling)
     came = run.many(Questions(accept=lambda who: None, confirm=None))
     (other, other_path), *others = lying

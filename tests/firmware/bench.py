@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER
-from teds_provision.protocol.operation.hardware import Port
+from teds_provision.protocol.operation.hardware import SessionPort
 from teds_provision.protocol.operation.streams import DataFrame
 from tests.firmware.memory_node import MemoryNode, link_number
 from tests.protocol.operation import bench as reference
@@ -108,7 +108,7 @@ class Acting(MemoryNode):
         self._library.memory_slow(self._board, ctypes.c_bool(slow))
 
     def handle(
-        self, frame: bytes, *, link: str, tapped: bool, port: Port | None = None, received: int | None = None
+        self, frame: bytes, *, link: str, tapped: bool, port: SessionPort | None = None, received: int | None = None
     ) -> bytes:
         number, kind = link_number(link)
         if kind == 3 and number not in self.connected:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from teds_provision.node.ble.address import StaticAddress
-from teds_provision.node.ble.peripheral import Line, Peripheral
+from teds_provision.node.ble.peripheral import BleLine, Peripheral
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.handler import InTheAir
 from teds_provision.node.hardware.board import Board
@@ -117,7 +117,7 @@ class CPeripheral(Peripheral):
         if due:
             asyncio.get_running_loop().create_task(self._notified(line, due))
 
-    async def _notified(self, line: Line, due: list[bytes]) -> None:
+    async def _notified(self, line: BleLine, due: list[bytes]) -> None:
         for value in due:
             with suppress(Exception):  # the connection is gone
                 await self._device.notify_subscriber(line.connection, self._notify, value)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.messages.identity import Identity
-from teds_provision.protocol.operation.hardware import Port
+from teds_provision.protocol.operation.hardware import SessionPort
 from tests.firmware import builds
 
 NANOSECONDS: Final = 10**9
@@ -198,7 +198,7 @@ class MemoryNode:
     # -- what a Tim is asked -----------------------------------------------------------------------------------------
 
     def handle(
-        self, frame: bytes, *, link: str, tapped: bool, port: Port | None = None, received: int | None = None
+        self, frame: bytes, *, link: str, tapped: bool, port: SessionPort | None = None, received: int | None = None
     ) -> bytes:
         """One command frame to one reply frame."""
         self._now()

@@ -19,14 +19,14 @@ from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, 
 from teds_provision.protocol.messages.frames import Command, Function, decode_reply, security_command
 from teds_provision.protocol.operation.can_frames import cut
 from teds_provision.protocol.operation.commands import Power
-from teds_provision.protocol.operation.datagram import Layout, Sealer, drive_key
-from teds_provision.protocol.operation.hardware import ChannelHardware, Port, Reading, port_of
+from teds_provision.protocol.operation.datagram import DatagramSealer, Layout, drive_key
+from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading, SessionPort, port_of
 from teds_provision.protocol.operation.stream_commands import Action, Driven
-from teds_provision.protocol.operation.timing import Token
+from teds_provision.protocol.operation.timing import TriggerToken
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim import Tim
 from teds_provision.teds.image import SECURITY
-from teds_provision.teds.sheet import Kind
+from teds_provision.teds.sheet import ChannelKind
 from tests.firmware.memory_node import MemoryNode
 from tests.protocol.desk import CREDENTIALS, META, NAME, NODE, UUID, Desk
 from tests.protocol.memory import RamFlash
@@ -35,11 +35,11 @@ from tests.protocol.operation.bench import channel_teds
 pytestmark = pytest.mark.system
 
 CHANNELS = {
-    1: ChannelHardware(Kind.SENSOR, 2, shortest=100_000),
-    2: ChannelHardware(Kind.SENSOR, 3, shortest=1_000_000),
-    7: ChannelHardware(Kind.ACTUATOR, 2, halt=0),
-    8: ChannelHardware(Kind.ACTUATOR, 5, halt=0),
-    9: ChannelHardware(Kind.EVENT_SENSOR, 2),
+    1: ChannelHardware(ChannelKind.SENSOR, 2, shortest=100_000),
+    2: ChannelHardware(ChannelKind.SENSOR, 3, shortest=1_000_000),
+    7: ChannelHardware(ChannelKind.ACTUATOR, 2, halt=0),
+    8: ChannelHardware(ChannelKind.ACTUATOR, 5, halt=0),
+    9: ChannelHardware(ChannelKind.EVENT_SENSOR, 2),
 }
 SHEET = {(0, 1): META, (1, 12): NAME} | {
     (number, 3): channel_teds(facts, period=0.001 if number == 2 else None) for number, facts in CHANNELS.items()
@@ -65,9 +65,9 @@ class Hardware:
     def keeps(self, period: int) -> bool:
         return True
 
-    def read(self, channel: int, tick: int) -> Reading:
+    def read(self, channel: int, tick: int) -> RawReading:
         width = self.channels[channel].octets
-        return Reading(((tick // MS + channel) % (1 << 8 * width)).to_bytes(width, "big"))
+        return RawReading(((tick // MS + channel) % (1 << 8 * width)).to_bytes(width, "big"))
 
     def bears(self, channel: int, data_set: bytes) -> bool:
         return data_set[0] < 0xF0
@@ -151,7 +151,7 @@ class Twins:
         self.frames()
         return mine
 
-    def port(self, link: str) -> Port:
+    def port(self, link: str) -> SessionPort:
         """What the reference is told of a link."""
         return port_of(link)
 
@@ -219,7 +219,7 @@ class Station:
         self.twins, self.dice = twins, random.Random(seed)
         self.key = b""
         self.counter = 0
-        self.driven: dict[str, tuple[Layout, Sealer]] = {}
+        self.driven: dict[str, tuple[Layout, DatagramSealer]] = {}
         self.sessions: dict[str, StationSession] = {}
         self.desk = Desk.__new__(Desk)
         self.desk.memory = twins.memory
@@ -383,7 +383,7 @@ class Station:
             security_command(Function.OPERATION),
             security_command(Function.POWER),
             Command(8, 4, 1, digest + b"\x0a" + (2000).to_bytes(2, "big")),
-            Token(TOKEN).arm(self.dice.choice(list(Action)), self.dice.choice([0, 5, 60])).command(),
+            TriggerToken(TOKEN).arm(self.dice.choice(list(Action)), self.dice.choice([0, 5, 60])).command(),
             security_command(Function.ARM, self.dice.randbytes(16) + bytes([61, 1])),
             security_command(Function.DRIVE, self.dice.choice([b"\x07", b"\x07\x08", b"\x08", b"\x01", b""])),
         ]
@@ -393,7 +393,7 @@ class Station:
         if ok and asked.function == Function.DRIVE and asked.command_class == 128:
             layout = Layout(tuple(asked.payload), tuple(CHANNELS[number].octets for number in asked.payload))
             key = drive_key(self.sessions[link].message_key, Driven.decode(payload).run)
-            self.driven[link] = (layout, Sealer(key))
+            self.driven[link] = (layout, DatagramSealer(key))
             self.counter = 0
 
     def drive(self) -> None:

@@ -16,7 +16,7 @@ import pytest
 from teds_provision.protocol.messages import ble
 from teds_provision.protocol.messages.frames import Command, Function, security_command
 from teds_provision.protocol.operation.can_frames import ble_frame
-from teds_provision.protocol.operation.hardware import Port, port_of
+from teds_provision.protocol.operation.hardware import SessionPort, port_of
 from teds_provision.protocol.repetition import Repetition
 from tests.bench import make_station
 from tests.e2e.desk import ANGLE, Desk, Station
@@ -36,7 +36,7 @@ class Line:
 
     def __init__(self, twins: Twins, number: int, mtu: int) -> None:
         self.twins, self.number, self.mtu = twins, number, mtu
-        self.assembly, self.repetition = ble.Assembly(0xFFFF), Repetition()
+        self.assembly, self.repetition = ble.BleAssembly(0xFFFF), Repetition()
         twins.c.ble_connected(number, mtu)
 
     def write(self, value: bytes) -> list[bytes]:
@@ -136,7 +136,7 @@ class InTheAir(Twins):
             self.py.unheard(link)
         self.c.ble_hears(int(link[4:]) - 2, hears)
 
-    def port(self, link: str) -> Port:
+    def port(self, link: str) -> SessionPort:
         return port_of(link)._replace(mtu=self.mtu, hears=self.hears.get(link, True))
 
     def lost(self, link: str) -> None:

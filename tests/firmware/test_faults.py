@@ -97,7 +97,7 @@ class Board(nodes.Measuring):
         return self.key.secret() if kind == "i" else b"\x01" + os.urandom(size - 1) if kind == "o" else os.urandom(size)
 
 
-def check(folder: Path, station: Station, patch: pytest.MonkeyPatch, name: str) -> nodes.Report:
+def check(folder: Path, station: Station, patch: pytest.MonkeyPatch, name: str) -> nodes.CheckReport:
     patch.setattr(Board, "library", built(folder, name), raising=False)
     patch.setattr(nodes, "Measuring", Board)
     patch.setattr(nodes, "Board", Board)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from teds_provision.links.nfc import message, tnep
-from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, Record
+from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, room
 from teds_provision.node.nfc.tags import ATS, IsoDepTag, NdefApplication, Type4Memory
 from teds_provision.node.nfc.tnep import TnepTag
@@ -147,9 +147,11 @@ def talk(taps: Taps) -> None:
         if dice.random() < 0.03:
             payload[dice.randrange(len(payload))] ^= 1
         name = tnep.TIM_TYPE.upper() if dice.random() < 0.1 else tnep.TIM_TYPE
-        records = [Record(EXTERNAL, name, bytes(payload))]
+        records = [NdefRecord(EXTERNAL, name, bytes(payload))]
         if dice.random() < 0.1:
-            records.insert(dice.randrange(2), Record(WELL_KNOWN, b"T", dice.randbytes(dice.choice((0, 5, 300))), b"id"))
+            records.insert(
+                dice.randrange(2), NdefRecord(WELL_KNOWN, b"T", dice.randbytes(dice.choice((0, 5, 300))), b"id")
+            )
         octets = chunked(bytes(payload), dice) if dice.random() < 0.1 else message.encode(records)
         if dice.random() < 0.04:
             octets = octets[: dice.randrange(len(octets))]

@@ -20,9 +20,9 @@ from teds_provision.protocol.operation.commands import (
     set_values,
     write_data_set,
 )
-from teds_provision.protocol.operation.hardware import ChannelHardware, Port
-from teds_provision.protocol.operation.stream_commands import CLOCK, Kind, drive, stop
-from teds_provision.teds.sheet import Kind as ChannelKind
+from teds_provision.protocol.operation.hardware import ChannelHardware, SessionPort
+from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, drive, stop
+from teds_provision.teds.sheet import ChannelKind
 from tests.firmware.bench import Acting, CBench
 from tests.protocol.operation import (
     test_any_octets,
@@ -142,7 +142,7 @@ def test_subscribe_in_its_order() -> None:
             ("one that is not there, an actuator too", subscribe(channels=(4, 9)), Reason.WRONG_STATE),
             ("an actuator, period 0", subscribe(channels=(4,), period=0), Reason.NOT_PERMITTED),
             ("periodic of an event sensor, period 0", subscribe(channels=(5,), period=0), Reason.OUT_OF_RANGE),
-            ("events of a sensor", subscribe(kind=Kind.EVENT, n=1), Reason.OUT_OF_RANGE),
+            ("events of a sensor", subscribe(kind=StreamKind.EVENT, n=1), Reason.OUT_OF_RANGE),
             ("period above 10^12", subscribe(period=10**12 + 1), Reason.OUT_OF_RANGE),
             (
                 "shorter than SPeriod, too long as well",
@@ -297,7 +297,7 @@ def test_the_last_counter_of_a_stream_is_sent() -> None:
 @pytest.mark.parametrize("fd", [False, True], ids=["classic", "FD"])
 def test_drive_and_streams_go_in_the_form_in_which_they_were_asked_for(fd: bool) -> None:
     bench = CBench()
-    bench.ports["can:f1"] = Port("can", "can", 0xF1, fd=fd)
+    bench.ports["can:f1"] = SessionPort("can", "can", 0xF1, fd=fd)
     bench.open().operate(1, 3, 4, 6)
     wheel = Wheel(bench)
     message = wheel.message(1000, 1001)

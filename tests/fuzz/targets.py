@@ -97,7 +97,7 @@ def check_sheet(data: bytes) -> None:
     """The typed datasheet, its interpreter and the guard: pieces of ``channel u8 ‖ code u8 ‖ length u16 ‖ block``."""
     from teds_provision.teds.calibration import ChannelInterpreter
     from teds_provision.teds.codec.frame import frame
-    from teds_provision.teds.formats import Block
+    from teds_provision.teds.formats import TedsBlock
     from teds_provision.teds.guard import check_calibration
     from teds_provision.teds.image import Image
     from teds_provision.teds.sheet import Sheet
@@ -121,7 +121,7 @@ def check_sheet(data: bytes) -> None:
             interpreter.encode(1.0)
     check_calibration(blocks, now=NOW)
     for (number, code), octets in blocks.items():
-        describe(Block(number, code, octets), blocks, now=NOW)
+        describe(TedsBlock(number, code, octets), blocks, now=NOW)
 
 
 def sheet_seeds() -> Iterable[bytes]:
@@ -198,17 +198,17 @@ def check_operation(data: bytes) -> None:
     for read in (
         lambda: commands.Operate.decode(1, data, actuator=True),
         lambda: commands.Operate.decode(1, data, actuator=False),
-        lambda: commands.Operation.decode(data),
+        lambda: commands.OperationReply.decode(data),
         lambda: commands.Sampled.decode(data, 4),
         lambda: commands.Power.decode(data),
         lambda: commands.decode_data_set(data, 2),
         lambda: commands.channel_list(data, 16),
-        lambda: datagram.Sealer(bytes(16)).open(data),
+        lambda: datagram.DatagramSealer(bytes(16)).open(data),
     ):
         with suppress(TedsProvisionError, Refused):
             read()
     can_frames.read_ble_frame(data)
-    assembly = can_frames.Assembly(63, fd=bool(data[:1] and data[0] & 1))
+    assembly = can_frames.StreamAssembly(63, fd=bool(data[:1] and data[0] & 1))
     for at in range(1, len(data), 9):
         found = assembly.take(data[at] & 7, data[at + 1 : at + 9])
         assert found is None or len(found) == 63
@@ -218,7 +218,7 @@ def check_nfc(data: bytes) -> None:
     """NDEF messages, the pieces in them and TNEP; both halves of a transaction."""
     from teds_provision.links.nfc import message, pieces, tnep
 
-    records: tuple[message.Record, ...] = ()
+    records: tuple[message.NdefRecord, ...] = ()
     with suppress(TedsProvisionError):
         records = message.decode(data)
         assert message.decode(message.encode(records)) == records
@@ -385,7 +385,7 @@ def check_backup(data: bytes) -> None:
         reader = chunks.ChunkReader(BytesIO(body), bytes(32), b"")
         reads(lambda: reader.read(len(body)), reader.require_end)
     elif kind == 1:
-        reads(lambda: content.Head.read(body, sealed_file.FORMAT))
+        reads(lambda: content.BackupHead.read(body, sealed_file.FORMAT))
     else:
         out = BytesIO()
         writer = chunks.ChunkWriter(out, bytes(32), b"")
@@ -397,10 +397,10 @@ def check_backup(data: bytes) -> None:
 
 def backup_seeds() -> Iterable[bytes]:
     from teds_provision.backup import sealed_file
-    from teds_provision.backup.content import Head
+    from teds_provision.backup.content import BackupHead
     from teds_provision.store.schema import SCHEMA_VERSION
 
-    head = Head("0" * 32, _key(1).point, "x", "2026-11-21T00:00:00Z", "file", "{}")
+    head = BackupHead("0" * 32, _key(1).point, "x", "2026-11-21T00:00:00Z", "file", "{}")
     yield b"\1" + head.line(sealed_file.FORMAT)
     tables = {"whitelist": ["uuid", "fingerprint"], "setting": ["name", "value"]}
     row = struct.pack(">BI", 0, 20) + b"\3" + struct.pack(">I", 10) + bytes(10) + b"\0"
@@ -487,11 +487,11 @@ def check_image(data: bytes) -> None:
 
 
 def image_seeds() -> Iterable[bytes]:
-    from teds_provision.teds.formats import Block, write_blocks
+    from teds_provision.teds.formats import TedsBlock, write_blocks
     from teds_provision.teds.profile import load_profile
 
     built = load_profile("magnetic-angular-position-sensor").build(bytes(10)).blocks
-    blocks = [Block(channel, code, teds) for (channel, code), teds in built.items() if code in (1, 12)]
+    blocks = [TedsBlock(channel, code, teds) for (channel, code), teds in built.items() if code in (1, 12)]
     for form in ("image", "json", "xml", "hex", "ihex", "binary"):
         written = write_blocks(blocks, form)  # type: ignore[arg-type]
         yield written if isinstance(written, bytes) else written.encode()

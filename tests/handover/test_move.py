@@ -17,7 +17,7 @@ from teds_provision.steps.commands import set_address
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
 from teds_provision.steps.verify_node import verify_node
-from teds_provision.store import Revocation
+from teds_provision.store import RevocationRecord
 from tests.bench import MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, node_key_id, provisioned, session, trust
 
@@ -170,7 +170,7 @@ def test_a_move_under_way_is_not_sealed_again_with_a_node_that_was_revoked_or_fo
     """Found by two commands at once: revoke deletes the key while a move of the node is open."""
     pair.export("move")
     if revoked:
-        pair.north.policy.deny(Revocation(pair.board.uuid, None, "lost", "a statement"))
+        pair.north.policy.deny(RevocationRecord(pair.board.uuid, None, "lost", "a statement"))
     pair.north.keys.remove(pair.board.uuid)
     with pytest.raises(PolicyRefused, match="is revoked" if revoked else "no key of it is held here") as refused:
         plan_export(pair.north, ExportOrder((pair.south.name,), None, "move"))

@@ -26,10 +26,10 @@ from teds_provision.node.pulse import Pulse
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.protocol.operation.commands import EITHER, OPERATE_FUNCTION
-from teds_provision.protocol.operation.hardware import Reading
+from teds_provision.protocol.operation.hardware import RawReading
 from teds_provision.protocol.operation.stream_commands import Clock, Subscribed
 from teds_provision.protocol.operation.streams import DataFrame, Stream
-from teds_provision.talk.meeting import Patience
+from teds_provision.talk.meeting import IdleStop
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
 
@@ -220,19 +220,19 @@ def refuses_claims(node: Faulty) -> None:
     node.tim._role._commands[EITHER, OPERATE_FUNCTION] = operate  # type: ignore[union-attr]
 
 
-def _reads(node: Faulty, bend: Callable[[Reading, int], Reading]) -> None:
+def _reads(node: Faulty, bend: Callable[[RawReading, int], RawReading]) -> None:
     real = node.board.read  # type: ignore[union-attr]
     node.board.read = lambda channel, tick: bend(real(channel, tick), tick)  # type: ignore[union-attr,method-assign]
 
 
 def out_of_range(node: Faulty) -> None:
     """In every second tenth of a second its values are beyond the limits of the datasheet."""
-    _reads(node, lambda given, tick: Reading(b"\xff" * len(given.octets)) if tick // (SECOND // 10) % 2 else given)
+    _reads(node, lambda given, tick: RawReading(b"\xff" * len(given.octets)) if tick // (SECOND // 10) % 2 else given)
 
 
 def not_valid(node: Faulty) -> None:
     """It says of every value that it is not valid."""
-    _reads(node, lambda given, _tick: Reading(given.octets, valid=False))
+    _reads(node, lambda given, _tick: RawReading(given.octets, valid=False))
 
 
 def test_pattern(node: Faulty) -> None:
@@ -280,7 +280,7 @@ def main() -> None:
         server.add(node, measuring=node)
         node.streams_over(_sender(server, node, FAULTS[fault] if FAULTS[fault] in BENDING else None))
         boards.append(node.board)
-    stop = Patience(None)
+    stop = IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     for part in (pulse, *boards, server):
         part.start()  # type: ignore[union-attr]

@@ -8,11 +8,12 @@ import pytest
 
 from teds_provision.measure.planning import BusShare, BusTime, Plans, plan_node
 from teds_provision.protocol.operation.budget import MOST_LOAD
-from teds_provision.teds.channel import Channel, Kind, SampleForm, Timing
+from teds_provision.teds.channel import Channel, ChannelKind, SampleForm, Timing
 
 FIRST, SECOND, THIRD = b"a" * 10, b"b" * 10, b"c" * 10
 FAST, SLOW = (
-    Channel(1, kind=Kind.SENSOR, sample=SampleForm(0, 2, 16), timing=Timing(period=period)) for period in (2e-5, 0.1)
+    Channel(1, kind=ChannelKind.SENSOR, sample=SampleForm(0, 2, 16), timing=Timing(period=period))
+    for period in (2e-5, 0.1)
 )
 
 

@@ -20,10 +20,10 @@ from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone, Wall
 from teds_provision.measure.hearing import GATHER, CanHearing, HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.protocol.operation.can_frames import Assembly, DataAddress, cut
-from teds_provision.protocol.operation.datagram import Sealer, stream_key
-from teds_provision.protocol.operation.stream_commands import Kind, Subscribed
-from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
+from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
+from teds_provision.protocol.operation.stream_commands import StreamKind, Subscribed
+from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration import fit
 from tests.teds.test_interpreter import sheet_of
 
@@ -41,24 +41,32 @@ class Scene:
     """A stream of two channels, n = 3 at 1 kHz, whose node's clock stood at 1 s when the host's stood at ``base``."""
 
     def __init__(
-        self, kind: Kind = Kind.PERIODIC, period: int = MS, *, real: int = MS, ago: int = 3600, fd: bool = True
+        self,
+        kind: StreamKind = StreamKind.PERIODIC,
+        period: int = MS,
+        *,
+        real: int = MS,
+        ago: int = 3600,
+        fd: bool = True,
     ) -> None:
         self.real = real  # period of a sensor that runs free
-        self.plan = Plan.of(0, ((1, 2), (2, 2)), n=3, period=period, kind=kind)
+        self.plan = StreamPlan.of(0, ((1, 2), (2, 2)), n=3, period=period, kind=kind)
         self.base = time.monotonic_ns() - ago * SECOND
         clock = ClockMap()
         clock.exchange(Exchange(self.base, self.base + 2000, SECOND + 500, SECOND + 1500, 1, 20))
         self.clock, self.blocks = clock, list[Block]()
         receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
         interpreter = StreamInterpreter(SHEET, self.plan, 1, clock, HOST, Monotone())
-        assembly = Assembly(self.plan.length, fd=fd)
+        assembly = StreamAssembly(self.plan.length, fd=fd)
         self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
-        self._sealer = Sealer(stream_key(KEY, 1))
+        self._sealer = DatagramSealer(stream_key(KEY, 1))
 
     def message(self, counter: int, flags: int = 0) -> bytes:
         raws = np.random.default_rng(counter).integers(0, 65536, 6).astype(">u2").tobytes()
         free = (
-            (SECOND + counter * 3 * self.real + 17).to_bytes(8, "big") if self.plan.subscribe.kind == Kind.FREE else b""
+            (SECOND + counter * 3 * self.real + 17).to_bytes(8, "big")
+            if self.plan.subscribe.kind == StreamKind.FREE
+            else b""
         )
         return self._sealer.seal(counter, bytes([flags]) + free + raws)
 
@@ -73,10 +81,12 @@ class Scene:
         return rows  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("kind", [Kind.PERIODIC, Kind.FREE])
+@pytest.mark.parametrize("kind", [StreamKind.PERIODIC, StreamKind.FREE])
 @given(st.lists(st.tuples(st.integers(0, 3), st.booleans(), st.booleans()), min_size=1, max_size=30), st.integers(0, 4))
 @settings(max_examples=60, deadline=None)
-def test_together_or_one_by_one_the_same_samples(kind: Kind, steps: list[tuple[int, bool, bool]], bent: int) -> None:
+def test_together_or_one_by_one_the_same_samples(
+    kind: StreamKind, steps: list[tuple[int, bool, bool]], bent: int
+) -> None:
     """Gaps, doubles and forged messages between good ones; batches end where the second flag says so."""
     one_by_one, together = Scene(kind), Scene(kind)
     counter = 0
@@ -105,7 +115,7 @@ def test_a_stream_that_runs_free_has_the_period_that_its_ticks_say(real: int) ->
     """The asked one stood for it: the last sample of each message had a time that was wrong, up to a period's tenth
     for each sample before it, and the clock was said to lie where samples were dated after they had come.
     """
-    scene = Scene(Kind.FREE, real=real)
+    scene = Scene(StreamKind.FREE, real=real)
     for counter in range(50):
         scene.heard.whole(scene.message(counter), scene.base + (counter * 3 + 2) * real + 1000)
         scene.heard.finish()

@@ -22,7 +22,7 @@ from teds_provision.measure.sightings import MOST, TWIN, Sighting, Sightings
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
-from teds_provision.store.lock import Mark, Taken
+from teds_provision.store.lock import Mark, MarkTaken
 from teds_provision.teds.fits import parse_require
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
@@ -262,15 +262,15 @@ def test_a_mark_names_its_holder_and_tells_of_one_that_was_killed(tmp_path: Path
     with Mark(place, command="measure crane") as held:
         assert not held.left_behind
         assert Mark(place, command="").is_taken
-        with pytest.raises(Taken, match="measure crane"), Mark(place, command="set"):
+        with pytest.raises(MarkTaken, match="measure crane"), Mark(place, command="set"):
             pass
-        with pytest.raises(Taken), Mark(place, command="set", shared=True):
+        with pytest.raises(MarkTaken), Mark(place, command="set", shared=True):
             pass
     assert not Mark(place, command="").is_taken
     with (
         Mark(place, command="set a", shared=True),
         Mark(place, command="set b", shared=True),
-        pytest.raises(Taken, match="set b"),
+        pytest.raises(MarkTaken, match="set b"),
         Mark(place, command="measure"),
     ):
         pass

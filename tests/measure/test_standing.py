@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import PolicyRefused
-from teds_provision.measure.trusting import Standing
+from teds_provision.measure.trusting import NodeStanding
 from teds_provision.station.station import Station
-from teds_provision.store import Revocation
+from teds_provision.store import RevocationRecord
 from tests.bench import PASSPHRASE
 from tests.handover.desk import Pair
 
@@ -39,7 +39,7 @@ def forgotten(pair: Pair) -> None:
 
 
 def revoked(pair: Pair) -> None:
-    pair.north.policy.deny(Revocation(pair.board.uuid, None, "lost", "a statement"))
+    pair.north.policy.deny(RevocationRecord(pair.board.uuid, None, "lost", "a statement"))
     pair.north.keys.remove(pair.board.uuid)
 
 
@@ -57,7 +57,7 @@ def unlisted(pair: Pair) -> None:
 def test_a_node_that_was_moved_forgotten_or_revoked_is_measured_no_more(
     pair: Pair, measuring: Station, decide: Callable[[Pair], None], why: str
 ) -> None:
-    standing = Standing(measuring, pair.board.uuid)
+    standing = NodeStanding(measuring, pair.board.uuid)
     standing.require()
     decide(pair)
     with pytest.raises(PolicyRefused, match=why):
@@ -65,17 +65,17 @@ def test_a_node_that_was_moved_forgotten_or_revoked_is_measured_no_more(
 
 
 def test_a_copy_and_another_nodes_ban_end_no_measurement(pair: Pair, measuring: Station) -> None:
-    standing = Standing(measuring, pair.board.uuid)
+    standing = NodeStanding(measuring, pair.board.uuid)
     copied(pair)
-    pair.north.policy.deny(Revocation(bytes(10), None, "lost", "a statement"))
+    pair.north.policy.deny(RevocationRecord(bytes(10), None, "lost", "a statement"))
     standing.require()
 
 
 def test_off_the_whitelist_a_node_is_measured_on_and_not_moved(pair: Pair, measuring: Station) -> None:
-    standing = Standing(measuring, pair.board.uuid)
+    standing = NodeStanding(measuring, pair.board.uuid)
     unlisted(pair)
     standing.require()
-    driven = Standing(measuring, pair.board.uuid)
+    driven = NodeStanding(measuring, pair.board.uuid)
     driven.drives = True
     pair.north.nodes.remember(pair.board.uuid, name="another")  # any change of the store is looked at
     with pytest.raises(PolicyRefused, match="actuators are not moved"):

@@ -167,13 +167,16 @@ PATTERNS = (
     # measuring and the service
     Pattern(
         "a node that was moved is measured no more",
-        "Standing.require",
+        "NodeStanding.require",
         "policy.require_not_given_away(self._uuid)",
         "None",
         "tests/measure/test_standing.py",
     ),
     Pattern(
-        "off the whitelist nothing moves", "Standing.require", "require_whitelisted(self._station, self._uuid)", "None"
+        "off the whitelist nothing moves",
+        "NodeStanding.require",
+        "require_whitelisted(self._station, self._uuid)",
+        "None",
     ),
     Pattern("a set point grows old", "TopicActuators._seconds_left", "age > self._dead_man / 1000", "False"),
     Pattern("a set point grows old in the queue", "TopicActuators._send", "self._seconds_left(command)", "None"),

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.ncap.nodes.roster import MOST_GONE, Roster
+from teds_provision.ncap.nodes.roster import MOST_GONE, NodeDirectory
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, events
 from tests.ncap.service import Service, until, verdict
@@ -33,7 +33,7 @@ class Silence:
 def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest() -> None:
     nothing: Any = None
     silence: Any = Silence()
-    roster = Roster(nothing, silence)
+    roster = NodeDirectory(nothing, silence)
     roster.note("a" * 20, "came", present=True, looked=1.0)
     for number in range(5 * MOST_GONE):
         uuid = f"{number:020x}"

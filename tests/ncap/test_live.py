@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from websockets.sync.client import connect
 
 from teds_provision.measure.blocks import Block, ChannelFacts
-from teds_provision.ncap.live import BEAT, POINTS, Listener, Live, thinned
+from teds_provision.ncap.live import BEAT, POINTS, Live, LiveClient, thinned
 from teds_provision.teds.units import parse_unit
 from tests.ncap.service import Service, virtual
 from tests.pace import PATIENCE, best_of, succeeds, until
@@ -97,7 +97,7 @@ async def fed(live: Live, rate: float, seconds: float, channels: int = 1) -> Non
         await asyncio.sleep(0.02)
 
 
-async def heard(listener: Listener, feeding: asyncio.Task[None]) -> list[dict[str, Any]]:
+async def heard(listener: LiveClient, feeding: asyncio.Task[None]) -> list[dict[str, Any]]:
     """What comes until nothing is fed any more, and the last of that has come."""
     found: list[dict[str, Any]] = []
     while not feeding.done():

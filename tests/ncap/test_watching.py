@@ -14,7 +14,7 @@ import pytest
 from teds_provision.errors import LinkFailure
 from teds_provision.ncap.nodes import watching
 from teds_provision.ncap.nodes.desk import Turns
-from teds_provision.ncap.nodes.roster import MOST_GONE, Roster
+from teds_provision.ncap.nodes.roster import MOST_GONE, NodeDirectory
 from teds_provision.ncap.nodes.watching import MOST_KNOWN, Watch
 from tests.pace import until
 
@@ -42,7 +42,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     nothing: Any = None
     silence: Any = Silence()
     monkeypatch.setattr(watching, "is_listed", lambda _station, _uuid: False)
-    roster = Roster(nothing, silence)
+    roster = NodeDirectory(nothing, silence)
     monkeypatch.setattr(roster, "refresh", lambda _uuids=None: None)
     return Watch("can:x", nothing, roster, silence, Turns(), nothing, lambda: True, nothing)
 

@@ -15,10 +15,10 @@ from teds_provision.links.ports import Link
 from teds_provision.node import described
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
-from teds_provision.protocol.operation.can_frames import Assembly, cut, data_address, trigger_identifier
-from teds_provision.protocol.operation.commands import Operate, Operation
+from teds_provision.protocol.operation.can_frames import StreamAssembly, cut, data_address, trigger_identifier
+from teds_provision.protocol.operation.commands import Operate, OperationReply
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock, Subscribed
-from teds_provision.protocol.operation.subscription import Message, Plan, Receiver, TickBounds
+from teds_provision.protocol.operation.subscription import Receiver, StreamMessage, StreamPlan, TickBounds
 from teds_provision.protocol.operation.timing import ClockSample
 from teds_provision.protocol.session import StationSession
 from tests.pace import PATIENCE
@@ -61,8 +61,8 @@ class SealedLine:
     def operate(self, channel: int = 0, *, lease: int = 10, dead_man: int | None = None) -> None:
         self.send(Operate(channel, self.digest, lease, dead_man).command())
 
-    def states(self) -> Operation:
-        return Operation.decode(self.send(security_command(Function.OPERATION)))
+    def states(self) -> OperationReply:
+        return OperationReply.decode(self.send(security_command(Function.OPERATION)))
 
 
 class MeasuringStation(SealedLine):
@@ -87,13 +87,13 @@ class MeasuringStation(SealedLine):
     def now(self) -> TickBounds:
         return self.clock.tick(time.monotonic_ns())
 
-    def subscribe(self, plan: Plan) -> tuple[Receiver, Subscribed]:
+    def subscribe(self, plan: StreamPlan) -> tuple[Receiver, Subscribed]:
         reply = plan.accept(self.send(plan.command()), self.now())
         return Receiver(plan, reply, self.session.message_key), reply
 
-    def hear(self, receiver: Receiver, messages: int, seconds: float = PATIENCE) -> list[Message]:
+    def hear(self, receiver: Receiver, messages: int, seconds: float = PATIENCE) -> list[StreamMessage]:
         """The next messages of one stream."""
-        assembly, heard = Assembly(receiver.plan.length, fd=self.fd), []
+        assembly, heard = StreamAssembly(receiver.plan.length, fd=self.fd), []
         until = time.monotonic() + seconds
         while len(heard) < messages:
             left = until - time.monotonic()

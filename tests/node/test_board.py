@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.node.hardware.board import Battery, Board, Shown
+from teds_provision.node.hardware.board import ActuatorReading, Battery, Board
 from teds_provision.node.hardware.clock import NodeClock
 from teds_provision.protocol.operation.commands import PowerFlag
 from teds_provision.teds.image import Image
@@ -31,7 +31,7 @@ def test_every_shipped_profile_gives_samples(profile: str) -> None:
 
 
 def test_an_actuator_begins_and_ends_at_its_low_limit_and_bears_its_range() -> None:
-    shown: list[Shown] = []
+    shown: list[ActuatorReading] = []
     board = Board(sheet("gripper"), shown=shown.append)
     assert board.set_point(1) == b"\0\0"
     assert [board.bears(1, octets) for octets in (b"\0\0", b"\x0f\xff", b"\x10\x00")] == [True, True, False]

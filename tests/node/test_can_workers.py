@@ -120,8 +120,8 @@ def test_a_stored_reply_is_kept_from_its_end_however_long_the_command_ran(monkey
 
     handler = SimpleNamespace(request=slow)
     node = SimpleNamespace(measuring=None, handler=handler, counts_as_tapped=lambda: False)
-    line = seat.Line(node, 0xF1, SimpleNamespace(put=lambda job: job()))  # type: ignore[arg-type]
-    request = seat.Request(bytes.fromhex("01 8010 0000".replace(" ", "")), fd=False, received=0)
+    line = seat.StationLine(node, 0xF1, SimpleNamespace(put=lambda job: job()))  # type: ignore[arg-type]
+    request = seat.SeatRequest(bytes.fromhex("01 8010 0000".replace(" ", "")), fd=False, received=0)
     first = line.answer(request)
     now[0] += 4  # its last frame is taken
     line.reply_left()

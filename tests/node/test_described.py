@@ -11,7 +11,7 @@ from teds_provision.node import described
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds import compose
 from teds_provision.teds.codec.model import AccessCode
-from teds_provision.teds.formats import Block, write_blocks
+from teds_provision.teds.formats import TedsBlock, write_blocks
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
@@ -27,7 +27,7 @@ def image() -> Image:
 
 def files(folder: Path, image: Image) -> dict[str, Path]:
     """The same TEDS in each format that says their channels."""
-    blocks = [Block(channel, code, teds) for (channel, code), teds in image.blocks.items()]
+    blocks = [TedsBlock(channel, code, teds) for (channel, code), teds in image.blocks.items()]
     paths = {"image": folder / "node.json"}
     paths["image"].write_text(image.to_json())
     for form in ("xml", "hex", "json"):

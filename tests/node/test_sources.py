@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from teds_provision.errors import BadData, NoReader, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.node.sources import SOURCES, make_source
 from teds_provision.node.sources.base import Place, Reading
-from teds_provision.node.sources.lines import Lines, Stream
+from teds_provision.node.sources.lines import Lines, StandardInput
 
 ANGLE, FORCE = Place(1, "angle", -180.0, 180.0), Place(2, "force", 0.0, 5.0)
 PLACES = (ANGLE, FORCE, Place(3, "bare"))
@@ -214,7 +214,7 @@ def test_standard_input_ends_and_the_node_stays() -> None:
     reading, writing = os.pipe()
     told: list[str] = []
     with os.fdopen(reading, "rb") as stream:
-        source, clock = Stream(PLACES, told.append, stream), Clock()
+        source, clock = StandardInput(PLACES, told.append, stream), Clock()
         source.start(clock)
         os.write(writing, b'{"t": 1, "value": {"angle": 1}}\n{"t": 2, "val')
         assert wait_for(lambda: source.at(1, 1.0) == Reading(value=1.0))

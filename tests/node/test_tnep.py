@@ -49,7 +49,7 @@ class Desk:
         assert service is not None
         return Poller(self.mailbox, service)
 
-    def say(self, octets: bytes) -> tuple[message.Record, ...]:
+    def say(self, octets: bytes) -> tuple[message.NdefRecord, ...]:
         """Write one message and return the answer to it."""
         self.mailbox.write(octets)
         until = time.monotonic() + 5
@@ -183,5 +183,7 @@ def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(
 
 def test_a_charging_reader_that_writes_its_power_disturbs_nobody(desk: Desk) -> None:
     before = desk.mailbox.read()
-    assert desk.say(message.encode([message.Record(message.WELL_KNOWN, b"WLCINF", bytes(6))])) == message.decode(before)
+    assert desk.say(message.encode([message.NdefRecord(message.WELL_KNOWN, b"WLCINF", bytes(6))])) == message.decode(
+        before
+    )
     assert tnep.status_of(desk.say(select())) == tnep.SUCCESS

@@ -14,7 +14,7 @@ from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import Counting, counting
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.fold import Own, Statement, View, view
-from teds_provision.protocol.plant.page import Draft, Page, open_page, seal_page
+from teds_provision.protocol.plant.page import Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Member, Place, Removed, Roster, open_roster, seal_roster
 from teds_provision.protocol.plant.signer import Signing, Word, signing
 
@@ -54,7 +54,7 @@ class Speaker:
     def page(self, *events: Mapping[str, Any], heads: Mapping[str, Place] = {}, after: Place | None = None) -> Place:
         """Write the next page, or another one after an earlier place."""
         n, previous = self.head if after is None else after
-        draft = Draft(REGISTRY, n + 1, previous, "0" * 16, NOW, heads, (1, "0" * 64))
+        draft = PageDraft(REGISTRY, n + 1, previous, "0" * 16, NOW, heads, (1, "0" * 64))
         octets = seal_page(draft, events, self.key)
         self.pages.append(octets)
         opened = open_page(octets, REGISTRY, lambda kid: self.key.point)

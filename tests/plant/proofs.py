@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
 from teds_provision.plant.evidence import TOOL, sign_evidence
 from teds_provision.protocol.keys import PrivateKey, fingerprint
 from teds_provision.protocol.plant import evidence as codec
-from teds_provision.protocol.plant.evidence import Claim, Facts
+from teds_provision.protocol.plant.evidence import BoardFacts, EvidenceClaim
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
@@ -23,9 +23,9 @@ from tests.steps.test_provision import run
 BEGUN = "2026-03-01T11:29:00Z"
 
 
-def facts_of(station: Station, teds: bytes, **changes: Any) -> Facts:
+def facts_of(station: Station, teds: bytes, **changes: Any) -> BoardFacts:
     shown = security.decode(teds)
-    facts = Facts(
+    facts = BoardFacts(
         station=station.identity.fingerprint,
         job=None,
         unit=None,
@@ -48,7 +48,7 @@ def evidence_of(station: Station, board: Board, *, operator: str | None = None, 
     """Provision a board and have it sign."""
     teds = run(station, board).image.blocks[SECURITY]
     with talk(board) as node:
-        claim = Claim(board.uuid, teds, facts_of(station, teds, **changes))
+        claim = EvidenceClaim(board.uuid, teds, facts_of(station, teds, **changes))
         return sign_evidence(node, station.credentials(board.uuid), claim, operator=operator)
 
 

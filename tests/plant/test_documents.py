@@ -13,13 +13,13 @@ from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProv
 from teds_provision.protocol.handover.strict_json import decode_base64url
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
 from teds_provision.protocol.plant import document, event, page, roster
-from teds_provision.protocol.plant.document import Kind, NewerFormat, hash_of
+from teds_provision.protocol.plant.document import DocumentKind, NewerFormat, hash_of
 from teds_provision.protocol.plant.roster import Member, Removed, Roster, open_roster, seal_roster, taking
 
 KAT: dict[str, Any] = json.loads((Path(__file__).parent.parent / "vectors/profile/plant_kat.json").read_text())
 KEYS = {name: SoftwareKey(int(key["d"], 16)) for name, key in KAT["keys"].items()}
 POINTS = {key["fingerprint"]: bytes.fromhex(key["point"]) for key in KAT["keys"].values()}
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, DocumentKind] = {
     kind.format.split("/")[0].removeprefix("teds-"): kind
     for kind in (document.ROSTER, document.PAGE, document.MEMBER_REQUEST, document.JOB, document.SIGN_REQUEST,
                  document.SIGNED)
@@ -33,7 +33,7 @@ def octets_of(name: str) -> bytes:
     return octets.encode()
 
 
-def kind_of(name: str) -> Kind:
+def kind_of(name: str) -> DocumentKind:
     return KINDS[KAT["documents"][name]["typ"]]
 
 
@@ -293,7 +293,7 @@ def test_the_reset_of_the_known_answers_is_proven_and_no_other() -> None:
 
 
 def test_a_page_takes_no_more_than_readers_do() -> None:
-    draft = page.Draft(KAT["registry"], 1, "", "0" * 16, NOW, {}, (1, "0" * 64))
+    draft = page.PageDraft(KAT["registry"], 1, "", "0" * 16, NOW, {}, (1, "0" * 64))
     one = event.made("unpinned", "0" * 16, "2026-02-01T12:00:00Z", bytes(10), {})
     with pytest.raises(BadData, match="1000"):
         page.seal_page(draft, [one] * 1001, KEYS["west"])

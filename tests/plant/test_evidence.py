@@ -19,7 +19,7 @@ from teds_provision.errors import BadData, NodeSilent, NotAuthentic, TedsProvisi
 from teds_provision.plant.evidence import sign_evidence
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.protocol.plant import evidence as codec
-from teds_provision.protocol.plant.evidence import Claim
+from teds_provision.protocol.plant.evidence import EvidenceClaim
 from teds_provision.station.station import Station
 from teds_provision.teds.image import SECURITY
 from tests.bench import Board, MemoryLink, make_station, talk
@@ -138,7 +138,7 @@ def test_a_board_that_is_gone_leaves_the_stations_word_on_a_failed_attempt(stati
     teds = run(station, board).image.blocks[SECURITY]
     failed = facts_of(station, teds, steps=(("identify", "done", 9), ("write", "node-silent", 40)))
     with talk(board, MemoryLink(board, lose_request=1)) as node:
-        document = sign_evidence(node, station.credentials(board.uuid), Claim(board.uuid, teds, failed))
+        document = sign_evidence(node, station.credentials(board.uuid), EvidenceClaim(board.uuid, teds, failed))
     evidence = codec.read(document)
     assert (evidence.verdict, evidence.facts.failure, evidence.proof) == ("failed", "node-silent", b"")
     assert faults(station, document) == []
@@ -146,7 +146,7 @@ def test_a_board_that_is_gone_leaves_the_stations_word_on_a_failed_attempt(stati
 
 def test_a_board_that_passed_must_sign(station: Station, board: Board) -> None:
     teds = run(station, board).image.blocks[SECURITY]
-    claim = Claim(board.uuid, teds, facts_of(station, teds))
+    claim = EvidenceClaim(board.uuid, teds, facts_of(station, teds))
     with pytest.raises(NodeSilent), talk(board, MemoryLink(board, lose_request=1)) as node:
         sign_evidence(node, station.credentials(board.uuid), claim)
     other = Board()  # the same UUID, another key

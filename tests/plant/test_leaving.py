@@ -12,7 +12,7 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import KeyStolen
-from teds_provision.measure.trusting import Standing
+from teds_provision.measure.trusting import NodeStanding
 from teds_provision.plant import leaving
 from teds_provision.protocol.plant.roster import Share, Why
 from teds_provision.station.station import Station
@@ -175,7 +175,7 @@ def test_a_running_measurement_ends_for_a_thief_alone(scene: Scene, why: Why, cu
     uuid = board_of(scene.north, os.urandom(10)).uuid
     scene.sync(scene.north, scene.south, scene.north)
     measuring = Station.open(scene.north.home, ask=ask)  # the process that measures, beside `registry remove`
-    standing = Standing(measuring, uuid)
+    standing = NodeStanding(measuring, uuid)
     standing.require()
     scene.remove(scene.south, why)
     assert scene.marks(scene.north) == [uuid]
@@ -183,7 +183,7 @@ def test_a_running_measurement_ends_for_a_thief_alone(scene: Scene, why: Why, cu
         with pytest.raises(KeyStolen, match=r"stolen: south has had this key"):
             standing.require()
     standing.require()
-    Standing(measuring, uuid).require()  # a session that began since is not ended again
+    NodeStanding(measuring, uuid).require()  # a session that began since is not ended again
     measuring.close()
 
 

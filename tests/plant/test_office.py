@@ -16,7 +16,7 @@ import pytest
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
 from teds_provision.plant import jobs, office, parcels
-from teds_provision.plant.asking import NotAnswered, PostOffice, Refused, send
+from teds_provision.plant.asking import NotAnswered, OfficeRefused, PostOffice, send
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
@@ -34,7 +34,7 @@ from teds_provision.protocol.plant.signing import (
     seal_request,
 )
 from teds_provision.station.station import Station
-from teds_provision.store import Revocation
+from teds_provision.store import RevocationRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
@@ -176,7 +176,7 @@ def test_an_office_notices_that_what_its_profile_extends_was_edited(
     base = folder / "smart-sensor.toml"
     assert build(desk.run(), board(1)).verified.verdict == "authentic"
     base.write_text(base.read_text().replace('operation-timeout = "500 ms"', 'operation-timeout = "400 ms"'))
-    with pytest.raises(Refused, match=r"\(differs\)"):
+    with pytest.raises(OfficeRefused, match=r"\(differs\)"):
         build(desk.run(), board(2))
 
 
@@ -266,7 +266,7 @@ def test_a_revoked_board_and_a_job_that_is_over_are_refused(desk: Desk) -> None:
     one = board(1)
     request = desk.request(desk.run(), one)
     assert desk.asks(proven(request, desk.line, one, nonce=bytes(16)), jobs=[]).refused == "job"
-    desk.office.policy.deny(Revocation(one.uuid, None, "stolen", ""))
+    desk.office.policy.deny(RevocationRecord(one.uuid, None, "stolen", ""))
     assert desk.asks(request).refused == "revoked"
 
 
@@ -356,7 +356,7 @@ def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: D
     run, one = desk.run(), board(1)
     assert run.job is not None
     desk.office.plant.line.set_job_state(run.job.id, "closed")
-    with pytest.raises(Refused, match=r"\(job\): .*closed here\.$"):
+    with pytest.raises(OfficeRefused, match=r"\(job\): .*closed here\.$"):
         build(run, one)
     desk.office.plant.line.set_job_state(run.job.id, "open")
     assert build(run, one).verified.verdict == "authentic"

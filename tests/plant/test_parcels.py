@@ -131,7 +131,7 @@ def test_requests_that_nobody_answers_any_more_do_not_keep_jobs_out(plant: Plant
     plant.roster(ROLES)
     north, west = plant["north"], plant["west"]
 
-    def send(kind: document.Kind, n: int) -> None:
+    def send(kind: document.DocumentKind, n: int) -> None:
         members = {"format": kind.format, "id": f"6f1c0a52-6f0e-4c1b-8a55-{n:012d}"}
         signed = document.seal(members, north.vault.identity(), kind)
         sealed = jose.encrypt(signed, [west.point], cty=CONTENT_TYPE)

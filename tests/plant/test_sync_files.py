@@ -17,7 +17,7 @@ from teds_provision.plant.files import FilesPost
 from teds_provision.plant.folding import heads_digest, views
 from teds_provision.plant.sync import resume
 from teds_provision.protocol.plant.document import hash_of
-from teds_provision.protocol.plant.page import Draft, seal_page
+from teds_provision.protocol.plant.page import PageDraft, seal_page
 from teds_provision.station.station import Station
 from teds_provision.store import WhitelistEntry
 from tests.plant.stations import Plant, ask
@@ -276,7 +276,7 @@ def test_a_page_of_a_clock_a_year_ahead_counts_and_no_name_of_it_wins_for_ever(p
     chain, roster = south.plant.tables.chain(south.fingerprint), south.plant.roster
     assert roster is not None
     ahead = datetime.now(UTC) + timedelta(days=365)
-    draft = Draft(roster.registry, chain.counted[0] + 1, chain.counted[1], "0" * 16, ahead, {}, (1, "0" * 64))
+    draft = PageDraft(roster.registry, chain.counted[0] + 1, chain.counted[1], "0" * 16, ahead, {}, (1, "0" * 64))
     octets = seal_page(draft, [], south.vault.identity())
     FilesPost(plants.stick).append(south.fingerprint, draft.n, draft.previous, hash_of(octets), octets)
     plants.sync(plants.north)

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass, field
 
 from teds_provision.protocol.agreement import Credentials, StationAgreement
-from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
+from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.protocol.messages.frames import Command, Reply, decode_reply, update_teds, write_teds
@@ -112,7 +112,7 @@ class Desk:
             "key_epoch": self.flash.epoch,
             **changes,
         }
-        keys = NodeKeys(UUID, NODE.point, self.flash.node_key_signature)
+        keys = SignedNodeKey(UUID, NODE.point, self.flash.node_key_signature)
         sheet = unsigned_datasheet(keys, STATION.point, CREDENTIALS.station_signature, digests(listed), **values)
         return sign_datasheet(sheet, UUID, CREDENTIALS)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.protocol.announce import LAST_ADDRESS, MOST_A_MINUTE, Announce, Claim, uuid_crc
+from teds_provision.protocol.announce import LAST_ADDRESS, MOST_A_MINUTE, AddressClaim, Announce, uuid_crc
 
 
 def soon(low: float, high: float) -> float:
@@ -49,7 +49,7 @@ def test_other_frames_are_none(identifier: int, data: str) -> None:
 
 
 def test_the_first_announce_waits_up_to_half_a_second_and_leaves_once() -> None:
-    claim = Claim(5, uniform=lambda low, high: high)
+    claim = AddressClaim(5, uniform=lambda low, high: high)
     claim.start(10.0)
     assert claim.due(10.0) == 10.5
     claim.announced(10.5)
@@ -57,13 +57,13 @@ def test_the_first_announce_waits_up_to_half_a_second_and_leaves_once() -> None:
 
 
 def test_the_smaller_crc_stays_and_announces_again() -> None:
-    claim = Claim(5, uniform=lambda low, high: high)
+    claim = AddressClaim(5, uniform=lambda low, high: high)
     assert claim.take(Announce(33, 0, 6), 33, 1.0) == 33
     assert claim.due(1.0) == 1.05
 
 
 def test_the_greater_crc_moves_to_the_next_address_that_it_has_not_heard() -> None:
-    claim = Claim(6, uniform=soon)
+    claim = AddressClaim(6, uniform=soon)
     for source in (239, 1, 3):
         claim.hear(source)
     assert claim.take(Announce(238, 0, 5), 238, 1.0) == 2
@@ -71,13 +71,13 @@ def test_the_greater_crc_moves_to_the_next_address_that_it_has_not_heard() -> No
 
 
 def test_with_an_actuator_claimed_it_stays_and_announces() -> None:
-    claim = Claim(6, uniform=soon)
+    claim = AddressClaim(6, uniform=soon)
     assert claim.take(Announce(33, 0, 5), 33, 1.0, pinned=True) == 33
     assert claim.due(1.0) == 1.0
 
 
 def test_other_addresses_and_equal_crcs_move_nobody() -> None:
-    claim = Claim(6, uniform=soon)
+    claim = AddressClaim(6, uniform=soon)
     assert claim.take(Announce(34, 0, 5), 33, 1.0) == 33
     assert not claim.conflict
     assert claim.take(Announce(33, 0, 6), 33, 1.0) == 33
@@ -86,13 +86,13 @@ def test_other_addresses_and_equal_crcs_move_nobody() -> None:
 
 
 def test_an_address_from_which_an_announce_came_is_taken() -> None:
-    claim = Claim(6, uniform=soon)
+    claim = AddressClaim(6, uniform=soon)
     claim.take(Announce(34, 0, 5), 33, 1.0)
     assert claim.take(Announce(33, 0, 5), 33, 1.0) == 35
 
 
 def test_at_most_twenty_announces_a_minute() -> None:
-    claim, left = Claim(5, uniform=soon), 0
+    claim, left = AddressClaim(5, uniform=soon), 0
     for attempt in range(100):
         claim.take(Announce(33, 0, 6), 33, attempt * 0.1)
         if claim.due(attempt * 0.1) is not None:
@@ -107,7 +107,7 @@ def bus_of(nodes: int, seed: int, addresses: int = LAST_ADDRESS) -> list[int]:
     """Addresses of ``nodes`` on one bus once nobody announces any more."""
     dice = random.Random(seed)
     crcs = dice.sample(range(2**32), nodes)
-    claims = [Claim(crc, uniform=dice.uniform) for crc in crcs]
+    claims = [AddressClaim(crc, uniform=dice.uniform) for crc in crcs]
     at = [1 + crc % addresses for crc in crcs]
     for claim in claims:
         claim.start(0.0)

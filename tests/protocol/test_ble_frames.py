@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.protocol.messages.ble import Assembly, Received, cut, piece_octets
+from teds_provision.protocol.messages.ble import BleAssembly, Received, cut, piece_octets
 
 
 @pytest.mark.parametrize(("mtu", "octets"), [(23, 14), (247, 238), (515, 506), (517, 506), (1000, 506), (5, 14)])
@@ -16,7 +16,7 @@ def test_a_piece_has_at_most_what_an_attribute_value_holds(mtu: int, octets: int
 
 @given(st.integers(0, 0xFFFF), st.binary(max_size=4094), st.integers(23, 517))
 def test_messages_are_cut_and_put_together(transaction: int, message: bytes, mtu: int) -> None:
-    frames, assembly = list(cut(transaction, message, mtu)), Assembly(4094)
+    frames, assembly = list(cut(transaction, message, mtu)), BleAssembly(4094)
     assert [assembly.take(frame) for frame in frames] == [None] * (len(frames) - 1) + [Received(transaction, message)]
     assert all(len(frame) <= min(mtu - 3, 512) for frame in frames)
 
@@ -32,7 +32,7 @@ def test_frames_as_they_stand_on_the_air() -> None:
 @pytest.mark.parametrize("fault", ["missing", "doubled", "swapped", "other transaction", "other total", "too much"])
 def test_a_frame_that_does_not_continue_drops_its_message_and_no_other(fault: str) -> None:
     message = bytes(range(60))
-    frames, assembly = list(cut(7, message, 23)), Assembly(1024)
+    frames, assembly = list(cut(7, message, 23)), BleAssembly(1024)
     hurt = list(frames)
     match fault:
         case "missing":
@@ -52,14 +52,14 @@ def test_a_frame_that_does_not_continue_drops_its_message_and_no_other(fault: st
 
 
 def test_a_message_too_long_is_never_begun() -> None:
-    assembly = Assembly(1024)
+    assembly = BleAssembly(1024)
     assert not [found for frame in cut(1, bytes(1025), 247) if (found := assembly.take(frame)) is not None]
     assert [assembly.take(frame) for frame in cut(2, bytes(1024), 247)][-1] == Received(2, bytes(1024))
 
 
 @given(st.lists(st.binary(max_size=40), max_size=20))
 def test_junk_makes_no_message_of_another_length(frames: list[bytes]) -> None:
-    assembly = Assembly(100)
+    assembly = BleAssembly(100)
     for frame in frames:
         found = assembly.take(frame)
         assert found is None or len(found.message) == int.from_bytes(frame[2:4], "big")

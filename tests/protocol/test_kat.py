@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.protocol import keys
 from teds_provision.protocol.agreement import Credentials, StationAgreement, derive
-from teds_provision.protocol.datasheet import NodeKeys, sign_datasheet, unsigned_datasheet
+from teds_provision.protocol.datasheet import SignedNodeKey, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Command, decode_reply
@@ -153,7 +153,7 @@ def test_the_signed_datasheet_is_the_vectors() -> None:
     sheet = KAT["datasheet"]
     listed = {(b["channel"], b["access_code"]): bytes.fromhex(b["sha256"]) for b in sheet["blocks"]}
     unsigned = unsigned_datasheet(
-        NodeKeys(UUID, key("node").point, octets("sig102", "signature")),
+        SignedNodeKey(UUID, key("node").point, octets("sig102", "signature")),
         key("station").point,
         octets("sig104", "signature"),
         listed,

@@ -18,7 +18,7 @@ from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.calibration import Calibration, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm
-from teds_provision.teds.channel import Channel, Kind
+from teds_provision.teds.channel import Channel, ChannelKind
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.guard import misfit
 from teds_provision.teds.profile import load_profile
@@ -134,8 +134,8 @@ def test_what_is_compared() -> None:
     assert misfit(calibration, had, had, load_profile(ANGLE).channel(1)) == ""
     assert misfit(calibration, had, replace(had, name="other", uncertainty=0.1), None) == ""
     for change, words in (
-        ({"kind": Kind.ACTUATOR}, "another type of channel (sensor, not actuator)"),
-        ({"kind": Kind.EVENT_SENSOR}, "event sensor"),
+        ({"kind": ChannelKind.ACTUATOR}, "another type of channel (sensor, not actuator)"),
+        ({"kind": ChannelKind.EVENT_SENSOR}, "event sensor"),
         ({"units": parse_unit("m").units}, "values in rad, and these are in m"),
         ({"sample": replace(form, model=3)}, "fraction"),
         ({"sample": SampleForm(0, 4)}, "4 octets"),

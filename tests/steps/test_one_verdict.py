@@ -28,7 +28,7 @@ from teds_provision.steps.read import read_image
 from teds_provision.steps.sign import known_node_keys
 from teds_provision.steps.verify import possession
 from teds_provision.steps.verify_node import Looked, look_at_node, look_in_session, verify_node
-from teds_provision.store import Reading, Revocation, utc_now
+from teds_provision.store import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY
@@ -202,7 +202,7 @@ def test_another_security_teds_makes_everything_be_read(station: Station, board:
 
 @given(first=st.integers(0, 2**64 - 1), opens=st.integers(0, 2**64 - 1))
 def test_c_tells_a_restart(first: int, opens: int) -> None:
-    row = Reading(bytes(10), utc_now(), "verify", first.to_bytes(8, "big"), True, b"")
+    row = NodeReading(bytes(10), utc_now(), "verify", first.to_bytes(8, "big"), True, b"")
     later = ((first + opens) % 2**64).to_bytes(8, "big")
     assert row.is_of_this_start(later) == (opens < 2**32)
 
@@ -224,7 +224,7 @@ def test_what_is_said_in_no_session_changes_no_row(station: Station, board: Boar
 
 
 def test_a_reading_in_no_session_is_replaced_by_any(station: Station) -> None:
-    row = Reading(bytes(10), "2026-01-01T00:00:00Z", "verify", None, True, b"")
+    row = NodeReading(bytes(10), "2026-01-01T00:00:00Z", "verify", None, True, b"")
     assert station.nodes.keep_reading(row)
     assert station.nodes.keep_reading(replace(row, by="other"))
     assert station.nodes.keep_reading(replace(row, by="measure", c=bytes(8)))
@@ -233,14 +233,14 @@ def test_a_reading_in_no_session_is_replaced_by_any(station: Station) -> None:
 
 
 def test_a_row_that_no_reading_of_ours_made_is_never_authentic(station: Station) -> None:
-    station.nodes.keep_reading(Reading(bytes(10), utc_now(), "x", bytes(8), True, b""))
+    station.nodes.keep_reading(NodeReading(bytes(10), utc_now(), "x", bytes(8), True, b""))
     judged = reading.verdict_of(station, bytes(10))
     assert judged is not None
     assert judged.verified.verdict == "unsigned"
 
 
 def test_a_ban_of_today_is_in_the_verdict_of_a_reading_of_yesterday(station: Station, board: Board) -> None:
-    station.policy.deny(Revocation(board.uuid, None, "stolen", "{}"))
+    station.policy.deny(RevocationRecord(board.uuid, None, "stolen", "{}"))
     assert shown(station, board) == ("not authentic", "session")
     judged = reading.verdict_of(station, board.uuid)
     assert judged is not None

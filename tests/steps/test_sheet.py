@@ -8,11 +8,19 @@ import pytest
 
 from teds_provision.errors import BadData, NodeBusy, NodeSilent, NoNode
 from teds_provision.station.station import Station
-from teds_provision.steps.batch_sheet import About, Board, Declined, Progress, Sheet, read_sheet, write_report
+from teds_provision.steps.batch_sheet import (
+    About,
+    BatchSheet,
+    BoardResult,
+    Declined,
+    Progress,
+    read_sheet,
+    write_report,
+)
 from teds_provision.steps.build import BuildOrder
 
 
-def read(station: Station, folder: Path, text: str | bytes) -> Sheet:
+def read(station: Station, folder: Path, text: str | bytes) -> BatchSheet:
     file = folder / "boards.csv"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     return read_sheet(station, file, BuildOrder(profile="load-cell"))
@@ -80,7 +88,7 @@ def test_rows_go_to_boards_in_the_order_of_the_taps_and_to_a_spare_at_last(stati
         progress.take(row, board_of(number))
         progress.rows[number].result = "failed" if error else "passed"
         if error:
-            progress.note(row, Board(board_of(number), 1.0, error=error, row=number))
+            progress.note(row, BoardResult(board_of(number), 1.0, error=error, row=number))
     progress.save()
     again = Progress(station.home, progress.sheet)
     assert [row.number for row in again.open] == [2]
@@ -104,8 +112,8 @@ def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station
         other.take(first, board_of(2))
     assert other.row_for(board_of(2), "") is second
     other.take(second, board_of(2))
-    other.note(second, Board(board_of(2), 1.0, error=NodeSilent("It was pulled."), row=2))
-    one.note(first, Board(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
+    other.note(second, BoardResult(board_of(2), 1.0, error=NodeSilent("It was pulled."), row=2))
+    one.note(first, BoardResult(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
     one.take(third, board_of(3))
     again = Progress(station.home, sheet)
     assert [again.board_of(row) for row in sheet.rows] == [board_of(number).hex() for number in (1, 2, 3)]
@@ -116,7 +124,7 @@ def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station
 def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tmp_path: Path) -> None:
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
     progress.take(progress.sheet.rows[0], board_of(1))
-    progress.note(progress.sheet.rows[0], Board(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
+    progress.note(progress.sheet.rows[0], BoardResult(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
     row = progress.row_for(board_of(2), "")
     assert row is not None
     assert row.number == 2
@@ -127,7 +135,7 @@ def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Pa
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
     first, second, _ = progress.sheet.rows
     progress.turn_away(first, board_of(1))
-    progress.note(first, Board(board_of(1), 1.0, error=NodeSilent("Its name is another's."), row=1))
+    progress.note(first, BoardResult(board_of(1), 1.0, error=NodeSilent("Its name is another's."), row=1))
     assert progress.row_for(board_of(1), "") is first, "held there again it is tried for the same row"
     assert progress.row_for(board_of(2), "") is second
     assert progress.next_row is second
@@ -139,10 +147,10 @@ def test_a_no_is_no_try_of_a_board(station: Station, tmp_path: Path) -> None:
     """A board that passed when it was held there again counted as one that needed two tries."""
     progress = Progress(station.home, read(station, tmp_path, "name\na\n"))
     (row,) = progress.sheet.rows
-    progress.note(row, Board(board_of(1), 1.0, error=Declined("You said no."), row=1))
+    progress.note(row, BoardResult(board_of(1), 1.0, error=Declined("You said no."), row=1))
     assert (progress.rows[1].result, progress.rows[1].tries) == ("skipped", 0)
     progress.rows[1].result = ""
-    progress.note(row, Board(board_of(1), 1.0, row=1))
+    progress.note(row, BoardResult(board_of(1), 1.0, row=1))
     assert (progress.rows[1].result, progress.rows[1].tries, progress.rows[1].first) == ("passed", 1, True)
     assert progress.totals().first_pass == 1.0
 
@@ -159,7 +167,7 @@ def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path
 def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(station: Station, tmp_path: Path) -> None:
     progress = Progress(station.home, read(station, tmp_path, "name\n<b>\nb\n"))
     progress.take(progress.sheet.rows[0], bytes(10))
-    progress.note(progress.sheet.rows[0], Board(bytes(10), 1.23, error=NodeSilent("It is <silent>."), row=1))
+    progress.note(progress.sheet.rows[0], BoardResult(bytes(10), 1.23, error=NodeSilent("It is <silent>."), row=1))
     about = About("bench <1>", "ab" * 32, "Ada", "teds-provision 9")
     write_report(tmp_path / "day.html", progress, about)
     text = (tmp_path / "day.html").read_text()

@@ -15,7 +15,7 @@ from teds_provision.files import json_files
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, station_key_message, to_pem
 from teds_provision.steps import verify_files as many
-from teds_provision.steps.verify_files import FileVerdict, Totals
+from teds_provision.steps.verify_files import FileVerdict, VerdictTotals
 from teds_provision.teds.calibration import Calibration, CalibrationInput
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
@@ -31,7 +31,7 @@ def signed(number: int, calibration: Calibration | None = None, *, ca: SoftwareK
     uuid, node = number.to_bytes(10, "big"), SoftwareKey.from_secret((1000 + number).to_bytes(32, "big"))
     profile = load_profile("magnetic-angular-position-sensor")
     blocks = dict(profile.build(uuid, calibration={1: calibration} if calibration else {}).blocks)
-    keys = datasheet.NodeKeys(uuid, node.point, node.sign(node_key_message(uuid, node.point)))
+    keys = datasheet.SignedNodeKey(uuid, node.point, node.sign(node_key_message(uuid, node.point)))
     teds = datasheet.unsigned_datasheet(
         keys,
         STATION.point,
@@ -212,7 +212,7 @@ def test_images_of_a_folder_come_by_name_folders_in_their_place_links_to_files_t
 
 def test_the_worst_exit_code_wins_whatever_the_order() -> None:
     for codes in ((0, 6, 4), (4, 0, 8), (4,)):
-        totals = Totals()
+        totals = VerdictTotals()
         for code in codes:
             totals.add(FileVerdict(Path("x"), exit_code=code))
         assert totals.exit_code == 4

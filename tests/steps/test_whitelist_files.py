@@ -12,21 +12,21 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotFound, OtherKey, PolicyRefused
 from teds_provision.station.station import Station
-from teds_provision.steps.whitelist import FORMATS, Listed, add, plan_addition, read_whitelist, remove, render
-from teds_provision.store import Revocation, WhitelistEntry
+from teds_provision.steps.whitelist import FORMATS, ListedNode, add, plan_addition, read_whitelist, remove, render
+from teds_provision.store import RevocationRecord, WhitelistEntry
 from tests.pace import costs_at_most
 
 ONE, TWO = bytes.fromhex("8d4d9da65281f7000000"), bytes.fromhex("8d4d9da65281f7000001")
 KEY, OTHER = "ab" * 32, "cd" * 32
 
 
-def read(folder: Path, text: str, name: str = "list.txt") -> list[Listed]:
+def read(folder: Path, text: str, name: str = "list.txt") -> list[ListedNode]:
     path = folder / name
     path.write_text(text)
     return read_whitelist(path)
 
 
-def pairs(listed: list[Listed]) -> list[tuple[bytes, str | None]]:
+def pairs(listed: list[ListedNode]) -> list[tuple[bytes, str | None]]:
     return [(entry.uuid, entry.fingerprint) for entry in listed]
 
 
@@ -196,43 +196,43 @@ def test_more_entries_than_a_whitelist_has_are_refused(tmp_path: Path) -> None:
 # -- trust -------------------------------------------------------------------------------------------------------------
 
 
-def put(station: Station, *listed: Listed) -> None:
+def put(station: Station, *listed: ListedNode) -> None:
     add(station, plan_addition(station, listed), source="test")
 
 
 def test_a_pinned_key_is_never_replaced_and_one_conflict_refuses_all(station: Station) -> None:
-    put(station, Listed(1, ONE, KEY))
+    put(station, ListedNode(1, ONE, KEY))
     with pytest.raises(OtherKey, match="pinned to the key abababababababab") as caught:
-        plan_addition(station, [Listed(1, TWO), Listed(2, ONE, OTHER)])
+        plan_addition(station, [ListedNode(1, TWO), ListedNode(2, ONE, OTHER)])
     assert caught.value.exit_code == 6
     assert station.pins.entry(TWO) is None
 
 
 def test_an_unpinned_entry_gains_a_key_and_keeps_the_rest(station: Station) -> None:
-    put(station, Listed(1, ONE, name="finger"))
+    put(station, ListedNode(1, ONE, name="finger"))
     before = station.pins.entry(ONE)
     assert before is not None
     assert before.assurance == "uuid"
-    put(station, Listed(1, ONE, KEY, "thumb"))
+    put(station, ListedNode(1, ONE, KEY, "thumb"))
     after = station.pins.entry(ONE)
     assert after is not None
     assert (after.fingerprint, after.name, after.assurance, after.added) == (KEY, "finger", "import", before.added)
-    assert plan_addition(station, [Listed(1, ONE), Listed(2, ONE, KEY)]).write == ()
+    assert plan_addition(station, [ListedNode(1, ONE), ListedNode(2, ONE, KEY)]).write == ()
 
 
 def test_the_key_that_a_node_has_proved_counts_as_pinned(station: Station) -> None:
     station.nodes.remember(ONE, point=station.point)
     with pytest.raises(OtherKey):
-        plan_addition(station, [Listed(1, ONE, KEY)])
-    put(station, Listed(1, ONE, station.fingerprint))
+        plan_addition(station, [ListedNode(1, ONE, KEY)])
+    put(station, ListedNode(1, ONE, station.fingerprint))
     assert remove(station, ONE)
     assert not remove(station, ONE)
-    put(station, Listed(1, ONE, KEY))  # the board was replaced
+    put(station, ListedNode(1, ONE, KEY))  # the board was replaced
 
 
 def test_removing_keeps_epoch_and_sequence(station: Station) -> None:
     station.nodes.remember(ONE, point=station.point, epoch=3, sequence=9)
-    put(station, Listed(1, ONE))
+    put(station, ListedNode(1, ONE))
     remove(station, ONE)
     known = station.nodes.get(ONE)
     assert known is not None
@@ -240,18 +240,18 @@ def test_removing_keeps_epoch_and_sequence(station: Station) -> None:
 
 
 def test_a_revoked_node_is_not_whitelisted_again(station: Station) -> None:
-    station.policy.deny(Revocation(ONE, None, "stolen", "{}"))
+    station.policy.deny(RevocationRecord(ONE, None, "stolen", "{}"))
     with pytest.raises(PolicyRefused, match="stolen"):
-        plan_addition(station, [Listed(1, ONE)])
+        plan_addition(station, [ListedNode(1, ONE)])
 
 
 def test_a_list_of_many_pages_is_held_against_what_is_known_on_each(station: Station) -> None:
     """Pages end at 500: the entries on the last one count as those on the first."""
-    listed = [Listed(number, number.to_bytes(10, "big"), KEY) for number in range(1201)]
+    listed = [ListedNode(number, number.to_bytes(10, "big"), KEY) for number in range(1201)]
     add(station, plan_addition(station, listed[:1000]), source="test")
     plan = plan_addition(station, listed)
     assert (plan.new, plan.unchanged, len(plan.write)) == (201, 1000, 201)
-    other = [*listed[:999], Listed(999, listed[999].uuid, OTHER), *listed[1000:]]
+    other = [*listed[:999], ListedNode(999, listed[999].uuid, OTHER), *listed[1000:]]
     with pytest.raises(OtherKey, match=listed[999].uuid.hex()):
         plan_addition(station, other)
 

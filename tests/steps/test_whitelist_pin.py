@@ -8,12 +8,12 @@ from teds_provision.errors import OtherKey
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.steps.identify import identify
-from teds_provision.steps.whitelist import Listed, add, plan_addition, remove
+from teds_provision.steps.whitelist import ListedNode, add, plan_addition, remove
 from tests.bench import Board, MemoryLink, talk
 
 
 def test_the_first_tap_pins_the_key_and_raises_the_assurance(station: Station, board: Board) -> None:
-    add(station, plan_addition(station, [Listed(0, board.uuid, name="finger")]))
+    add(station, plan_addition(station, [ListedNode(0, board.uuid, name="finger")]))
     who = identify(station, talk(board))
     entry = station.pins.entry(board.uuid)
     assert entry is not None
@@ -25,7 +25,7 @@ def test_the_first_tap_pins_the_key_and_raises_the_assurance(station: Station, b
 
 
 def test_a_bus_pins_nothing(station: Station, board: Board) -> None:
-    add(station, plan_addition(station, [Listed(0, board.uuid)]))
+    add(station, plan_addition(station, [ListedNode(0, board.uuid)]))
     identify(station, talk(board, MemoryLink(board, via="can", tapped=False)))
     entry = station.pins.entry(board.uuid)
     assert entry is not None
@@ -35,13 +35,13 @@ def test_a_bus_pins_nothing(station: Station, board: Board) -> None:
 def test_another_board_under_the_same_uuid_is_refused_until_the_entry_is_removed(
     station: Station, board: Board
 ) -> None:
-    add(station, plan_addition(station, [Listed(0, board.uuid)]))
+    add(station, plan_addition(station, [ListedNode(0, board.uuid)]))
     identify(station, talk(board))
     replaced = Board(board.uuid)
     with pytest.raises(OtherKey):
         identify(station, talk(replaced))
     remove(station, board.uuid)
-    add(station, plan_addition(station, [Listed(0, board.uuid)]))
+    add(station, plan_addition(station, [ListedNode(0, board.uuid)]))
     identify(station, talk(replaced))
     entry = station.pins.entry(board.uuid)
     assert entry is not None

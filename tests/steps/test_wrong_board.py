@@ -14,10 +14,10 @@ from teds_provision.node.hardware.board import Board as Hardware
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.protocol.operation.commands import OPERATION, ChannelState, Operation
+from teds_provision.protocol.operation.commands import OPERATION, ChannelState, OperationReply
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session, reset_node
-from teds_provision.steps.batch import Boards, Questions, Request
+from teds_provision.steps.batch import Boards, ProvisionRequest, Questions
 from teds_provision.steps.board_type import WrongBoard, bears, differences, operate
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
@@ -171,7 +171,7 @@ def test_the_check_shows_one_real_reading_and_claims_nothing(
     assert 0 <= sample["value"] < 6.2832
     with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
         require_session(station, node)
-        told = Operation.decode(node.send(OPERATION, "to tell its mode"))
+        told = OperationReply.decode(node.send(OPERATION, "to tell its mode"))
     assert (told.measuring, told.channels[1]) == (False, (ChannelState(0), 0)), "nothing is claimed"
 
 
@@ -195,9 +195,9 @@ def test_reason_6_and_23_of_operate_have_words_of_their_own(
 def test_a_row_of_a_sheet_waits_for_its_own_board(station: Station, angle: VirtualNode, tmp_path: Path) -> None:
     sheet = tmp_path / "boards.csv"
     sheet.write_text("uuid,name,profile\n,cell,load-cell\n")
-    boards = Boards(station, LinkSettings("nfc"), Request(None, BuildOrder(), sheet=sheet), Silent())
+    boards = Boards(station, LinkSettings("nfc"), ProvisionRequest(None, BuildOrder(), sheet=sheet), Silent())
     asked = Questions(lambda _who: None, None)
-    from teds_provision.steps.batch_sheet import Board as Ended
+    from teds_provision.steps.batch_sheet import BoardResult as Ended
 
     def tap(contact: Contact) -> Ended:
         with Conversation(contact, notice=lambda _notice: None) as node:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import PolicyRefused, StoreFailure, UsageFailure
-from teds_provision.store import Handover, Holder, Revocation, Store, Tombstone, TrustRecord
+from teds_provision.store import Handover, Holder, RevocationRecord, Store, Tombstone, TrustRecord
 
 NODE = bytes(range(10))
 LAB = TrustRecord("lab", "station", b"\x04" + bytes(64), "ab" * 32)
@@ -87,7 +87,7 @@ def test_holders_are_listed_per_node_and_in_all(store: Store) -> None:
 
 
 def test_a_revocation_is_kept_with_its_statement(store: Store) -> None:
-    revocation = Revocation(NODE, None, "stolen", "eyJ.x.y")
+    revocation = RevocationRecord(NODE, None, "stolen", "eyJ.x.y")
     store.put_revocation(revocation)
     assert store.revocation(NODE) == revocation
     assert store.revocations() == [revocation]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFound, StoreFailure
-from teds_provision.store import Facts, KeyRecord, NodeRecord, Store
+from teds_provision.store import KeyRecord, NodeRecord, StationRecord, Store
 
 NODE = bytes(range(10))
 OTHER = bytes(range(1, 11))
@@ -100,7 +100,7 @@ def test_transactions_nest_and_undo_only_what_failed(store: Store) -> None:
             raise RuntimeError
     assert [node.uuid for node in store.nodes()] == [NODE]
     with suppress(RuntimeError), store.transaction():
-        store.put_facts(Facts("lost", "file"))
+        store.put_facts(StationRecord("lost", "file"))
         with store.transaction():
             store.add_key(a_key(1))
         raise RuntimeError

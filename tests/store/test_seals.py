@@ -15,7 +15,7 @@ from teds_provision.errors import PolicyRefused, StoreChanged, WrongPassphrase
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise, rewrap
-from teds_provision.store import Revocation, TrustRecord, WhitelistEntry
+from teds_provision.store import RevocationRecord, TrustRecord, WhitelistEntry
 from teds_provision.vault import forget_vaults, passphrase
 
 NODE = bytes(range(10))
@@ -154,7 +154,7 @@ def test_a_planted_end_of_trust_and_a_planted_lifting_do_not_count(home: Path, o
 
 def test_a_lifting_needs_the_vault(opened: Open) -> None:
     station = opened(ask=nobody)
-    station.policy.deny(Revocation(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
+    station.policy.deny(RevocationRecord(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
     with pytest.raises(WrongPassphrase):
         station.policy.lift(NODE)
     assert station.policy.revocation(NODE) is not None
@@ -164,7 +164,7 @@ def test_an_end_of_trust_and_a_lifting_that_a_person_made_hold(opened: Open) -> 
     station = opened()
     station.unlock()
     station.policy.end_ca(OTHER)
-    station.policy.deny(Revocation(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
+    station.policy.deny(RevocationRecord(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
     assert station.policy.lift(NODE)
     station.close()
     said: list[str] = []

@@ -17,14 +17,14 @@ import pytest
 
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds.image import Image
-from teds_provision.teds.sheet import Kind, Sheet
+from teds_provision.teds.sheet import ChannelKind, Sheet
 from tests.e2e.desk import ANGLE, Running
 from tests.measure.hall import Hall, events, of, ran
 from tests.pace import succeeds, until
 from tests.strangers.wire import of_spec
 
 pytestmark = pytest.mark.link
-KINDS = {Kind.SENSOR: "sensor", Kind.EVENT_SENSOR: "event sensor", Kind.ACTUATOR: "actuator"}
+KINDS = {ChannelKind.SENSOR: "sensor", ChannelKind.EVENT_SENSOR: "event sensor", ChannelKind.ACTUATOR: "actuator"}
 
 
 @dataclass
@@ -53,7 +53,7 @@ class Stranger:
         sheet = Sheet.of(Image(flash.uuid, dict(flash.blocks)))
         channels = {
             one.number: {
-                "kind": KINDS[Kind(one.kind)],
+                "kind": KINDS[ChannelKind(one.kind)],
                 "octets": one.sample.octets,
                 "shortest": int(one.period * 1e9 * (1 - 1e-6)) if one.period > 0 else 1,
                 "bears": [0, 4095],

@@ -93,7 +93,7 @@ def test_recompose_refuses_what_has_no_fields(name: str) -> None:
 def test_any_octets_decode(octets: bytes) -> None:
     decoded = teds.decode(octets)
     assert decoded.octets == octets
-    assert decoded.verdict in set(teds.Verdict)
+    assert decoded.verdict in set(teds.Conformity)
 
 
 @given(access_code=st.integers(0, 255), content=st.binary(max_size=300), long=st.booleans(), width=st.integers(0, 5))

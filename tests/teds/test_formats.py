@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.errors import BadData, NotFound
 from teds_provision.teds.codec.frame import frame
-from teds_provision.teds.formats import FORMATS, Block, class_of, detect, lost, read_blocks, write_blocks
+from teds_provision.teds.formats import FORMATS, TedsBlock, class_of, detect, lost, read_blocks, write_blocks
 from teds_provision.teds.formats.intelhex import stretches, write_intel_hex
 from teds_provision.teds.formats.tree import from_tree, shortest, to_tree
 from teds_provision.teds.image import split_run
@@ -74,7 +74,7 @@ def test_a_profile_names_what_it_cannot_hold():
         next(p for p in PROFILES if p.stem == "load-cell").read_bytes(), path=PROFILES[0].parent / "load-cell.toml"
     )
     calibration = teds.compose(5, {"LowLimit": 0.0, "HiLimit": 1.0, "OError": 0.1})
-    blocks = [*channel, Block(1, 5, calibration), Block(0, 16, octets_of(_vector("x24_security")))]
+    blocks = [*channel, TedsBlock(1, 5, calibration), TedsBlock(0, 16, octets_of(_vector("x24_security")))]
     said = " ".join(lost(blocks, "toml"))
     assert "CalTEDS of channel 1 (calibrations come from a file of their own)" in said
     assert "SecurityTEDS2024 of channel 0" in said
@@ -87,12 +87,12 @@ def test_a_field_without_a_key_is_named_by_a_profile():
     path = PROFILES[0].parent / "load-cell.toml"
     others = [block for block in read_blocks(path.read_bytes(), path=path) if block.access_code != 1]
     fields = [("UUID", bytes(10)), ("OholdOff", 1.0), ("TestTime", 0.0), ("MaxChan", 7), ("200", b"own")]
-    said = lost([Block(0, 1, teds.compose(1, fields)), *others], "toml")
+    said = lost([TedsBlock(0, 1, teds.compose(1, fields)), *others], "toml")
     assert said == ("MetaTEDS of channel 0: MaxChan, type 200.",)
 
 
 def test_teds_without_a_channel_make_no_profile_and_that_is_said():
-    assert "does not load" in lost([Block(0, 1, META)], "toml")[0]
+    assert "does not load" in lost([TedsBlock(0, 1, META)], "toml")[0]
 
 
 def test_a_profile_that_extends_another_is_read_beside_it(tmp_path):
@@ -172,12 +172,12 @@ def test_a_run_of_framed_teds_is_cut_apart_and_a_broken_one_is_not():
     assert split_run(broken) == [broken]
     assert [block.access_code for block in read_blocks(META + NAME)] == [1, 12]
     with pytest.raises(BadData, match="right Length and checksum"):
-        write_blocks([Block(0, 1, META), Block(0, 12, broken)], "binary")
-    assert lost([Block(1, 12, NAME)], "binary") == ("the channels of the TEDS.",)
+        write_blocks([TedsBlock(0, 1, META), TedsBlock(0, 12, broken)], "binary")
+    assert lost([TedsBlock(1, 12, NAME)], "binary") == ("the channels of the TEDS.",)
 
 
 def test_hex_keeps_places_in_comments_and_other_comments_mean_nothing():
-    blocks = [Block(0, 1, META), Block(7, 12, NAME), Block(None, 12, NAME)]
+    blocks = [TedsBlock(0, 1, META), TedsBlock(7, 12, NAME), TedsBlock(None, 12, NAME)]
     text = write_blocks(blocks, "hex")
     assert "# channel 7 access code 12 (XdcrName)" in text
     assert read_blocks(b"# made by somebody\n" + text.encode()) == blocks
@@ -185,8 +185,8 @@ def test_hex_keeps_places_in_comments_and_other_comments_mean_nothing():
 
 def test_intel_hex_crosses_64_kib_and_is_what_other_tools_read():
     blocks = [
-        Block(None, 1, META),
-        Block(None, 128, frame(bytes.fromhex("030400800102") + b"\x80\xff\xff" + bytes(0xFFFF))),
+        TedsBlock(None, 1, META),
+        TedsBlock(None, 128, frame(bytes.fromhex("030400800102") + b"\x80\xff\xff" + bytes(0xFFFF))),
     ]
     text = write_intel_hex(blocks, address=0xFFF0)
     assert read_blocks(text.encode()) == blocks
@@ -203,14 +203,14 @@ def test_intel_hex_with_segment_base_and_start_records_of_other_tools():
 
 
 def test_an_image_needs_a_uuid_and_places():
-    image = json.loads(write_blocks([Block(0, 1, META), Block(1, 12, NAME)], "image"))
+    image = json.loads(write_blocks([TedsBlock(0, 1, META), TedsBlock(1, 12, NAME)], "image"))
     assert (image["uuid"], len(image["blocks"])) == ("00010203040506070809", 2)
     with pytest.raises(BadData, match="UUID"):
-        write_blocks([Block(0, 12, NAME)], "image")
+        write_blocks([TedsBlock(0, 12, NAME)], "image")
     with pytest.raises(BadData, match="channel and access code"):
-        write_blocks([Block(None, 12, NAME)], "image")
+        write_blocks([TedsBlock(None, 12, NAME)], "image")
     with pytest.raises(BadData, match="Two TEDS"):
-        write_blocks([Block(0, 1, META), Block(0, 1, META)], "image")
+        write_blocks([TedsBlock(0, 1, META), TedsBlock(0, 1, META)], "image")
 
 
 def test_json_can_be_written_by_hand_without_octets():
@@ -312,14 +312,16 @@ def known_teds(draw):
         200: [("17", draw(st.binary(max_size=5)))],
     }[code]
     octets = teds.compose(code, fields, edition=edition, width=draw(st.sampled_from([None, 2])))
-    return Block(draw(st.none() | st.integers(0, 65535)), code, octets)
+    return TedsBlock(draw(st.none() | st.integers(0, 65535)), code, octets)
 
 
 def damaged(block, data):
     octets = bytearray(block.octets)
     for _ in range(data.draw(st.integers(0, 3))):
         octets[data.draw(st.integers(0, len(octets) - 1))] = data.draw(SMALL)
-    return Block(block.channel, class_of(bytes(octets)) if block.channel is None else block.access_code, bytes(octets))
+    return TedsBlock(
+        block.channel, class_of(bytes(octets)) if block.channel is None else block.access_code, bytes(octets)
+    )
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
@@ -362,7 +364,7 @@ def test_any_octets_are_read_or_refused_with_bad_data(octets):
 @given(st.sampled_from([*LOSSLESS, "ihex", "image", "toml"]), st.data())
 @settings(suppress_health_check=[HealthCheck.too_slow])
 def test_a_damaged_text_file_is_read_or_refused_with_bad_data(format, data):
-    text = bytearray(as_octets(write_blocks([Block(0, 1, META), Block(1, 12, NAME)], format)))
+    text = bytearray(as_octets(write_blocks([TedsBlock(0, 1, META), TedsBlock(1, 12, NAME)], format)))
     for _ in range(data.draw(st.integers(1, 4))):
         text[data.draw(st.integers(0, len(text) - 1))] = data.draw(SMALL)
     with suppress(BadData, NotFound):
@@ -379,7 +381,7 @@ def test_the_examples_of_the_page_are_the_same_teds(language):
     page = (ROOT / "docs" / "formats.md").read_text()
     (example,) = re.findall(rf"^```{language}\n((?:#|\{{|<\?xml).*?)^```", page, re.DOTALL | re.MULTILINE)
     fields = [("Format", 0), ("TCName", "boiler inlet"), ("200", b"\x01\x02")]
-    assert read_blocks(example.encode()) == [Block(1, 12, teds.compose(12, fields))]
+    assert read_blocks(example.encode()) == [TedsBlock(1, 12, teds.compose(12, fields))]
 
 
 def test_the_page_names_every_format():

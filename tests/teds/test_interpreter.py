@@ -27,7 +27,7 @@ from teds_provision.teds.calibration import (
     fit,
 )
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
-from teds_provision.teds.channel import Kind
+from teds_provision.teds.channel import ChannelKind
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.units import WrittenUnit, parse_unit
@@ -262,7 +262,7 @@ def test_a_turn_is_two_pi_to_a_hundred_thousandth_and_of_sensors_of_angles_alone
         (2 * math.pi + 1.1e-5, {}, False),
         (2 * math.pi - 0.9e-5, {}, True),
         (2 * math.pi, {"units": parse_unit("m").units}, False),
-        (2 * math.pi, {"kind": Kind.ACTUATOR}, False),
+        (2 * math.pi, {"kind": ChannelKind.ACTUATOR}, False),
         (math.nan, {}, False),
     ):
         assert replace(known, high=high, **more).full_turn is full  # type: ignore[arg-type]

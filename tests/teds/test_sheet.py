@@ -18,7 +18,7 @@ from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile import load_profile, shipped_profiles
-from teds_provision.teds.sheet import Kind, channel_of
+from teds_provision.teds.sheet import ChannelKind, channel_of
 from teds_provision.teds.units import parse_unit
 
 UUID = bytes.fromhex("00112233445566778899")
@@ -40,7 +40,7 @@ def test_the_magnetic_sensor_reads_as_its_paper_says() -> None:
     assert sheet.uuid == UUID == sheet.meta.uuid
     assert not sheet.errors
     (channel,) = sheet.channels[:1]
-    assert channel.kind is Kind.SENSOR
+    assert channel.kind is ChannelKind.SENSOR
     assert not channel.actuator
     assert channel.units.radians == Fraction(1)
     assert channel.si_unit == "rad"
@@ -127,7 +127,7 @@ def test_a_name_finds_its_channel_only_if_it_is_alone() -> None:
 def test_an_actuator_says_how_it_halts() -> None:
     sheet = Sheet.of(image_of("gripper"))
     (actuator, *_) = [channel for channel in sheet.channels if channel.actuator]
-    assert actuator.kind is Kind.ACTUATOR
+    assert actuator.kind is ChannelKind.ACTUATOR
     assert actuator.kind.word == "actuator"
     assert actuator.halt in (1, 2, 3)
 

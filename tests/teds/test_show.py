@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.teds.codec.model import TimeInstance, Units
-from teds_provision.teds.formats import Block, read_blocks
+from teds_provision.teds.formats import TedsBlock, read_blocks
 from teds_provision.teds.show import describe, hexadecimal, instant, seconds, shown_to_json, span
 
 VECTORS = sorted((Path(__file__).parent.parent / "vectors" / "ieee1451").glob("*.hex"))
@@ -19,7 +19,7 @@ KELVIN = Units(kelvins=1)
 
 
 def shown_of(code, fields, **more):
-    return describe(Block(None, code, teds.compose(code, fields)), now=NOW, **more)
+    return describe(TedsBlock(None, code, teds.compose(code, fields)), now=NOW, **more)
 
 
 def texts(shown):
@@ -82,7 +82,7 @@ def test_calibration_limits_are_in_the_calibrated_unit_when_the_channel_lies_bes
         ],
     )
     beside = {(1, 3): channel, (1, 5): calibration}
-    shown = describe(Block(1, 5, calibration), beside, now=NOW)
+    shown = describe(TedsBlock(1, 5, calibration), beside, now=NOW)
     assert texts(shown)["HiLimit"] == "360 °"
     summary = dict(shown.summary)
     assert summary["method"] == "linear: 1 segment of degree 1"
@@ -91,7 +91,7 @@ def test_calibration_limits_are_in_the_calibrated_unit_when_the_channel_lies_bes
 
 def test_a_place_that_the_tedsid_denies_is_named():
     name = teds.compose(12, {"Format": 0, "TCName": "a"})
-    assert describe(Block(2, 3, name)).title == "channel 2 · ChanTEDS (3), though its TEDSID says 12"
+    assert describe(TedsBlock(2, 3, name)).title == "channel 2 · ChanTEDS (3), though its TEDSID says 12"
 
 
 @pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
@@ -108,7 +108,7 @@ def test_damage_never_raises(path, data):
         octets[data.draw(st.integers(0, len(octets) - 1))] = data.draw(st.integers(0, 255))
     code = data.draw(st.none() | st.integers(0, 255))
     beside = {(1, code or 0): bytes(octets), (1, 3): bytes(octets)}
-    json.dumps(shown_to_json(describe(Block(1, code, bytes(octets)), beside, now=NOW)), allow_nan=False)
+    json.dumps(shown_to_json(describe(TedsBlock(1, code, bytes(octets)), beside, now=NOW)), allow_nan=False)
 
 
 @given(st.integers(1, 255), st.binary(max_size=120), st.sampled_from([2007, 2024]))
@@ -117,4 +117,4 @@ def test_any_content_of_any_class_never_raises(code, content, edition):
 
     head = bytes([3, 4, 0, code, 1, 1]) if edition == 2007 else bytes([3, 5, 0, 255, code, 2, 1])
     octets = frame(head + content)
-    json.dumps(shown_to_json(describe(Block(None, code, octets), {(0, code): octets}, now=NOW)), allow_nan=False)
+    json.dumps(shown_to_json(describe(TedsBlock(None, code, octets), {(0, code): octets}, now=NOW)), allow_nan=False)

@@ -15,7 +15,7 @@ GOOD = {"clean", "block-clean", "message"}
 
 def test_the_index_is_whole() -> None:
     assert len(ALL) >= 67
-    assert {entry["verdict"] for entry in ALL.values()} == set(teds.Verdict)
+    assert {entry["verdict"] for entry in ALL.values()} == set(teds.Conformity)
     assert all(len(octets_of(name)) == entry["octets"] for name, entry in ALL.items())
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.errors import BadData
-from teds_provision.teds.formats import Block, read_blocks, write_blocks
+from teds_provision.teds.formats import TedsBlock, read_blocks, write_blocks
 from teds_provision.teds.formats.xmlform import NAMESPACE, SCHEMA
 from tests.pace import costs_at_most
 
@@ -38,8 +38,8 @@ def test_every_profile_gives_valid_xml(schema, path):
 @given(text=st.text(max_size=30), number=st.floats(width=32), channel=st.none() | st.integers(0, 65535))
 def test_any_text_and_number_give_valid_xml_that_comes_back(schema, text, number, channel):
     blocks = [
-        Block(channel, 12, teds.compose(12, {"Format": 1, "TCName": text})),
-        Block(channel, 3, teds.compose(3, {"LowLimit": number, "DAngles": (number, 0.0)})),
+        TedsBlock(channel, 12, teds.compose(12, {"Format": 1, "TCName": text})),
+        TedsBlock(channel, 3, teds.compose(3, {"LowLimit": number, "DAngles": (number, 0.0)})),
     ]
     document = write_blocks(blocks, "xml")
     schema.validate(document)
@@ -112,7 +112,7 @@ def test_deep_nesting_is_refused():
 
 
 def test_xml_in_another_encoding_is_read():
-    document = write_blocks([Block(1, 12, teds.compose(12, {"Format": 0, "TCName": "Öl"}))], "xml")
+    document = write_blocks([TedsBlock(1, 12, teds.compose(12, {"Format": 0, "TCName": "Öl"}))], "xml")
     assert (
         teds.decode(read_blocks(document.replace("UTF-8", "ISO-8859-1").encode("latin-1"), "xml")[0].octets).get(
             "TCName"

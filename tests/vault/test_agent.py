@@ -192,11 +192,11 @@ def test_a_span_that_is_none_is_usage(home: Path, span: str) -> None:
     assert run(home, "unlock", "--for", span, passphrase=PASSPHRASE).code == 2
 
 
-def page_with(secret: bytes) -> agent.Page:
+def page_with(secret: bytes) -> agent.LockedPage:
     read, write = os.pipe()
     os.write(write, secret)
     os.close(write)
-    page = agent.Page()
+    page = agent.LockedPage()
     page.read(read)
     os.close(read)
     return page

@@ -33,13 +33,13 @@ from teds_provision.protocol.operation.stream_commands import (
     Action,
     Arm,
     Driven,
-    Kind,
+    StreamKind,
     Subscribe,
     drive,
     stop,
 )
 from teds_provision.protocol.operation.subscription import TickBounds
-from teds_provision.protocol.operation.timing import Token
+from teds_provision.protocol.operation.timing import TriggerToken
 from teds_provision.protocol.session import StationSession
 from tests.protocol.operation.bench import DIGEST, HIGH, LOW, MS, SECOND, Bench, K
 
@@ -149,7 +149,7 @@ def operate(channel: int, *, digest: bytes = DIGEST, lease: int = 60, dead_man: 
 
 def subscribe(**changes: object) -> Command:
     """Subscribe to two samples of channel 1 every 10 ms, or something else."""
-    asked: dict[str, Any] = {"stream": 0, "kind": Kind.PERIODIC, "n": 2, "gap": 1000, "period": 10 * MS, "start": 0, "channels": (1,)}  # fmt: skip
+    asked: dict[str, Any] = {"stream": 0, "kind": StreamKind.PERIODIC, "n": 2, "gap": 1000, "period": 10 * MS, "start": 0, "channels": (1,)}  # fmt: skip
     return Subscribe(**{**asked, **changes}).command()
 
 
@@ -251,12 +251,12 @@ def _checks_of_streams() -> Iterator[OperationScene]:
     yield scene.rows(
         [
             (subscribe(n=0, channels=(9,)), "n 0: 4."),
-            (subscribe(kind=Kind.EVENT, n=2, channels=(5,)), "Events, n 2: 4."),
+            (subscribe(kind=StreamKind.EVENT, n=2, channels=(5,)), "Events, n 2: 4."),
             (subscribe(stream=4), "Stream 4: 4."),
             (subscribe(channels=(4, 9)), "One that is not there: 2."),
             (subscribe(channels=(4,), period=0), "An actuator: 3."),
             (subscribe(channels=(5,)), "Periodic of an event sensor: 19."),
-            (subscribe(kind=Kind.EVENT, n=1), "Events of a sensor: 19."),
+            (subscribe(kind=StreamKind.EVENT, n=1), "Events of a sensor: 19."),
             (subscribe(period=10**12 + 1, n=200), "A period above 10^12: 19."),
             (subscribe(n=114, gap=65535), "241 octets: 10."),
             (subscribe(n=1, gap=5001, start=now), "2 frames · 5001 µs in 10 ms: 21."),
@@ -369,7 +369,7 @@ def _streams() -> Iterator[OperationScene]:
     )
     start = scene.bench.hardware.tick + 20 * MS
     scene.say(operate(5), "The event sensor.").say(
-        subscribe(kind=Kind.EVENT, n=1, period=20 * MS, start=start, channels=(5,)), "Subscribe."
+        subscribe(kind=StreamKind.EVENT, n=1, period=20 * MS, start=start, channels=(5,)), "Subscribe."
     )
     for after, note in (
         (-1, "Before the start."),
@@ -388,7 +388,7 @@ def _streams() -> Iterator[OperationScene]:
 
 
 def _triggers() -> Iterator[OperationScene]:
-    token, other, last = (Token(octets("trigger", number)[:8]) for number in range(3))
+    token, other, last = (TriggerToken(octets("trigger", number)[:8]) for number in range(3))
     scene = OperationScene(
         "trigger", "A trigger: the mark, the start of streams that wait, once, for its life.", F1, F2
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.protocol.agreement import AgreedKey, Credentials, StationAgreement, key_id
-from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
+from teds_provision.protocol.datasheet import SignedNodeKey, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
@@ -85,7 +85,7 @@ def signed(
     shown = credentials(station, ca)
     fixed = {"ca": "peer:a69bf70a91fc6b1f", "last_modified": bytes.fromhex("6955b90000000000")}
     node = key("node")
-    own = NodeKeys(UUID, node.point, node.sign(node_key_message(UUID, node.point)))
+    own = SignedNodeKey(UUID, node.point, node.sign(node_key_message(UUID, node.point)))
     plain = {name: values.pop(name) for name in ("sequence", "key_epoch") if name in values}
     sheet = unsigned_datasheet(
         own,

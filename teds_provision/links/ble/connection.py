@@ -33,7 +33,7 @@ class NotConnected(ConnectionLost):
     """No connection came about: nothing was sent."""
 
 
-class Connection:
+class BleConnection:
     """The connection to the node at ``address``; ``number`` tells it apart in this process.
 
     ``data`` is given each notification of the data characteristic, in the loop.
@@ -190,7 +190,7 @@ class Connection:
             self._note("out", frame)
             async with asyncio.timeout(seconds):
                 await self._doing(functools.partial(_write, write, frame))
-        assembly = ble.Assembly(MOST_REPLY)
+        assembly = ble.BleAssembly(MOST_REPLY)
         while True:
             async with asyncio.timeout(seconds):
                 octets = await self._news.get()

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Any, Final, TypeVar
 
 from teds_provision.links.ble import troubles
-from teds_provision.links.ble.connection import Connection, ConnectionLost, NotConnected
+from teds_provision.links.ble.connection import BleConnection, ConnectionLost, NotConnected
 from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
 from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
 
@@ -63,7 +63,7 @@ class BleLink:
     def __init__(
         self,
         loop: Loop,
-        connection: Connection,
+        connection: BleConnection,
         number: Callable[[], int],
         make_room: Callable[[], bool],
         notice: NoticeSink,

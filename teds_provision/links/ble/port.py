@@ -19,7 +19,7 @@ from typing import Final
 from teds_provision.errors import LinkFailure, NodeRefused, NoNode, NoReader, TedsProvisionError
 from teds_provision.files import read_limited, whole_file
 from teds_provision.links.ble.adapter import Adapter
-from teds_provision.links.ble.connection import Connection
+from teds_provision.links.ble.connection import BleConnection
 from teds_provision.links.ble.link import BleLink, Loop
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import BLE, LISTEN_SECONDS, Capabilities, Contact, Notice, NoticeSink, Trace
@@ -43,7 +43,7 @@ def cache_file() -> Path:
     return user_cache_path("teds-provision") / FILE
 
 
-class Remembered:
+class RememberedNodes:
     """Identify of nodes by address, the newest last; :meth:`save` keeps what was learnt."""
 
     def __init__(self, path: Path) -> None:
@@ -113,8 +113,8 @@ class BlePort:
         self.place = f"ble:{spec_text}"
         self._loop = Loop()
         self._adapter = Adapter(self.spec)
-        self._connections: dict[str, Connection] = {}
-        self._known = Remembered(cache_file())
+        self._connections: dict[str, BleConnection] = {}
+        self._known = RememberedNodes(cache_file())
         self._data: queue.Queue[DataMessage] = queue.Queue(_MOST_HELD)
         self._heard = self._closed = False
         self.lost = 0  # data messages for which nobody had time
@@ -349,7 +349,7 @@ class BlePort:
         with self._lock:
             connection = self._connections.get(address)
             if connection is None:
-                connection = self._connections[address] = Connection(
+                connection = self._connections[address] = BleConnection(
                     self._adapter, address, self._take_data, self.trace
                 )
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice)

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from teds_provision.errors import AddressConflict
-from teds_provision.links.can.finding import Found, ask_all, conflict_text, settle
+from teds_provision.links.can.finding import FunctionalAnswers, ask_all, conflict_text, settle
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
 from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
@@ -46,7 +46,7 @@ class _Seen:
     silent: float | None = None
 
 
-class Watched(Protocol):
+class WatchedPort(Protocol):
     """What is asked of the port whose bus is watched."""
 
     spec: CanSpec
@@ -67,7 +67,7 @@ class Watched(Protocol):
 class Arrivals:
     """The nodes of one bus; :meth:`round` asks everyone once and yields what is new."""
 
-    def __init__(self, port: Watched, notice: NoticeSink) -> None:
+    def __init__(self, port: WatchedPort, notice: NoticeSink) -> None:
         self._port, self._notice = port, notice
         self._seen: dict[bytes, _Seen] = {}
         self._conflicts: set[int] = set()
@@ -134,12 +134,12 @@ class Arrivals:
             yield address, identity
 
     def _all(self, stop: threading.Event, clashing: set[int]) -> Iterator[tuple[int, Identity]]:
-        found = Found()
+        found = FunctionalAnswers()
         bus, transaction = self._port.bus(), self._port.next_transaction()
         for news in ask_all(bus, transaction, silence=_SILENCE_SECONDS, longest=_LONGEST_SECONDS):
             if stop.is_set():
                 return
-            if isinstance(news, Found):
+            if isinstance(news, FunctionalAnswers):
                 found = news
             elif self._is_news(*news):
                 yield news

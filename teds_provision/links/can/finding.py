@@ -23,25 +23,25 @@ AskOne = Callable[[int], Identity | None]
 
 
 @dataclass
-class Found:
+class FunctionalAnswers:
     """What one functional Identify came to: who answers where, and what remained unclear."""
 
     identities: dict[int, Identity] = field(default_factory=dict)
     conflicts: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
 
-    def together(self, other: Found) -> Found:
+    def together(self, other: FunctionalAnswers) -> FunctionalAnswers:
         """What two questions came to; what one of them made clear is clear."""
         identities = self.identities | other.identities
         unfinished = (self.unfinished | other.unfinished) - identities.keys()
-        return Found(identities, self.conflicts | other.conflicts, unfinished)
+        return FunctionalAnswers(identities, self.conflicts | other.conflicts, unfinished)
 
-    def cleared_by(self, later: Found) -> Found:
+    def cleared_by(self, later: FunctionalAnswers) -> FunctionalAnswers:
         """What a later question made of it: where two seemed to answer, they do if they did again."""
         identities = {node: who for node, who in self.identities.items() if node not in later.conflicts}
         identities |= later.identities
         unclear = self.unfinished | self.conflicts | later.unfinished
-        return Found(identities, later.conflicts, unclear - identities.keys() - later.conflicts)
+        return FunctionalAnswers(identities, later.conflicts, unclear - identities.keys() - later.conflicts)
 
     @property
     def twice(self) -> dict[bytes, list[int]]:
@@ -54,7 +54,7 @@ class Found:
 
 def ask_all(
     bus: SharedBus, transaction: int, *, silence: float, longest: float
-) -> Iterator[tuple[int, Identity] | Found]:
+) -> Iterator[tuple[int, Identity] | FunctionalAnswers]:
     """Send a functional Identify; yields each node as it answers, and at last all that was found.
 
     Ends after ``silence`` seconds without a frame of an answer, ``longest`` at most. What came torn stands under
@@ -71,7 +71,9 @@ def ask_all(
                 told.add(node)
                 yield node, identity
         gathering = asked.gathering
-    yield Found(_identities(gathering), set(gathering.conflicts), gathering.unfinished | _unreadable(gathering))
+    yield FunctionalAnswers(
+        _identities(gathering), set(gathering.conflicts), gathering.unfinished | _unreadable(gathering)
+    )
 
 
 def _news(bus: SharedBus, asked: Asked, silence: float, longest: float) -> Iterator[int]:
@@ -87,7 +89,7 @@ def _news(bus: SharedBus, asked: Asked, silence: float, longest: float) -> Itera
             return
 
 
-def settle(found: Found, ask: AskOne, *, until: float) -> Found:
+def settle(found: FunctionalAnswers, ask: AskOne, *, until: float) -> FunctionalAnswers:
     """Ask each address that remained unclear by itself: a lost frame does not come twice, two nodes do.
 
     ``until`` is a monotonic time. Keeps as ``conflicts`` where two really answer, as ``unfinished`` where nobody does.
@@ -107,7 +109,7 @@ def settle(found: Found, ask: AskOne, *, until: float) -> Found:
             identities[address] = identity
         else:
             (conflicts if address in found.conflicts else unfinished).add(address)
-    return Found(identities, conflicts, unfinished)
+    return FunctionalAnswers(identities, conflicts, unfinished)
 
 
 def read_identity(reply: bytes) -> Identity:

@@ -20,7 +20,7 @@ from teds_provision.links.can.isotp import (
     physical_id,
     single,
 )
-from teds_provision.links.can.shared import Line, SharedBus
+from teds_provision.links.can.shared import AddressPair, SharedBus
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, decode_reply, refusal
 from teds_provision.protocol.messages.identity import Identity
@@ -185,7 +185,7 @@ class _Exchange:
     def __init__(
         self,
         bus: SharedBus,
-        line: Line,
+        line: AddressPair,
         body: bytes,
         tries: int,
         seconds: float,

@@ -38,14 +38,14 @@ _EXTENDED_IDS: Final = 1 << 29
 _CLASSIC, _FD = 8, 64
 
 
-class Heard(NamedTuple):
+class ReceivedFrame(NamedTuple):
     """A frame, or what the controller says of itself (``error``: the identifier of an error frame)."""
 
     frame: Frame | None
     error: int = 0
 
 
-_NOTHING: Final = Heard(None)
+_NOTHING: Final = ReceivedFrame(None)
 
 
 class Multicast:
@@ -71,7 +71,7 @@ class Multicast:
                 raise TimeoutError("no room for another datagram") from None
             self._out.send(datagram)
 
-    def receive(self, seconds: float) -> Heard | None:
+    def receive(self, seconds: float) -> ReceivedFrame | None:
         """The next datagram of another, None where none came within ``seconds``; raises OSError."""
         try:
             return self._read()
@@ -86,7 +86,7 @@ class Multicast:
         """Release the sender; the receiving socket is python-can's."""
         self._out.close()
 
-    def _read(self) -> Heard:
+    def _read(self) -> ReceivedFrame:
         datagram, ancillary, _, sender = self._in.recvmsg(_LARGEST, _ANCILLARY, socket.MSG_DONTWAIT)
         return _NOTHING if sender[:2] == self._own else read(datagram, _arrival(ancillary), fd=self._fd)
 
@@ -120,7 +120,7 @@ def written(frame: Frame) -> bytes:
     return datagram
 
 
-def read(datagram: bytes, at: float, *, fd: bool) -> Heard:
+def read(datagram: bytes, at: float, *, fd: bool) -> ReceivedFrame:
     """What a datagram says; anybody may send anything, and what is no data frame of ours says nothing."""
     try:
         fields = msgpack.unpackb(datagram)
@@ -132,10 +132,10 @@ def read(datagram: bytes, at: float, *, fd: bool) -> Heard:
     if type(identifier) is not int or not 0 <= identifier < _EXTENDED_IDS:
         return _NOTHING
     if fields.get("is_error_frame"):
-        return Heard(None, identifier)
+        return ReceivedFrame(None, identifier)
     if type(data) is not bytes or is_fd > fd or not _is_data(fields, len(data), _FD if is_fd else _CLASSIC):
         return _NOTHING
-    return Heard(Frame(identifier, data, is_fd, at))
+    return ReceivedFrame(Frame(identifier, data, is_fd, at))
 
 
 def _is_data(fields: dict[object, object], octets: int, most: int) -> bool:

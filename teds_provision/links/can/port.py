@@ -16,7 +16,7 @@ from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.finding import (
     LONGEST_SECONDS,
     SILENCE_SECONDS,
-    Found,
+    FunctionalAnswers,
     ask_all,
     ask_one,
     conflict_text,
@@ -170,7 +170,7 @@ class CanPort:
         began = time.monotonic()
         until, enough = began + seconds, began + min(listen, seconds)
         notice(Notice("waiting", f"Asking every node on {self.spec.text}.", seconds))
-        found, told = Found(), set[str]()
+        found, told = FunctionalAnswers(), set[str]()
 
         def once(each: Notice) -> None:
             if each.text not in told:
@@ -190,7 +190,7 @@ class CanPort:
             raise self._nobody(seconds, set(), whom="No node answered")
         return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 
-    def _everyone(self, longest: float, notice: NoticeSink, silence: float = SILENCE_SECONDS) -> Found:
+    def _everyone(self, longest: float, notice: NoticeSink, silence: float = SILENCE_SECONDS) -> FunctionalAnswers:
         began = time.monotonic()
         found = self._asked_once(longest, silence)
         for _ in range(_ROUNDS_OF_MANY - 1):
@@ -209,14 +209,14 @@ class CanPort:
         self.tell_of_rivals(notice)
         return found
 
-    def _asked_once(self, longest: float, silence: float = SILENCE_SECONDS) -> Found:
-        found = Found()
+    def _asked_once(self, longest: float, silence: float = SILENCE_SECONDS) -> FunctionalAnswers:
+        found = FunctionalAnswers()
         for news in ask_all(self.bus(), self.next_transaction(), silence=silence, longest=longest):
-            if isinstance(news, Found):
+            if isinstance(news, FunctionalAnswers):
                 found = news
         return found
 
-    def _settled(self, found: Found, until: float) -> Found:
+    def _settled(self, found: FunctionalAnswers, until: float) -> FunctionalAnswers:
         """Look again at what remained unclear: where two seem to be, by asking everyone once more.
 
         A reply to a station that died a moment ago, by chance under our transaction number, looks like a second node;
@@ -281,11 +281,11 @@ class CanPort:
         self, wanted: Callable[[Identity], bool], seconds: float, notice: NoticeSink, told: set[bytes]
     ) -> Contact | None:
         """Ask everyone; ends with the first answer that is wanted."""
-        found = Found()
+        found = FunctionalAnswers()
         for news in ask_all(
             self.bus(), self.next_transaction(), silence=SILENCE_SECONDS, longest=min(LONGEST_SECONDS, seconds)
         ):
-            if isinstance(news, Found):
+            if isinstance(news, FunctionalAnswers):
                 found = news
             elif wanted(news[1]):
                 return self._contact(*news)

@@ -1,4 +1,4 @@
-"""One CAN bus for many threads: whoever reads it (:class:`Reading`) hands each frame to those who wait for it.
+"""One CAN bus for many threads: whoever reads it (:class:`BusReader`) hands each frame to those who wait for it.
 
 What nodes send to this station is put together here, whoever asked; the flow control leaves at once from the thread
 that reads, so that a busy one holds nobody up. Data frames, announcements and triggers go to those who listen
@@ -50,7 +50,7 @@ _NAP_SECONDS: Final = 0.002
 Thing = TypeVar("Thing")
 
 
-class Reading:
+class BusReader:
     """Reads ``bus`` until :meth:`stop`; each frame goes to ``take``, the end of the bus to ``failed``.
 
     ``take`` runs in one thread at a time. ``woken`` can be read once the bus is to be closed.
@@ -355,7 +355,7 @@ class Listener:
 
 
 @dataclass(frozen=True)
-class Event:
+class ReplyEvent:
     """What became of a reply: ``body`` (transaction first) whole, or it has begun, is torn, or another one began.
 
     ``at``: when the last frame of a whole one came in (time.monotonic).
@@ -367,7 +367,7 @@ class Event:
 
 
 @dataclass
-class Line:
+class AddressPair:
     """What the loop knows of one pair of addresses: the message that comes in, and the thread that has an exchange.
 
     ``own`` is the station's address; ``transaction`` that of the exchange that runs, -1 for none.
@@ -377,7 +377,7 @@ class Line:
     own: int
     turn: threading.Lock = field(default_factory=threading.Lock)
     flows: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
-    events: SimpleQueue[Event] = field(default_factory=SimpleQueue)
+    events: SimpleQueue[ReplyEvent] = field(default_factory=SimpleQueue)
     transaction: int = -1
     partial: Reassembly | None = None
     gathering: Gathering | None = None
@@ -386,7 +386,7 @@ class Line:
     asked: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
 
     @contextmanager
-    def exchange(self, transaction: int) -> Iterator[Line]:
+    def exchange(self, transaction: int) -> Iterator[AddressPair]:
         """Wait for this transaction's reply; one exchange with one node at a time."""
         with self.turn:
             for waiting in (self.flows, self.events):
@@ -435,7 +435,7 @@ class SharedBus:
         self._failure: LinkFailure | None = None
         self._listeners: tuple[Listener, ...] = ()
         self._asked: tuple[Asked, ...] = ()
-        self._lines: dict[tuple[int, int], Line] = {}
+        self._lines: dict[tuple[int, int], AddressPair] = {}
         self._clashes: dict[int, float] = {}
         self._announced: dict[int, float] = {}
         self._lost_at = -math.inf
@@ -443,7 +443,7 @@ class SharedBus:
         self._sending = threading.Lock()
         self._closing = False
         self._wake, self._woken = socket.socketpair()
-        self._reading = Reading(bus, self._route, self._fail, self._woken)
+        self._reading = BusReader(bus, self._route, self._fail, self._woken)
         self._thread = threading.Thread(target=self._reading.run, name=f"can {self.spec.text}", daemon=True)
         self._thread.start()
 
@@ -511,13 +511,13 @@ class SharedBus:
         with self._lock:
             self._listeners = tuple(other for other in self._listeners if other is not listener)
 
-    def line(self, node: int, own: int | None = None) -> Line:
+    def line(self, node: int, own: int | None = None) -> AddressPair:
         """The line to the node at this address; ``own`` is another address than this station's, to try a node out."""
         pair = node, self.own if own is None else own
         line = self._lines.get(pair)  # there already for all frames but the first: a new one costs more than a frame
         if line is None:
             with self._lock:
-                line = self._lines.setdefault(pair, Line(*pair))
+                line = self._lines.setdefault(pair, AddressPair(*pair))
         return line
 
     @contextmanager
@@ -551,7 +551,7 @@ class SharedBus:
         for one in asked:
             one.news.put(-1)
         for line in lines:
-            line.events.put(Event("failed"))
+            line.events.put(ReplyEvent("failed"))
             line.flows.put(b"")
 
     def _route(self, frame: Frame) -> None:
@@ -561,7 +561,7 @@ class SharedBus:
             self._announced[node] = time.monotonic()
             line = self._lines.get((node, self.own))
             if line is not None and line.transaction >= 0:
-                line.events.put(Event("announced"))
+                line.events.put(ReplyEvent("announced"))
         ends = addresses(frame.identifier)
         if ends is not None and len(frame.data) >= 2:
             own, node = ends
@@ -574,7 +574,7 @@ class SharedBus:
         """Whether something announced itself at this address after ``moment`` (time.monotonic)."""
         return self._announced.get(node, -math.inf) > moment
 
-    def _from_node(self, line: Line, frame: Frame) -> None:
+    def _from_node(self, line: AddressPair, frame: Frame) -> None:
         line.heard_at = frame.at
         match frame.data[0] >> 4:
             case 0:
@@ -586,17 +586,17 @@ class SharedBus:
             case 3 if line.transaction >= 0:  # nobody waits for any other: they would only pile up
                 line.flows.put(frame.data)
 
-    def _single(self, line: Line, frame: Frame) -> None:
+    def _single(self, line: AddressPair, frame: Frame) -> None:
         body = read_single(frame.data)
         if not body:
             return
         if body[0] == line.transaction:
-            line.events.put(Event("whole", body, frame.at))
+            line.events.put(ReplyEvent("whole", body, frame.at))
             line.flows.put(b"")  # whoever waits for a flow control has its answer
         elif not self._gathered(line, frame, body[0]) and body[0] not in line.asked:
             self.rivals.unasked(line.node)
 
-    def _first(self, line: Line, frame: Frame) -> None:
+    def _first(self, line: AddressPair, frame: Frame) -> None:
         partial = Reassembly.begin(line.node, frame)
         if partial is None:
             return
@@ -607,12 +607,12 @@ class SharedBus:
                 return
             other = line.partial
             if other is not None and other.first != partial.first:
-                line.events.put(Event("clash"))
+                line.events.put(ReplyEvent("clash"))
             elif other is not None and not other.number:
                 return  # the same frame twice
             line.partial, line.gathering = partial, None
             self._reply(flow(line.node, line.own, CONTINUE, fd=frame.fd, gap=line.gap))
-            line.events.put(Event("begun"))
+            line.events.put(ReplyEvent("begun"))
         elif self._gathered(line, frame, transaction):
             return
         elif transaction in line.asked:  # a late reply: end it, so that the node is free for the next
@@ -620,7 +620,7 @@ class SharedBus:
         else:
             self.rivals.unasked(line.node)
 
-    def _gathered(self, line: Line, frame: Frame, transaction: int) -> bool:
+    def _gathered(self, line: AddressPair, frame: Frame, transaction: int) -> bool:
         for asked in self._asked:
             if asked.gathering.transaction == transaction and asked.until > frame.at:
                 line.gathering, line.partial = asked.gathering, None
@@ -628,7 +628,7 @@ class SharedBus:
                 return True
         return False
 
-    def _consecutive(self, line: Line, frame: Frame) -> None:
+    def _consecutive(self, line: AddressPair, frame: Frame) -> None:
         if line.gathering is not None:
             for asked in self._asked:
                 if asked.gathering is line.gathering:
@@ -640,13 +640,13 @@ class SharedBus:
         match partial.take(frame.data):
             case "whole":
                 line.partial = None
-                line.events.put(Event("whole", bytes(partial.octets), frame.at))
+                line.events.put(ReplyEvent("whole", bytes(partial.octets), frame.at))
             case "block":
                 self._reply(flow(line.node, line.own, CONTINUE, fd=partial.fd, gap=line.gap))
             case "torn":
                 line.partial = None
                 self._reply(flow(line.node, line.own, OVERFLOW, fd=partial.fd))  # it need not send the rest
-                line.events.put(Event("torn"))
+                line.events.put(ReplyEvent("torn"))
 
     def _gather(self, asked: Asked, node: int, frame: Frame) -> None:
         gathering = asked.gathering

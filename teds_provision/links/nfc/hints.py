@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from teds_provision.links.hints import BleAddress, Charging, ChargingState
-from teds_provision.links.nfc.message import Record
+from teds_provision.links.nfc.message import NdefRecord
 
 OUT_OF_BAND: Final = b"application/vnd.bluetooth.le.oob"
 MIME: Final = 2
@@ -33,7 +33,7 @@ _LONGEST_EXPONENT: Final = 0x13
 Fields = dict[str, int | str]
 
 
-def charging(records: Sequence[Record]) -> Charging | None:
+def charging(records: Sequence[NdefRecord]) -> Charging | None:
     """What the WLC records of a message say, None where it has none."""
     raw: dict[str, Fields] = {}
     for record in records:
@@ -134,7 +134,7 @@ def _milliseconds(exponent: int) -> int:
     return 1 << (min(exponent & 31, _LONGEST_EXPONENT) + 3)
 
 
-def ble_address(records: Sequence[Record]) -> BleAddress | None:
+def ble_address(records: Sequence[NdefRecord]) -> BleAddress | None:
     """The device address of a Bluetooth LE out-of-band record, None where there is none that can be read."""
     for record in records:
         if record.tnf == MIME and record.type.lower() == OUT_OF_BAND:

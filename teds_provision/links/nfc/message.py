@@ -16,7 +16,7 @@ _NAMES = ("empty", "urn:nfc:wkt:", "", "", "urn:nfc:ext:", "unknown", "unchanged
 
 
 @dataclass(frozen=True)
-class Record:
+class NdefRecord:
     """One NDEF record: ``tnf`` 0 to 7 (type name format), type, payload and id as octets."""
 
     tnf: int
@@ -38,7 +38,7 @@ class Record:
         return self.tnf == WELL_KNOWN and self.type == name
 
 
-def encode(records: Sequence[Record]) -> bytes:
+def encode(records: Sequence[NdefRecord]) -> bytes:
     """Return the NDEF message of ``records``: short records where the payload has at most 255 octets, no chunks."""
     octets = bytearray()
     for number, record in enumerate(records):
@@ -50,14 +50,14 @@ def encode(records: Sequence[Record]) -> bytes:
     return bytes(octets)
 
 
-def decode(octets: bytes) -> tuple[Record, ...]:
+def decode(octets: bytes) -> tuple[NdefRecord, ...]:
     """Split an NDEF message into its records, chunks put together; an empty message gives none.
 
     Raises Garbled when the framing is broken: begin or end mark missing, a record longer than the message, octets
     left over, chunks out of order.
     """
-    records: list[Record] = []
-    chunk: Record | None = None
+    records: list[NdefRecord] = []
+    chunk: NdefRecord | None = None
     at, ended = 0, not octets
     while not ended:
         flags, record, at = _record(octets, at)
@@ -68,7 +68,7 @@ def decode(octets: bytes) -> tuple[Record, ...]:
         if (chunk is not None) != (record.tnf == 6) or (chunk is not None and record.type):
             raise Garbled("The NDEF message has a chunk out of order.")
         if chunk is not None:
-            record = Record(chunk.tnf, chunk.type, chunk.payload + record.payload, chunk.id)
+            record = NdefRecord(chunk.tnf, chunk.type, chunk.payload + record.payload, chunk.id)
         chunk = record if flags & 0x20 else None
         if chunk is None:
             records.append(record)
@@ -77,7 +77,7 @@ def decode(octets: bytes) -> tuple[Record, ...]:
     return tuple(records)
 
 
-def _record(octets: bytes, at: int) -> tuple[int, Record, int]:
+def _record(octets: bytes, at: int) -> tuple[int, NdefRecord, int]:
     """Read one record at ``at``; return its flags octet, the record and where the next one begins."""
     try:
         flags, type_octets = octets[at], octets[at + 1]
@@ -92,4 +92,4 @@ def _record(octets: bytes, at: int) -> tuple[int, Record, int]:
         raise Garbled("The NDEF message is cut off.")
     kind = octets[start : start + type_octets]
     ident = octets[start + type_octets : start + type_octets + id_octets]
-    return flags, Record(flags & 7, bytes(kind), bytes(octets[end - size : end]), bytes(ident)), end
+    return flags, NdefRecord(flags & 7, bytes(kind), bytes(octets[end - size : end]), bytes(ident)), end

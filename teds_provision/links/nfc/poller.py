@@ -11,7 +11,7 @@ from typing import Protocol
 
 from teds_provision.errors import Garbled, NodeSilent
 from teds_provision.links.nfc import message, tnep
-from teds_provision.links.nfc.message import Record
+from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 
 PATIENCE = 5.0  # seconds that a station goes on reading
@@ -83,7 +83,7 @@ class Poller:
         """Select the service anew before the next transaction."""
         self._selected = False
 
-    def _exchange(self, octets: bytes, take: Callable[[Sequence[Record]], bool]) -> None:
+    def _exchange(self, octets: bytes, take: Callable[[Sequence[NdefRecord]], bool]) -> None:
         """Write ``octets`` and read until ``take`` accepts an answer; our own message still there is "not yet"."""
         if len(octets) > self._service.max_ndef:
             raise Garbled(f"The node takes NDEF messages of at most {self._service.max_ndef} octets.")
@@ -112,14 +112,14 @@ class Poller:
             self._sleep(min(interval, left))
 
 
-def _take(records: Sequence[Record], requester: Requester) -> bool:
+def _take(records: Sequence[NdefRecord], requester: Requester) -> bool:
     payload = tnep.external(records, tnep.TIM_TYPE)
     if payload is None:
         raise Garbled("The node answered without a payload record.")
     return requester.take(Piece.decode(payload))
 
 
-def _successful(records: Sequence[Record]) -> Sequence[Record]:
+def _successful(records: Sequence[NdefRecord]) -> Sequence[NdefRecord]:
     code = tnep.status_of(records)
     if code is None:
         raise Garbled("The node answered without a TNEP status.")

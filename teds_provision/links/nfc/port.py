@@ -15,7 +15,7 @@ from typing import TypeGuard
 from teds_provision.errors import BadData, Garbled, LinkFailure, NodeSilent, NoNode, NoReader
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.links.nfc import hints, message, tnep
-from teds_provision.links.nfc.message import Record
+from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.links.nfc.pcsc import PcscReader
 from teds_provision.links.nfc.poller import Poller
 from teds_provision.links.nfc.reader import AUTO, Reader, open_reader
@@ -27,7 +27,7 @@ from teds_provision.protocol.messages.identity import Identity
 
 
 @dataclass(frozen=True)
-class Visit:
+class NodeInField:
     """A node in the field: its tag as activated, its service, and what it says of itself."""
 
     tag: ReaderTag
@@ -45,7 +45,7 @@ class Foreign:
     text: str
 
 
-def look(tag: ReaderTag) -> Visit | Foreign:
+def look(tag: ReaderTag) -> NodeInField | Foreign:
     """Read the initial message and say what the tag is; raises FieldLost and ReaderLost."""
     try:
         records = message.decode(tag.read())
@@ -61,14 +61,14 @@ def look(tag: ReaderTag) -> Visit | Foreign:
         identity = Identity.decode(payload)
     except BadData as error:
         return Foreign(tag, _described(tag, error.message))
-    return Visit(tag, service, identity, hints.charging(records), hints.ble_address(records))
+    return NodeInField(tag, service, identity, hints.charging(records), hints.ble_address(records))
 
 
 def _described(tag: ReaderTag, what: str) -> str:
     return f"A tag that is not a node of this profile: {tag.kind}, UID {tag.uid.hex().upper()}. {what}"
 
 
-def _listed(records: Sequence[Record]) -> str:
+def _listed(records: Sequence[NdefRecord]) -> str:
     names = [f"{record.name or 'a record'} ({len(record.payload)} octets)" for record in records]
     return "the NDEF records " + ", ".join(names) if names else "an empty NDEF message"
 
@@ -129,10 +129,10 @@ class NfcPort:
         """
         until, told, never = time.monotonic() + seconds, "", threading.Event()
         waiting = False
-        seen: Visit | Foreign | None = None
+        seen: NodeInField | Foreign | None = None
         while (left := until - time.monotonic()) > 0:
             seen = self._look(notice, never)
-            if isinstance(seen, Visit) and wanted(seen.identity):
+            if isinstance(seen, NodeInField) and wanted(seen.identity):
                 return self._contact(seen, notice)
             if seen is not None:
                 told = _tell(seen, told, notice)
@@ -144,7 +144,7 @@ class NfcPort:
             time.sleep(_PAUSE)
         if self._reader is None:
             raise NoReader("The reader was unplugged and did not come back.", hint="Plug it in again.")
-        if isinstance(seen, Visit):
+        if isinstance(seen, NodeInField):
             raise NoNode(
                 f"Node {seen.identity.uuid.hex()} lies on the reader, and it is not the one that is meant.",
                 hint="Put the node there that you named, or name the one that lies there.",
@@ -171,7 +171,7 @@ class NfcPort:
         notice(waiting)
         while not stop.is_set():
             seen = self._look(notice, stop)
-            same = isinstance(seen, Visit) and seen.identity.uuid == here
+            same = isinstance(seen, NodeInField) and seen.identity.uuid == here
             if not same and _has_left(here, seen, gone_at):
                 notice(_left(here))
                 notice(waiting)
@@ -210,7 +210,7 @@ class NfcPort:
         self._transaction = (self._transaction + 1) & 0xFFFF
         return self._transaction
 
-    def back(self, uuid: bytes, seconds: float) -> Visit:
+    def back(self, uuid: bytes, seconds: float) -> NodeInField:
         """Activate the node ``uuid`` anew; raises NodeSilent when it, or any node, is not there within ``seconds``."""
         until = time.monotonic() + seconds
         while True:
@@ -218,9 +218,9 @@ class NfcPort:
                 seen = self._sense_and_look()
             except FieldLost:
                 seen = None
-            if isinstance(seen, Visit) and seen.identity.uuid == uuid:
+            if isinstance(seen, NodeInField) and seen.identity.uuid == uuid:
                 return seen
-            if isinstance(seen, Visit):
+            if isinstance(seen, NodeInField):
                 raise NodeSilent(
                     f"The node moved away; another one ({seen.identity.uuid.hex()}) lies on the reader.",
                     hint=f"Put node {uuid.hex()} back and run the command again.",
@@ -239,10 +239,10 @@ class NfcPort:
         """Close a reader that failed, so that the next look opens it again."""
         self.close()
 
-    def _contact(self, visit: Visit, notice: NoticeSink) -> Contact:
+    def _contact(self, visit: NodeInField, notice: NoticeSink) -> Contact:
         return _contact(visit, NfcLink(self, visit, notice), self.trace)
 
-    def _look(self, notice: NoticeSink, stop: threading.Event) -> Visit | Foreign | None:
+    def _look(self, notice: NoticeSink, stop: threading.Event) -> NodeInField | Foreign | None:
         """Poll once; None when nothing lies there or the reader is away (which is told once)."""
         try:
             with self.turn:
@@ -265,7 +265,7 @@ class NfcPort:
             stop.wait(_REOPEN)
             return None
 
-    def _sense_and_look(self) -> Visit | Foreign | None:
+    def _sense_and_look(self) -> NodeInField | Foreign | None:
         with self.turn:
             if self._reader is None:
                 raise ReaderLost("it was closed")
@@ -273,7 +273,7 @@ class NfcPort:
             self._failures = 0
             return None if tag is None else look(tag)
 
-    def _stay(self, seen: Visit | Foreign, stop: threading.Event, seconds: float | None) -> None:
+    def _stay(self, seen: NodeInField | Foreign, stop: threading.Event, seconds: float | None) -> None:
         """Wait until the tag does not answer (one miss: the next look finds who is there), at most ``seconds``."""
         until = None if seconds is None else time.monotonic() + seconds
         while not stop.is_set() and (until is None or time.monotonic() < until):
@@ -289,7 +289,7 @@ class NfcPort:
 class NfcLink:
     """The line to one node that lies on the reader; selects the service when it is first used."""
 
-    def __init__(self, port: NfcPort, visit: Visit, notice: NoticeSink) -> None:
+    def __init__(self, port: NfcPort, visit: NodeInField, notice: NoticeSink) -> None:
         self._port = port
         self._notice = notice
         self._poller: Poller | None = Poller(visit.tag, visit.service)
@@ -379,11 +379,11 @@ class NfcLink:
         return self._poller
 
 
-def _contact(visit: Visit, link: NfcLink, trace: Trace | None) -> Contact:
+def _contact(visit: NodeInField, link: NfcLink, trace: Trace | None) -> Contact:
     return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble, trace=trace)
 
 
-def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
+def _tell(seen: NodeInField | Foreign, told: str, notice: NoticeSink) -> str:
     """Name a tag that is waited past, unless it was the last one named; return what was said."""
     if isinstance(seen, Foreign):
         text = seen.text
@@ -396,7 +396,7 @@ def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
     return text
 
 
-def _has_left(here: bytes | None, seen: Visit | Foreign | None, gone_at: float) -> TypeGuard[bytes]:
+def _has_left(here: bytes | None, seen: NodeInField | Foreign | None, gone_at: float) -> TypeGuard[bytes]:
     """Whether the node ``here``, which is not ``seen``, is gone: something else lies there, or nothing for a while."""
     return here is not None and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE)
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from teds_provision.errors import Garbled
-from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, Record
+from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 
 SERVICE = b"urn:nfc:xsn:teds-provision:tim"
 ID_TYPE = b"teds-provision:id"
@@ -40,10 +40,10 @@ class ServiceParameters:
         """Least time between writing and reading, in seconds: 2^(WT_INT/4 - 1) ms."""
         return float(2.0 ** (self.wt_int / 4 - 1) / 1000.0)
 
-    def record(self) -> Record:
+    def record(self) -> NdefRecord:
         """Return version ‖ length of the URI ‖ URI ‖ mode ‖ WT_INT ‖ N_wait ‖ maximum (u16, big endian)."""
         tail = struct.pack(">BBBH", self.mode, self.wt_int, self.n_wait, self.max_ndef)
-        return Record(WELL_KNOWN, b"Tp", bytes((self.version, len(self.uri))) + self.uri + tail)
+        return NdefRecord(WELL_KNOWN, b"Tp", bytes((self.version, len(self.uri))) + self.uri + tail)
 
     @classmethod
     def decode(cls, payload: bytes) -> ServiceParameters:
@@ -55,7 +55,7 @@ class ServiceParameters:
         return cls(uri, wt_int & 63, min(n_wait, 15), max_ndef, mode, payload[0])
 
 
-def our_service(records: Sequence[Record]) -> ServiceParameters | None:
+def our_service(records: Sequence[NdefRecord]) -> ServiceParameters | None:
     """Find the profile's service in an initial message; other services and broken ``Tp`` records are passed over."""
     for record in records:
         if record.is_well_known(b"Tp"):
@@ -68,12 +68,12 @@ def our_service(records: Sequence[Record]) -> ServiceParameters | None:
     return None
 
 
-def select(uri: bytes) -> Record:
+def select(uri: bytes) -> NdefRecord:
     """Return the ``Ts`` record that selects the service ``uri``, or deselects when it is empty."""
-    return Record(WELL_KNOWN, b"Ts", bytes((len(uri),)) + uri)
+    return NdefRecord(WELL_KNOWN, b"Ts", bytes((len(uri),)) + uri)
 
 
-def selection(records: Sequence[Record]) -> bytes | None:
+def selection(records: Sequence[NdefRecord]) -> bytes | None:
     """Return the URI that a message selects (empty: deselects), None when it holds no ``Ts`` record.
 
     Raises Garbled when the record's length does not add up.
@@ -86,12 +86,12 @@ def selection(records: Sequence[Record]) -> bytes | None:
     return None
 
 
-def status(code: int) -> Record:
+def status(code: int) -> NdefRecord:
     """Return the ``Te`` record: 0 success, 1 protocol error, 0x80 to 0xFE the service's own errors."""
-    return Record(WELL_KNOWN, b"Te", bytes((code,)))
+    return NdefRecord(WELL_KNOWN, b"Te", bytes((code,)))
 
 
-def status_of(records: Sequence[Record]) -> int | None:
+def status_of(records: Sequence[NdefRecord]) -> int | None:
     """Return the code of a message's ``Te`` record, None when it has none."""
     for record in records:
         if record.is_well_known(b"Te") and record.payload:
@@ -99,16 +99,16 @@ def status_of(records: Sequence[Record]) -> int | None:
     return None
 
 
-def external(records: Sequence[Record], name: bytes) -> bytes | None:
+def external(records: Sequence[NdefRecord], name: bytes) -> bytes | None:
     """Return the payload of the first external record of type ``name``, None when there is none."""
     return next((record.payload for record in records if record.is_external(name)), None)
 
 
-def payload_record(payload: bytes) -> Record:
+def payload_record(payload: bytes) -> NdefRecord:
     """Return the profile's payload record around one encoded piece."""
-    return Record(EXTERNAL, TIM_TYPE, payload)
+    return NdefRecord(EXTERNAL, TIM_TYPE, payload)
 
 
-def id_record(identify: bytes) -> Record:
+def id_record(identify: bytes) -> NdefRecord:
     """Return the record of the initial message that holds the payload of Identify."""
-    return Record(EXTERNAL, ID_TYPE, identify)
+    return NdefRecord(EXTERNAL, ID_TYPE, identify)

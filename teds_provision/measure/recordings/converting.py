@@ -28,7 +28,7 @@ from teds_provision.measure.recordings.columns import part_of
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.recordings.parquet import ParquetWriter
 from teds_provision.measure.recordings.source import Entry, Recording
-from teds_provision.measure.recordings.summary import Summary
+from teds_provision.measure.recordings.summary import RecordingSummary
 from teds_provision.measure.sinks import FILES, TEXT, as_sink_failure
 from teds_provision.measure.sinks.files import FileSink
 from teds_provision.measure.sinks.wide import WideSink
@@ -44,7 +44,7 @@ class Converted:
 
     recording: Recording
     files: tuple[Path, ...]
-    summary: Summary
+    summary: RecordingSummary
 
 
 def convert(source: Path, target: Path, *, wide: bool = False) -> Converted:
@@ -66,7 +66,7 @@ def convert(source: Path, target: Path, *, wide: bool = False) -> Converted:
             hint="Convert the recording that it was made of, or convert it to .csv or .parquet.",
         )
     wide = wide or recording.wide
-    summary = Summary()
+    summary = RecordingSummary()
     try:
         with _folder_for(target) as folder:
             entries = _counted(recording, summary)
@@ -112,7 +112,7 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
     return made
 
 
-def _counted(recording: Recording, summary: Summary) -> Iterator[Entry]:
+def _counted(recording: Recording, summary: RecordingSummary) -> Iterator[Entry]:
     """The entries, each counted; a channel that no head named gets a place among the facts."""
     for entry in recording.entries():
         summary.take(entry)

@@ -23,7 +23,7 @@ from teds_provision.teds.units import parse_units
 
 
 @dataclass(frozen=True)
-class Limits:
+class ReadLimits:
     """The most that is read of a recording at a time."""
 
     line: int = 8 << 20
@@ -37,7 +37,7 @@ class Limits:
     columns: int = 40_100
 
 
-MOST: Final = Limits()
+MOST: Final = ReadLimits()
 ROWS: Final = 4096
 """Rows that are handed on together: enough for numpy, few enough to keep nodes together in time."""
 

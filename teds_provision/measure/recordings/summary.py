@@ -16,7 +16,7 @@ NOTES = 100
 
 
 @dataclass
-class Seen:
+class ChannelStatistics:
     """What was seen of a channel; times are unix seconds."""
 
     samples: int = 0
@@ -37,10 +37,10 @@ class Seen:
 
 
 @dataclass
-class Summary:
+class RecordingSummary:
     """Counts what goes by. ``missing`` samples are gaps of the sample number within a run of a stream."""
 
-    channels: dict[tuple[str, int], Seen] = field(default_factory=dict)
+    channels: dict[tuple[str, int], ChannelStatistics] = field(default_factory=dict)
     facts: dict[tuple[str, int], ChannelFacts] = field(default_factory=dict)
     reports: dict[str, NodeReport] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
@@ -64,8 +64,8 @@ class Summary:
         else:
             self.facts.update((one.key, one) for one in entry if len(self.facts) < MOST.channels)
 
-    def _seen_of(self, key: tuple[str, int]) -> Seen:
-        return self.channels.setdefault(key, Seen())
+    def _seen_of(self, key: tuple[str, int]) -> ChannelStatistics:
+        return self.channels.setdefault(key, ChannelStatistics())
 
     def _block(self, block: Block) -> None:
         if not len(block.time):
@@ -116,7 +116,7 @@ class Summary:
 
     def _channel(self, key: tuple[str, int], recording: Recording) -> dict[str, Any]:
         facts = self.facts.get(key) or recording.facts.get(key) or ChannelFacts(key[0], "", key[1], "")
-        seen = self.channels.get(key, Seen())
+        seen = self.channels.get(key, ChannelStatistics())
         return {
             "channel": facts.number,
             **{name: value for name, value in facts_as_json(facts).items() if name != "number"},

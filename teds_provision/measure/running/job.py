@@ -5,9 +5,9 @@ The way of `measure` and of `ncap run` alike:
 * ``station.measurements.keep(KeptMeasurement(...))`` says what is measured; ``due()`` what is to be carried on after a
   start, ``of_group(NAME)`` what `measure NAME` carries on; ``forget(ID)`` deletes.
 * ``Buses(ports)`` hears the buses of the process, once for all measurements.
-* ``Job(station, kept)`` makes its sinks; ``run(buses, stop)`` measures on this thread until ``stop`` is set, or
-  ``start(buses)`` and ``stop()`` on a thread of its own, again and again after an error. While it runs, its nodes and
-  its group are held: ``station.measurements.is_running(uuid)``, PolicyRefused (6) for whoever wants them too.
+* ``MeasurementJob(station, kept)`` makes its sinks; ``run(buses, stop)`` measures on this thread until ``stop`` is set,
+  or ``start(buses)`` and ``stop()`` on a thread of its own, again and again after an error. While it runs, its nodes
+  and its group are held: ``station.measurements.is_running(uuid)``, PolicyRefused (6) for whoever wants them too.
 * ``job.measurement.session(uuid)`` is the session of a node that is measured, for one more command in between.
 
 What is kept is deleted when a measurement that is not ``lasting`` ends in order; after ``kill -9`` it is still there.
@@ -22,13 +22,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.measure.blocks import Command, StationFacts
+from teds_provision.measure.blocks import SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest, Requirements
 from teds_provision.measure.runner import Ended, Measurement, Watcher
 from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
 from teds_provision.measure.sinks.wide import WIDE
-from teds_provision.protocol.operation.stream_commands import Kind
+from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
 from teds_provision.store.records import KeptMeasurement
@@ -48,7 +48,7 @@ def whole_path(spec: str) -> str:
 _SERVICES = frozenset({"ros1", "ros2", "mqtt", "mqtts"})
 
 
-class Job:
+class MeasurementJob:
     """One measurement: ``sinks`` are made (and opened by the run), ``ended`` is how the last run ended.
 
     ``more`` makes the sinks beside those that are kept, anew for each run; it gets what takes set points of topics.
@@ -63,7 +63,7 @@ class Job:
         *,
         more: Callable[[CommandTaker | None], Sequence[Sink]] = lambda _take: (),
         request: MeasurementRequest | None = None,
-        admits: Callable[[Command], bool] | None = lambda _command: True,
+        admits: Callable[[SetPointCommand], bool] | None = lambda _command: True,
         opened: Callable[[str, CommandTaker | None], Sink] = open_sink,
     ) -> None:
         self.station, self.kept = station, kept
@@ -71,7 +71,7 @@ class Job:
         self.request = replace(request_of(kept, request or MeasurementRequest(patient=True)), actuators=self._moves)
         self._each_node = self.request.newcomers
         self._more, self._admits, self._opened = more, admits, opened
-        self._commands: Callable[[Command], None] = lambda _command: None
+        self._commands: Callable[[SetPointCommand], None] = lambda _command: None
         self.sinks = self._new_sinks()
         self.measurement: Measurement | None = None
         self.ended: Ended | None = None
@@ -191,7 +191,7 @@ class Job:
         admit = self._admit if self._moves else None
         return [*(self._opened(spec, admit) for spec in self.kept.sinks), *self._more(admit)]
 
-    def _admit(self, command: Command) -> None:
+    def _admit(self, command: SetPointCommand) -> None:
         """A set point that came by a topic."""
         if self._admits is not None and self._admits(command):
             self._commands(command)
@@ -203,7 +203,7 @@ def request_of(kept: KeptMeasurement, more: MeasurementRequest) -> MeasurementRe
         more,
         channels=kept.channels,
         rate=kept.rate,
-        kind=None if kept.kind is None else Kind[kept.kind.upper()],
+        kind=None if kept.kind is None else StreamKind[kept.kind.upper()],
         trigger=kept.trigger,
         newcomers=kept.match is not None and not kept.frozen,
         actuators=kept.actuators,

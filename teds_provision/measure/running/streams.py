@@ -12,13 +12,13 @@ from itertools import chain
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Block, Invalid
-from teds_provision.measure.buses import Bus
+from teds_provision.measure.buses import MeasuredBus
 from teds_provision.measure.clock import ClockMap, HostClock, Monotone
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.trusting import Trusted, ask_clock
-from teds_provision.protocol.operation.stream_commands import Clock, Kind, decode_stopped, stop
-from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.protocol.operation.stream_commands import Clock, StreamKind, decode_stopped, stop
+from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.talk.conversation import SessionLost
 
 UNSIGNED = "nobody has signed the datasheet: raw values alone"
@@ -97,7 +97,9 @@ class NodeStreams:
             self.clock.exchange(exchange)
         return reply
 
-    def subscribe(self, bus: Bus, trusted: Trusted, plan: Plan, address: int, *, ahead: float = 0.0) -> None:
+    def subscribe(
+        self, bus: MeasuredBus, trusted: Trusted, plan: StreamPlan, address: int, *, ahead: float = 0.0
+    ) -> None:
         """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
         bus.hearing.expect(address, number)
@@ -126,7 +128,7 @@ class NodeStreams:
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
         bus.hearing.register(address, number, heard)
 
-    def stop(self, bus: Bus, trusted: Trusted | None, address: int) -> None:
+    def stop(self, bus: MeasuredBus, trusted: Trusted | None, address: int) -> None:
         """Stop each in order, so that its counter tells what was lost at the end; without a session hear no more.
 
         First the messages that are being filled may come: the samples until now are all wanted, and Stop takes back
@@ -163,7 +165,7 @@ class NodeStreams:
         return [
             one
             for one in self.running.values()
-            if one.receiver.plan.subscribe.kind != Kind.EVENT and one.receiver.start is not None
+            if one.receiver.plan.subscribe.kind != StreamKind.EVENT and one.receiver.start is not None
         ]
 
     def every(self) -> float | None:

@@ -17,7 +17,7 @@ from teds_provision.measure.trusting import Trusted
 from teds_provision.protocol.operation.can_frames import trigger_identifier
 from teds_provision.protocol.operation.stream_commands import Action
 from teds_provision.protocol.operation.subscription import TickBounds
-from teds_provision.protocol.operation.timing import START_AFTER_MARK, Token, mark_is_honest
+from teds_provision.protocol.operation.timing import START_AFTER_MARK, TriggerToken, mark_is_honest
 from teds_provision.talk.conversation import SessionLost
 
 TRIGGER_LIFE = 30  # seconds
@@ -28,7 +28,7 @@ HELD_BACK = 10_000_000  # ns: a controller may hold a frame back while others wi
 def pull(common_start: CommonStart, keepers: Sequence[NodeKeeper], note: Callable[[str], None]) -> None:
     """Arm every node, send a frame on each bus, read each node's mark: it must meet the time of sending."""
     common_start.triggered()
-    token = Token.draw()
+    token = TriggerToken.draw()
     armed = _arm(token, keepers, note)
     ports = {keeper.bus.place: keeper.bus.port for keeper, _ in armed if keeper.bus is not None}
     sent = {place: _send(port, token) for place, port in ports.items() if isinstance(port, CanPort)}
@@ -43,14 +43,16 @@ def pull(common_start: CommonStart, keepers: Sequence[NodeKeeper], note: Callabl
             heard.begin(mark + START_AFTER_MARK)
 
 
-def _send(port: CanPort, token: Token) -> tuple[int, int]:
+def _send(port: CanPort, token: TriggerToken) -> tuple[int, int]:
     """The trigger on one bus; between which two times (monotonic ns) it went out."""
     before = time.monotonic_ns()
     port.send(Frame(trigger_identifier(port.spec.source), token.octets))
     return before, time.monotonic_ns() + HELD_BACK
 
 
-def _arm(token: Token, keepers: Sequence[NodeKeeper], note: Callable[[str], None]) -> list[tuple[NodeKeeper, Trusted]]:
+def _arm(
+    token: TriggerToken, keepers: Sequence[NodeKeeper], note: Callable[[str], None]
+) -> list[tuple[NodeKeeper, Trusted]]:
     """The nodes that wait for the trigger now."""
     armed = []
     for keeper in keepers:

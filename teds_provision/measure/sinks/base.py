@@ -20,15 +20,15 @@ from teds_provision.measure.blocks import (
     Block,
     ChannelFacts,
     ClockSet,
-    Command,
     GroupRows,
     NodeReport,
+    SetPointCommand,
     SinkStats,
     StationFacts,
 )
 
 Item = Block | GroupRows | NodeReport | ClockSet | tuple[ChannelFacts, ...]
-CommandTaker = Callable[[Command], None]
+CommandTaker = Callable[[SetPointCommand], None]
 
 RECORDER_WAITING = 2_000_000  # values that a recorder may owe: some 200 MB, 40 s at 50,000 values a second
 LIVE_WAITING = 256  # items that a live sink may owe: newest wins

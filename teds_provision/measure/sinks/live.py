@@ -34,9 +34,9 @@ from teds_provision.measure.blocks import (
     Block,
     ChannelFacts,
     ClockSet,
-    Command,
     GroupRows,
     NodeReport,
+    SetPointCommand,
     StationFacts,
     why_invalid,
 )
@@ -62,7 +62,7 @@ JOINT_STATE, STRING, DIAGNOSTICS = "sensor_msgs/JointState", "std_msgs/String", 
 
 
 @dataclass(frozen=True)
-class Status:
+class DiagnosticEntry:
     """One entry of /diagnostics."""
 
     level: int
@@ -148,7 +148,7 @@ class TopicSink(ThreadedSink):
         """Subscribe to JointState of set points; each goes to :meth:`_joint_command`."""
 
     @abstractmethod
-    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+    def _diagnose(self, stamp: float, statuses: Sequence[DiagnosticEntry]) -> None:
         """One DiagnosticArray."""
 
     @property
@@ -349,25 +349,31 @@ class TopicSink(ThreadedSink):
             self._say("running", f"{rate:.0f} messages/s{over}")
         self._diagnose(time.time(), self._statuses(rate))
 
-    def _statuses(self, rate: float) -> list[Status]:
+    def _statuses(self, rate: float) -> list[DiagnosticEntry]:
         found = [self._status(report) for report in self._reports.values()]
         for uuid in sorted({one.uuid for one in self._facts.values() if one.unsigned}):
             name = f"{self._topics.node(uuid)}: datasheet"
-            found.append(Status(WARN, name, "nobody has signed it: raw values alone, which reach no topic", uuid))
+            found.append(
+                DiagnosticEntry(WARN, name, "nobody has signed it: raw values alone, which reach no topic", uuid)
+            )
         for uuid in sorted({one.uuid for one in self._facts.values() if one.unverified}):
             name = f"{self._topics.node(uuid)}: datasheet"
-            found.append(Status(WARN, name, "unverified: nobody has signed it, and values are calibrated by it", uuid))
+            found.append(
+                DiagnosticEntry(WARN, name, "unverified: nobody has signed it, and values are calibrated by it", uuid)
+            )
         for one in self._facts.values():
             if one.overdue:
                 name = f"{self._topics.node(one.uuid)}: calibration of {one.label}"
-                found.append(Status(WARN, name, f"due since {one.due}", one.uuid))
+                found.append(DiagnosticEntry(WARN, name, f"due since {one.due}", one.uuid))
         stats = self.stats
         values = (("messages per second", f"{rate:.0f}"), ("dropped values", str(stats.dropped)))
         level = WARN if rate > BUDGET or stats.dropped else OK
-        found.append(Status(level, f"{self._topics.station}: {self.name}", stats.detail, self._topics.station, values))
+        found.append(
+            DiagnosticEntry(level, f"{self._topics.station}: {self.name}", stats.detail, self._topics.station, values)
+        )
         return found
 
-    def _status(self, report: NodeReport) -> Status:
+    def _status(self, report: NodeReport) -> DiagnosticEntry:
         counters = {"lost": report.lost, "late": report.late, "bad": report.bad, "invalid": report.invalid}
         level = {"running": OK, "waiting": WARN, "ended": OK}.get(report.state, ERROR)
         told = report.state == "running" and report.why
@@ -379,11 +385,13 @@ class TopicSink(ThreadedSink):
         if report.clock_error is not None:
             values.append(("clock error [s]", f"{report.clock_error:.2g}"))
         message = report.why or report.state
-        return Status(level, f"{self._topics.node(report.uuid)}: measurement", message, report.uuid, tuple(values))
+        return DiagnosticEntry(
+            level, f"{self._topics.node(report.uuid)}: measurement", message, report.uuid, tuple(values)
+        )
 
     def _command(self, uuid: str, channel: int, value: float) -> None:
         """A set point came; what is no finite number is refused here, limits are kept where units are known."""
         if self._commands is None or not math.isfinite(value):
             self.refused_commands += 1
             return
-        self._commands(Command(uuid, channel, value, time.monotonic()))
+        self._commands(SetPointCommand(uuid, channel, value, time.monotonic()))

@@ -16,7 +16,7 @@ from typing import Any, Final, Generic, TypeVar, cast
 from teds_provision.errors import Frozen, NodeBusy, NoNode, TedsProvisionError
 from teds_provision.links import Port
 from teds_provision.links.ports import Contact, Notice
-from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 # One thing at a time with each node: sessions of this process share one address, and a second Open ends the first.
@@ -113,7 +113,7 @@ class Errand(Generic[Result]):
 class Desk:
     """Errands, and the nodes that come. ``port_of`` gives the open port of a place."""
 
-    def __init__(self, roster: Roster, turns: Turns, port_of: PortOf) -> None:
+    def __init__(self, roster: NodeDirectory, turns: Turns, port_of: PortOf) -> None:
         self._roster, self._turns, self._port_of = roster, turns, port_of
         self._waiting: list[Errand[Any]] = []
         self._guard = threading.Lock()

@@ -18,7 +18,7 @@ from typing import Any, Final
 from teds_provision.api.bodies import LONGEST_HOLD
 from teds_provision.errors import LinkFailure, NodeBusy, NodeRefused, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.links.ports import Notice
-from teds_provision.measure.blocks import Command
+from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.held_actuator import HeldActuator
 from teds_provision.measure.trusting import DEAD_MAN, Trusted, open_trusted, require_whitelisted
 from teds_provision.ncap.live import Live
@@ -101,7 +101,7 @@ class Holding:
         """What an actuator was told last, and whether it is known to be safe."""
         return self._last.get((uuid, channel))
 
-    def admits(self, command: Command) -> bool:
+    def admits(self, command: SetPointCommand) -> bool:
         """Whether a set point that came by a topic may pass: not while a request holds its actuator. Told once."""
         with self._guard:
             held = self._held.get((command.uuid, command.channel))

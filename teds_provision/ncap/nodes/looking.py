@@ -17,7 +17,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import Identified, identify
 from teds_provision.steps.read import list_blocks, read_block, read_identity, read_image
-from teds_provision.steps.reading import Judged, is_keyed, keep
+from teds_provision.steps.reading import NodeVerdict, is_keyed, keep
 from teds_provision.steps.verify import Verified, known_of, session, verify_image
 from teds_provision.steps.verify_node import look_in_session
 from teds_provision.store import utc_now
@@ -37,7 +37,7 @@ class Look:
     A ``judged`` that came in no session is shown beside the node's row of reading, and changes no row.
     """
 
-    judged: Judged
+    judged: NodeVerdict
     sheet: Sheet | None = None
     power: dict[str, Any] | None = None
 
@@ -67,7 +67,7 @@ def _in_session(station: Station, node: Conversation) -> Look | None:
     return Look(looked.judged, sheet, power_of(node))
 
 
-def read_anew(station: Station, node: Conversation) -> tuple[Image, Judged] | None:
+def read_anew(station: Station, node: Conversation) -> tuple[Image, NodeVerdict] | None:
     """Read every TEDS of a node in a session, and keep that reading; None where no session comes about."""
     if session_if_keyed(station, node) is None:
         return None
@@ -94,7 +94,7 @@ def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
     image = Image(node.uuid, blocks)
     why = "the node opens no session under any key that is held here" if is_keyed(station, node.uuid) else ""
     checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
-    return Look(Judged(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), Sheet.of(image))
+    return Look(NodeVerdict(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), Sheet.of(image))
 
 
 def power_of(node: Conversation) -> dict[str, Any] | None:

@@ -28,7 +28,7 @@ from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk, Errand
 from teds_provision.ncap.nodes.looking import STRANGERS_TEDS, as_problem
-from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
@@ -75,7 +75,7 @@ class Provisioning:
     def __init__(
         self,
         station: Station,
-        roster: Roster,
+        roster: NodeDirectory,
         live: Live,
         desk: Desk,
         apart: Callable[[str, str], AbstractContextManager[None]] = lambda _uuid, _why: nullcontext(),
@@ -306,7 +306,7 @@ class Adopting:
     def __init__(
         self,
         station: Station,
-        roster: Roster,
+        roster: NodeDirectory,
         live: Live,
         virtuals: Virtuals,
         adopts: Callable[[], bool],

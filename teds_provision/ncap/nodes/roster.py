@@ -19,7 +19,7 @@ from teds_provision.ncap.live import Live
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.inventory import with_verdicts
-from teds_provision.steps.reading import Judged
+from teds_provision.steps.reading import NodeVerdict
 from teds_provision.store import Search
 from teds_provision.store.records import iso
 from teds_provision.teds.sheet import Channel, Sheet
@@ -49,7 +49,7 @@ class Seen:
     version: int = 0  # grows with each change here
 
 
-class Roster:
+class NodeDirectory:
     """The nodes by UUID (20 hex digits, lower case)."""
 
     def __init__(self, station: Station, live: Live) -> None:
@@ -60,7 +60,7 @@ class Roster:
         self._lock, self._reading = threading.RLock(), threading.Lock()
         self._seen: dict[str, Seen] = {}
         self._rows: dict[str, dict[str, Any]] = {}
-        self._judged: dict[str, Judged | None] = {}  # as the store and today's trust have it, beside each row
+        self._judged: dict[str, NodeVerdict | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
         self._own_names: dict[str, str] = {}  # as the datasheet of each says
         self.changes = 0  # grows with each change of a node's name or datasheet

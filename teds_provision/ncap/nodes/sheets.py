@@ -11,20 +11,20 @@ from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFa
 from teds_provision.lazy import late
 from teds_provision.ncap.nodes.desk import Desk
 from teds_provision.ncap.nodes.looking import read_anew
-from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.station.station import Station
 from teds_provision.steps.build import guard
 from teds_provision.steps.document import SheetPlan, plan_sheet, write_sheet
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
-from teds_provision.steps.reading import Judged, is_keyed, verdict_of
+from teds_provision.steps.reading import NodeVerdict, is_keyed, verdict_of
 from teds_provision.steps.verify import Verified, known_of, session, verify_image
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.calibration.model import is_finite
 from teds_provision.teds.channel import TURN
-from teds_provision.teds.formats import Block, placed, write_blocks
+from teds_provision.teds.formats import TedsBlock, placed, write_blocks
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.show import describe, shown_to_json
@@ -45,14 +45,14 @@ class ReadSheet:
     """What a node has, or had when it was last read (``now`` False)."""
 
     image: Image
-    judged: Judged
+    judged: NodeVerdict
     now: bool
 
 
 class Sheets:
     """Reads and writes. ``measured`` gives the datasheet of a node that a measurement holds, as its session has it."""
 
-    def __init__(self, station: Station, roster: Roster, desk: Desk, measured: MeasuredSheet) -> None:
+    def __init__(self, station: Station, roster: NodeDirectory, desk: Desk, measured: MeasuredSheet) -> None:
         self._station, self._roster, self._desk, self._measured = station, roster, desk, measured
 
     def read(self, uuid: str) -> ReadSheet:
@@ -80,14 +80,14 @@ class Sheets:
         image = read_image(node)
         why = "it opens no session under our key" if is_keyed(station, node.uuid) else ""
         checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
-        return ReadSheet(image, Judged(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
+        return ReadSheet(image, NodeVerdict(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
 
     def document(self, uuid: str, form: str) -> tuple[str, str]:
         """The datasheet as a document, and its media type; raises UsageFailure for a format that is none of ours."""
         if form not in FORMATS:
             raise UsageFailure(f"Unsupported datasheet format: {form!r}.", hint=f"Use {', '.join(FORMATS)}.")
         image = self.read(uuid).image
-        blocks = [Block(channel, code, image.blocks[channel, code]) for channel, code in image]
+        blocks = [TedsBlock(channel, code, image.blocks[channel, code]) for channel, code in image]
         text = write_blocks(blocks, form)  # type: ignore[arg-type]
         return (text if isinstance(text, str) else text.decode()), FORMATS[form]
 
@@ -96,7 +96,7 @@ class Sheets:
         found = self.read(uuid)
         blocks = found.image.blocks
         teds = [
-            shown_to_json(describe(Block(channel, code, blocks[channel, code]), blocks))
+            shown_to_json(describe(TedsBlock(channel, code, blocks[channel, code]), blocks))
             for channel, code in found.image
         ]
         return {

@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from teds_provision.api.operations import API
 from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
-from teds_provision.ncap.live import Listener
+from teds_provision.ncap.live import LiveClient
 from teds_provision.ncap.web import metrics
 from teds_provision.ncap.web.answers import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.clause12 import Clause12
@@ -204,7 +204,7 @@ def _is_good(tokens: Tokens, digest: str) -> bool:
         return False
 
 
-async def _send(socket: WebSocket, listener: Listener, hello: dict[str, Any]) -> None:
+async def _send(socket: WebSocket, listener: LiveClient, hello: dict[str, Any]) -> None:
     try:
         await socket.send_json(hello)
         while True:

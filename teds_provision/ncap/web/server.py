@@ -31,7 +31,7 @@ BODY: Final = 30.0
 """Seconds that its body may take: 1 MiB at most."""
 
 
-class Connection(H11Protocol):
+class HttpConnection(H11Protocol):
     """uvicorn's, with an end to its patience."""
 
     _began = 0.0
@@ -48,7 +48,7 @@ class Connection(H11Protocol):
 
     def _make_room(self) -> None:
         """End the oldest connection that works for nobody."""
-        mine = [one for one in self.connections if isinstance(one, Connection) and one is not self]
+        mine = [one for one in self.connections if isinstance(one, HttpConnection) and one is not self]
         strangers = [one for one in mine if not one.is_known]
         useless = strangers or [one for one in mine if one.is_silent]
         if useless:
@@ -147,7 +147,7 @@ class Servers:
             lifespan="off",
             server_header=False,
             proxy_headers=False,
-            http=Connection,
+            http=HttpConnection,
             ws="websockets-sansio",
             ws_max_size=4096,
             ws_per_message_deflate=False,

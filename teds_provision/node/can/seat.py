@@ -1,7 +1,7 @@
 """One node's seat on a CAN bus: a line for each base station, its answer to everyone, its Announces.
 
-Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`Line.answer` and
-:meth:`Line.begin_anew` run in the line's turns.
+Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`StationLine.answer` and
+:meth:`StationLine.begin_anew` run in the line's turns.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.isotp import Pair
-from teds_provision.node.handler import Crew, Measuring, NodeHandler, Turns
-from teds_provision.protocol.announce import Announce, Claim, uuid_crc
+from teds_provision.node.handler import Crew, JobQueue, MeasuringHandler, NodeHandler
+from teds_provision.protocol.announce import AddressClaim, Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 
@@ -29,7 +29,7 @@ def link_name(station: int) -> str:
     return f"{BUS}:{station:02x}"
 
 
-class Request(NamedTuple):
+class SeatRequest(NamedTuple):
     """A whole request: transaction ‖ command; whether it came by CAN FD, and its tick (0 for a node without clock)."""
 
     body: bytes
@@ -37,14 +37,14 @@ class Request(NamedTuple):
     received: int
 
 
-class Line:
+class StationLine:
     """One base station's line to one node: its own session (by name) and stored reply.
 
     A link is one pair of addresses: with a new own address it begins anew. ``pairs`` keeps the old Pair as long as it
     still sends.
     """
 
-    def __init__(self, seat: Seat, station: int, turns: Turns) -> None:
+    def __init__(self, seat: Seat, station: int, turns: JobQueue) -> None:
         self.seat, self.station, self.turns = seat, station, turns
         self.name = link_name(station)
         self.pairs: dict[int, Pair] = {}
@@ -69,7 +69,7 @@ class Line:
         self.replying = None
         self._repetition.left(time.monotonic())
 
-    def answer(self, request: Request) -> bytes:
+    def answer(self, request: SeatRequest) -> bytes:
         """Run a request and return transaction ‖ reply; raises what the node raises."""
         seat, body = self.seat, request.body
 
@@ -93,7 +93,7 @@ class Seat:
         counts_as_tapped: Callable[[], bool],
         crew: Crew,
         send: Callable[[Seat, Frame], None],
-        measuring: Measuring | None = None,
+        measuring: MeasuringHandler | None = None,
     ) -> None:
         self.handler, self.counts_as_tapped, self._crew = handler, counts_as_tapped, crew
         self._send = send
@@ -101,8 +101,8 @@ class Seat:
         self.address = handler.can_address()
         identity = Identity.decode(handler.identify())
         self.uuid, self.max_message = identity.uuid, identity.max_message
-        self.claim = Claim(uuid_crc(identity.uuid))
-        self.lines: dict[int, Line] = {}
+        self.claim = AddressClaim(uuid_crc(identity.uuid))
+        self.lines: dict[int, StationLine] = {}
         self.spoken_from: set[int] = set()
 
     def announce(self) -> None:
@@ -112,11 +112,11 @@ class Seat:
         self._send(self, Frame(announce.identifier, announce.encode()))
         self.claim.announced(time.monotonic())
 
-    def pair(self, station: int, own: int) -> tuple[Line, Pair]:
+    def pair(self, station: int, own: int) -> tuple[StationLine, Pair]:
         """The pair of ``own`` and ``station``, made where there is none yet."""
         line = self.lines.get(station)
         if line is None:
-            line = self.lines[station] = Line(self, station, self._crew.turns())
+            line = self.lines[station] = StationLine(self, station, self._crew.turns())
         pair = line.pairs.get(own)
         if pair is None:
             if line.pairs:
@@ -125,7 +125,7 @@ class Seat:
             pair = line.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
         return line, pair
 
-    def reply_left(self, line: Line) -> None:
+    def reply_left(self, line: StationLine) -> None:
         """The reply that left this line is through, or was given up: data may follow."""
         line.reply_left()
         if self.measuring is not None:

@@ -17,8 +17,8 @@ from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, Reassembly, addresses, physical_id, read_single, single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
-from teds_provision.node.can.seat import Line, Request, Seat, link_name
-from teds_provision.node.handler import Crew, Measuring, NodeHandler
+from teds_provision.node.can.seat import Seat, SeatRequest, StationLine, link_name
+from teds_provision.node.handler import Crew, MeasuringHandler, NodeHandler
 from teds_provision.protocol.announce import Announce, is_announce
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, Reply, refusal
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station
@@ -150,7 +150,7 @@ class CanServer:
     ) -> None:
         self._spec = parse_spec(spec_text)
         self._tell = tell
-        self._nodes: list[tuple[NodeHandler, Callable[[], bool], Measuring | None]] = []
+        self._nodes: list[tuple[NodeHandler, Callable[[], bool], MeasuringHandler | None]] = []
         self._bus: Bus | None = None
         self._crew: Crew | None = None
         self._seats: list[Seat] = []
@@ -160,7 +160,7 @@ class CanServer:
         self._pushing: set[tuple[Seat, Pair]] = set()
         self._looked = 0.0
         self._later: list[tuple[float, int, Callable[[], None]]] = []
-        self._everyone_due: dict[Line, int] = {}
+        self._everyone_due: dict[StationLine, int] = {}
         self._number = itertools.count()
         self._lock = threading.RLock()
         self._sending = threading.Lock()
@@ -175,7 +175,7 @@ class CanServer:
         handler: NodeHandler,
         *,
         counts_as_tapped: Callable[[], bool] = _never,
-        measuring: Measuring | None = None,
+        measuring: MeasuringHandler | None = None,
     ) -> None:
         """Hang one more node on this bus, before :meth:`start`; ``measuring`` where it offers operation.md."""
         self._nodes.append((handler, counts_as_tapped, measuring))
@@ -339,7 +339,7 @@ class CanServer:
         if frame.data and frame.data[0] >> 4 == _FLOW_CONTROL:
             self._flow_control_of_old_address(station, own, frame)
 
-    def _request(self, seat: Seat, line: Line, pair: Pair, frame: Frame) -> None:
+    def _request(self, seat: Seat, line: StationLine, pair: Pair, frame: Frame) -> None:
         begun = Reassembly.begin(pair.peer, frame)
         if begun is not None and begun.length > seat.max_message + 1:  # refused in place of a flow control
             said = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
@@ -350,7 +350,7 @@ class CanServer:
             if pair.waits_for_flow:
                 pair.stop_sending()  # whoever asks again has not taken that answer up
             received = seat.measuring.tick(frame.at) if seat.measuring is not None else 0
-            line.put(functools.partial(self._run_request, line, pair, Request(body, frame.fd, received)))
+            line.put(functools.partial(self._run_request, line, pair, SeatRequest(body, frame.fd, received)))
         self._note(seat, pair)
 
     def _measuring_frame(self, station: int, frame: Frame) -> None:
@@ -371,7 +371,7 @@ class CanServer:
                 pair.take(frame)
                 self._note(seat, pair)
 
-    def _run_request(self, line: Line, pair: Pair, request: Request) -> None:
+    def _run_request(self, line: StationLine, pair: Pair, request: SeatRequest) -> None:
         """Run one request in the turn of its node and send the reply from the address that was asked."""
         try:
             reply = line.answer(request)

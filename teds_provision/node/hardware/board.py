@@ -17,11 +17,10 @@ from teds_provision.errors import BadData
 from teds_provision.node import sources
 from teds_provision.node.hardware.clock import NANOSECONDS, NodeClock
 from teds_provision.node.hardware.converter import Converter
-from teds_provision.node.sources.base import Place, Tell
-from teds_provision.node.sources.base import Reading as Given
+from teds_provision.node.sources.base import Place, Reading, Tell
 from teds_provision.protocol.operation.commands import Power, PowerFlag
-from teds_provision.protocol.operation.hardware import ChannelHardware, Reading
-from teds_provision.teds.sheet import Channel, Kind, Sheet
+from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading
+from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 
 # The battery of a virtual transducer: charged in a reader's field, emptied outside it (operation.md section 7).
 
@@ -79,7 +78,7 @@ _PPM: Final = 1e-6
 
 
 @dataclass(frozen=True)
-class Shown:
+class ActuatorReading:
     """What an actuator does: its raw number, the value in ``unit`` (None: nothing says), and whether it is safe.
 
     ``time`` is when it began to, unix seconds.
@@ -108,7 +107,7 @@ class Board:
         source: str = "noise",
         clock: NodeClock | None = None,
         battery: Battery | None = None,
-        shown: Callable[[Shown], None] = lambda shown: None,
+        shown: Callable[[ActuatorReading], None] = lambda shown: None,
         tell: Tell = lambda text: None,
     ) -> None:
         self.clock = clock or NodeClock()
@@ -122,7 +121,7 @@ class Board:
         self.channels: Mapping[int, ChannelHardware] = {n: _facts(channel) for n, channel in kinds.items()}
         self.converters = {number: Converter(sheet, channel) for number, channel in kinds.items()}
         self._test_seconds = _self_test_seconds(sheet.meta.self_test_time)
-        self._seen: dict[int, Reading | None] = dict.fromkeys(self._event_sensors())
+        self._seen: dict[int, RawReading | None] = dict.fromkeys(self._event_sensors())
         self._testing: dict[int, int] = {}
         self._safe_state = {n: self._lowest(n) for n, facts in self.channels.items() if facts.actuator}
         self._bounds = {number: self._raw_limits(number) for number in self._safe_state}
@@ -130,7 +129,7 @@ class Board:
         self.source = sources.make_source(source, self.places, tell)
 
     def _event_sensors(self) -> list[int]:
-        return [n for n, facts in self.channels.items() if facts.kind is Kind.EVENT_SENSOR]
+        return [n for n, facts in self.channels.items() if facts.kind is ChannelKind.EVENT_SENSOR]
 
     @property
     def places(self) -> list[Place]:
@@ -169,23 +168,23 @@ class Board:
 
     # -- sensors ---------------------------------------------------------------------------------------------------
 
-    def read(self, channel: int, tick: int) -> Reading:
+    def read(self, channel: int, tick: int) -> RawReading:
         """What the source gives for ``tick``; zeros that are not valid where it gives nothing."""
         given = self.source.at(channel, tick / NANOSECONDS)
         converter = self.converters[channel]
         if given is None or channel in self.faults:
-            return Reading(bytes(converter.form.octets), valid=False)
+            return RawReading(bytes(converter.form.octets), valid=False)
         try:
-            return Reading(converter.octets(given))
+            return RawReading(converter.octets(given))
         except BadData:  # no way from a value to a sample: nothing that could be shown
-            return Reading(bytes(converter.form.octets), valid=False)
+            return RawReading(bytes(converter.form.octets), valid=False)
 
     @property
     def has_events(self) -> bool:
         """Whether it has event sensors."""
         return bool(self._seen)
 
-    def events(self) -> Iterator[tuple[int, int, Reading]]:
+    def events(self) -> Iterator[tuple[int, int, RawReading]]:
         """Event sensors that show something else than at the last look: channel, tick, what they show."""
         tick = self.now()
         for channel, before in list(self._seen.items()):
@@ -222,14 +221,14 @@ class Board:
     def _show(self, channel: int, *, safe: bool) -> None:
         facts, converter, octets = self._facts[channel], self.converters[channel], self._set_points[channel]
         value = converter.value(octets)
-        self.shown(Shown(channel, facts.name, value, facts.unit.text, converter.raw_of(octets), safe))
+        self.shown(ActuatorReading(channel, facts.name, value, facts.unit.text, converter.raw_of(octets), safe))
         if facts.name and value is not None:
             self.source.acted({facts.name: value})
 
     def _lowest(self, channel: int) -> bytes:
         converter = self.converters[channel]
         try:
-            return converter.octets(Given(value=converter.low) if math.isfinite(converter.low) else Given(raw=0.0))
+            return converter.octets(Reading(value=converter.low) if math.isfinite(converter.low) else Reading(raw=0.0))
         except BadData:
             return bytes(converter.form.octets)
 
@@ -274,7 +273,7 @@ def _facts(channel: Channel) -> ChannelHardware:
         raise BadData(f"The datasheet does not say how a sample of channel {channel.number} is coded.")
     period = channel.period if math.isfinite(channel.period) and channel.period > 0 else 0.0
     return ChannelHardware(
-        Kind(channel.kind),
+        ChannelKind(channel.kind),
         channel.sample.octets,
         channel.sample.model,
         channel.halt,

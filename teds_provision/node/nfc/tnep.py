@@ -16,7 +16,7 @@ from typing import Final, Protocol
 from teds_provision.errors import Garbled
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.hints import MIME, OUT_OF_BAND
-from teds_provision.links.nfc.message import WELL_KNOWN, Record
+from teds_provision.links.nfc.message import WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, Responder, room
 from teds_provision.links.nfc.poller import STATUS_OCTETS
 from teds_provision.node.handler import NodeHandler
@@ -37,32 +37,32 @@ _REPEAT_WAITS: Final = bytes((0x09, 0x1E, 0x03, 0x0A))
 _BATTERY_LEVEL: Final = 0x01
 
 
-def charge_records(power: Power) -> tuple[Record, ...]:
+def charge_records(power: Power) -> tuple[NdefRecord, ...]:
     """``WLCCAP`` (I can be charged, or am full) and ``WLCSTAI`` (battery in per cent); none without a battery."""
     if not power.flags & PowerFlag.BATTERY or power.level is None:
         return ()
     mode = _BATTERY_FULL if power.flags & PowerFlag.FULL else _STATIC
     return (
-        Record(WELL_KNOWN, CAPABILITY, bytes((_VERSION, mode | 0x01)) + _REPEAT_WAITS),
-        Record(WELL_KNOWN, STATUS, bytes((_BATTERY_LEVEL, power.level))),
+        NdefRecord(WELL_KNOWN, CAPABILITY, bytes((_VERSION, mode | 0x01)) + _REPEAT_WAITS),
+        NdefRecord(WELL_KNOWN, STATUS, bytes((_BATTERY_LEVEL, power.level))),
     )
 
 
-def out_of_band_record(address: bytes, *, random: bool) -> Record:
+def out_of_band_record(address: bytes, *, random: bool) -> NdefRecord:
     """Bluetooth LE out-of-band record: ``address`` 6 octets as people write them; the role is peripheral only."""
     structures = b"\x08\x1b" + address[::-1] + bytes((random,)) + b"\x02\x1c\x00"
-    return Record(MIME, OUT_OF_BAND, structures)
+    return NdefRecord(MIME, OUT_OF_BAND, structures)
 
 
-def is_poller_information(record: Record) -> bool:
+def is_poller_information(record: NdefRecord) -> bool:
     """Whether a reader says how it charges; it may write that at any time, into the mailbox that TNEP uses."""
     return record.is_well_known(POLLER)
 
 
-Records = Callable[[], tuple[Record, ...]]
+Records = Callable[[], tuple[NdefRecord, ...]]
 
 
-def _none() -> tuple[Record, ...]:
+def _none() -> tuple[NdefRecord, ...]:
     return ()
 
 

@@ -17,7 +17,7 @@ from teds_provision.node.sources.lines import Lines, feed
 _SECONDS_TO_END = 2.0
 
 
-class Command(Lines):
+class CommandSource(Lines):
     """Runs a program (no shell); lines need no ``t``: without one the node's clock is the host's."""
 
     def __init__(self, places: Sequence[Place], tell: Tell, words: Sequence[str]) -> None:
@@ -71,7 +71,7 @@ class Command(Lines):
             self.end()
 
 
-def make(argument: str, places: Sequence[Place], tell: Tell) -> Command:
+def make(argument: str, places: Sequence[Place], tell: Tell) -> CommandSource:
     """``exec:./hand --rate 100``: words as a shell would part them."""
     try:
         words = shlex.split(argument)
@@ -79,4 +79,4 @@ def make(argument: str, places: Sequence[Place], tell: Tell) -> Command:
         raise UsageFailure(f"exec: {error}.", hint="Close the quotes.") from error
     if not words:
         raise UsageFailure("exec: names no program.", hint="Write --source 'exec:./hand --rate 100'.")
-    return Command(places, tell, words)
+    return CommandSource(places, tell, words)

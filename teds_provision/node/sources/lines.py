@@ -143,7 +143,7 @@ def feed(read: Callable[[], bytes], take: Callable[[bytes], None]) -> None:
         take(held)
 
 
-class Stream(Lines):
+class StandardInput(Lines):
     """Lines from a pipe: standard input."""
 
     def __init__(self, places: Sequence[Place], tell: Tell, stream: IO[bytes]) -> None:
@@ -260,9 +260,9 @@ def _answers(path: Path) -> bool:
         return True
 
 
-def make_stream(argument: str, places: Sequence[Place], tell: Tell) -> Stream:
+def make_stream(argument: str, places: Sequence[Place], tell: Tell) -> StandardInput:
     """``-`` reads standard input."""
-    return Stream(places, tell, sys.stdin.buffer)
+    return StandardInput(places, tell, sys.stdin.buffer)
 
 
 def make_socket(argument: str, places: Sequence[Place], tell: Tell) -> UnixSocket:

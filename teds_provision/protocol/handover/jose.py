@@ -69,7 +69,7 @@ FindKey = Callable[[str], bytes | None]
 
 
 @dataclass(frozen=True)
-class Verified:
+class VerifiedJws:
     """What stands under a good signature: ``kid`` and point of the signer, and the payload."""
 
     kid: str
@@ -101,7 +101,7 @@ def signed_header(key: PrivateKey, typ: str) -> bytes:
     return base64url(dump({"alg": SIGNATURE_ALGORITHM, "kid": fingerprint(key.point), "typ": typ})) + b"."
 
 
-def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: int) -> Verified:
+def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: int) -> VerifiedJws:
     """Check a compact JWS of this ``typ`` whose ``kid`` is the fingerprint of a key that ``find_key`` trusts.
 
     The payload is decoded only under a good signature. Raises NotAuthentic, PolicyRefused or BadData.
@@ -112,7 +112,7 @@ def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: in
         raise BadData(NO_COMPACT_JWS)
     message = memoryview(octets)[: len(octets) - len(parts[2]) - 1]
     kid, signer = check_signature(parts[0], parts[2], hashlib.sha256(message).digest(), find_key, typ)
-    return Verified(kid, signer, decode_base64url(parts[1], "The payload"))
+    return VerifiedJws(kid, signer, decode_base64url(parts[1], "The payload"))
 
 
 def check_signature(

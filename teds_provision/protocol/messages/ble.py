@@ -40,7 +40,7 @@ class Received(NamedTuple):
     message: bytes
 
 
-class Assembly:
+class BleAssembly:
     """Puts frames of one connection together; a message longer than ``most`` octets is never begun.
 
     Offset 0 begins anew; a frame that does not continue what is held drops it. Nothing is answered to either: the other

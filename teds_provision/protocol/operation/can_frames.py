@@ -86,14 +86,14 @@ def next_segment(segment: int) -> int:
     return segment % _SEGMENTS + 1
 
 
-class Piece(NamedTuple):
+class Segment(NamedTuple):
     """One frame's share of a message: its segment, and the frame's data (Drive: the segment stands in front)."""
 
     segment: int
     data: bytes
 
 
-def cut(message: bytes, *, fd: bool, drive: bool = False) -> Iterator[Piece]:
+def cut(message: bytes, *, fd: bool, drive: bool = False) -> Iterator[Segment]:
     """Cut a message into the data of its frames; the last one of CAN FD is padded with CC."""
     room = (FD_OCTETS if fd else CLASSIC_OCTETS) - drive
     segment = 0
@@ -101,7 +101,7 @@ def cut(message: bytes, *, fd: bool, drive: bool = False) -> Iterator[Piece]:
         data = (bytes([segment]) if drive else b"") + message[at : at + room]
         if fd:
             data = data.ljust(fd_length(len(data)), bytes([PADDING]))
-        yield Piece(segment, data)
+        yield Segment(segment, data)
         segment = next_segment(segment)
 
 
@@ -110,7 +110,7 @@ def frames_of(length: int, *, fd: bool, drive: bool = False) -> int:
     return -(-length // ((FD_OCTETS if fd else CLASSIC_OCTETS) - drive))
 
 
-class Assembly:
+class StreamAssembly:
     """Puts the messages of one stream (or of Drive) together; ``length`` octets each.
 
     ``broken`` counts messages that were begun and not finished, because a frame is missing; ``wrong`` frames of another

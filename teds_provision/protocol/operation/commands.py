@@ -95,7 +95,7 @@ class ChannelState(IntFlag):
 
 
 @dataclass(frozen=True)
-class Operation:
+class OperationReply:
     """Reply to Operation (128.19): mode, and for each channel its state bits and claimant (source address, 0 none)."""
 
     measuring: bool
@@ -107,7 +107,7 @@ class Operation:
         return bytes([self.measuring]) + b"".join(rows)
 
     @classmethod
-    def decode(cls, payload: bytes) -> Operation:
+    def decode(cls, payload: bytes) -> OperationReply:
         """Read the reply; raises Garbled."""
         if len(payload) % 3 != 1 or payload[0] > 1:
             raise Garbled("The node's reply to Operation has a wrong form.")

@@ -36,7 +36,7 @@ def drive_key(message_key: bytes, run: int) -> bytes:
     return HKDFExpand(hashes.SHA256(), 16, b"TEDS1 drive\0" + run.to_bytes(2, "big")).derive(message_key)
 
 
-class Sealer:
+class DatagramSealer:
     """Seals and opens the messages of one run."""
 
     def __init__(self, key: bytes) -> None:

@@ -7,9 +7,9 @@ from typing import Final
 from teds_provision.errors import Garbled, NotAuthentic
 from teds_provision.protocol.operation.datagram import (
     LAST_COUNTER,
+    DatagramSealer,
     DriveValues,
     Layout,
-    Sealer,
     drive_key,
     drive_length,
 )
@@ -36,7 +36,7 @@ class Driver:
         self.layout, self.run = layout, reply.run
         self.next = 0
         self._dead_man = dead_man * 10**6
-        self._sealer = Sealer(drive_key(message_key, reply.run))
+        self._sealer = DatagramSealer(drive_key(message_key, reply.run))
 
     def seal(self, values: tuple[bytes, ...], now: TickBounds, *, hold: int | None = None) -> bytes:
         """One message with these data sets, in the layout's order.

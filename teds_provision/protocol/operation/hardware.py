@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, Protocol
 
 from teds_provision.protocol.operation.commands import Power
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.sheet import Kind, channel_from
+from teds_provision.teds.sheet import ChannelKind, channel_from
 
 _MILLION: Final = 10**6
 _LONGEST: Final = 1e6
@@ -26,7 +26,7 @@ class ChannelHardware:
     ``octets`` is ModLenth, ``model`` DatModel, ``halt`` ActHalt (None: none), ``shortest`` the shortest period in ns.
     """
 
-    kind: Kind
+    kind: ChannelKind
     octets: int
     model: int = 0
     halt: int | None = None
@@ -35,10 +35,10 @@ class ChannelHardware:
     @property
     def actuator(self) -> bool:
         """Whether it acts."""
-        return self.kind is Kind.ACTUATOR
+        return self.kind is ChannelKind.ACTUATOR
 
 
-class Reading(NamedTuple):
+class RawReading(NamedTuple):
     """One data set, ModLenth octets; not valid where out of range, warming up, or with a fault."""
 
     octets: bytes
@@ -69,7 +69,7 @@ class Hardware(Protocol):
     def keeps(self, period: int) -> bool:
         """Whether the clock keeps a period of so many ns on average."""
 
-    def read(self, channel: int, tick: int) -> Reading:
+    def read(self, channel: int, tick: int) -> RawReading:
         """The value of a sensor at ``tick``, which is now or a little before."""
 
     def bears(self, channel: int, data_set: bytes) -> bool:
@@ -97,7 +97,7 @@ class Hardware(Protocol):
         """Battery and charge."""
 
 
-class Port(NamedTuple):
+class SessionPort(NamedTuple):
     """Where a session's link lies: ``kind`` nfc, can or ble; streams of one ``bus`` share its budget.
 
     ``source`` is the station's address there (F1 to F7 on CAN, 1 on NFC, 2 and up on BLE); ``fd`` says that the command
@@ -112,13 +112,13 @@ class Port(NamedTuple):
     hears: bool = True
 
 
-def port_of(link: str) -> Port:
+def port_of(link: str) -> SessionPort:
     """The port that a link's name says: ``nfc``, ``can:f1``, ``ble:2`` (bus = what stands before the last colon)."""
     bus, _, source = link.rpartition(":")
     bus = bus or link
     kind = bus.partition(":")[0].rstrip("0123456789")
     number = int(source, 16) if source and bus != link else 1
-    return Port(kind, bus, number)
+    return SessionPort(kind, bus, number)
 
 
 def teds_fits(own: ChannelHardware, teds: bytes | None) -> bool:

@@ -39,18 +39,18 @@ from teds_provision.protocol.operation.commands import (
     WRITE_FUNCTION,
     ChannelState,
     Operate,
-    Operation,
+    OperationReply,
     PowerFlag,
     Sampled,
     channel_list,
     demand_form,
 )
-from teds_provision.protocol.operation.hardware import ChannelHardware, Hardware, Port, teds_fits
+from teds_provision.protocol.operation.hardware import ChannelHardware, Hardware, SessionPort, teds_fits
 from teds_provision.protocol.operation.stream_role import StreamRole, demand
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import NodeSession
 from teds_provision.teds.codec.model import AccessCode
-from teds_provision.teds.sheet import Kind
+from teds_provision.teds.sheet import ChannelKind
 
 _OFFSET_OCTETS: Final = 4
 
@@ -60,7 +60,7 @@ class Inner(NamedTuple):
 
     command: Command
     session: NodeSession
-    port: Port
+    port: SessionPort
     received: int
 
 
@@ -85,7 +85,7 @@ class OperationRole:
         self.streams = StreamRole(
             hardware, self.claims, teds=self._channel_teds, real=self._real, address=address, room=streams
         )
-        self._ports: dict[NodeSession, Port] = {}
+        self._ports: dict[NodeSession, SessionPort] = {}
         self._commands: dict[tuple[int, int], Callable[[Inner], bytes]] = {
             (EITHER, OPERATE_FUNCTION): self._operate,
             (EITHER, IDLE_FUNCTION): self._idle,
@@ -201,16 +201,16 @@ class OperationRole:
     def _operation(self, inner: Inner) -> bytes:
         demand_form(not inner.command.payload)
         rows = {channel: self._state(channel, inner.session) for channel in self._hardware.channels}
-        return Operation(bool(self.claims.sessions()), rows).encode()
+        return OperationReply(bool(self.claims.sessions()), rows).encode()
 
     def _state(self, channel: int, session: NodeSession) -> tuple[ChannelState, int]:
         holders = self.claims.holders(channel)
         kind = self._hardware.channels[channel].kind
         bits = {
-            ChannelState.ACTUATOR: kind is Kind.ACTUATOR,
+            ChannelState.ACTUATOR: kind is ChannelKind.ACTUATOR,
             ChannelState.CLAIMED_HERE: session in holders,
             ChannelState.CLAIMED_BY_OTHER: bool(holders - {session}),
-            ChannelState.EVENT_SENSOR: kind is Kind.EVENT_SENSOR,
+            ChannelState.EVENT_SENSOR: kind is ChannelKind.EVENT_SENSOR,
             ChannelState.SAFE: channel in self.claims.safe,
             ChannelState.STOPPED: channel in self.claims.stopped,
             ChannelState.TESTING: self._hardware.testing(channel),

@@ -26,7 +26,7 @@ NONE: Final = 0xFFFFFFFF
 """``last`` of Clock: no Drive message had a good tag yet."""
 
 
-class Kind(IntEnum):
+class StreamKind(IntEnum):
     """How a stream samples: at even times; one message an event; or even, by the sensor's own clock."""
 
     PERIODIC = 0
@@ -39,7 +39,7 @@ class Subscribe:
     """Subscribe (128.14): ``gap`` in µs, ``period`` and ``start`` in ns of the node's clock (start: SOON, WAITS)."""
 
     stream: int
-    kind: Kind
+    kind: StreamKind
     n: int
     gap: int
     period: int
@@ -63,9 +63,9 @@ class Subscribe:
         demand_form(len(payload) > 21)
         stream, kind, n, gap, period, start = struct.unpack_from(">BBBHQQ", payload)
         channels = channel_list(payload[21:], MOST_STREAM_CHANNELS)
-        demand_form(stream <= LAST_STREAM and kind & ~TEST_PATTERN in set(Kind) and n >= 1)
-        made = cls(stream, Kind(kind & ~TEST_PATTERN), n, gap, period, start, channels, bool(kind & TEST_PATTERN))
-        demand_form(made.kind != Kind.EVENT or (n == 1 and len(channels) == 1))
+        demand_form(stream <= LAST_STREAM and kind & ~TEST_PATTERN in set(StreamKind) and n >= 1)
+        made = cls(stream, StreamKind(kind & ~TEST_PATTERN), n, gap, period, start, channels, bool(kind & TEST_PATTERN))
+        demand_form(made.kind != StreamKind.EVENT or (n == 1 and len(channels) == 1))
         return made
 
     def length(self, octets: int) -> int:
@@ -73,9 +73,9 @@ class Subscribe:
         return message_length(self.kind, self.n, octets)
 
 
-def message_length(kind: Kind, n: int, octets: int) -> int:
+def message_length(kind: StreamKind, n: int, octets: int) -> int:
     """13 + n · Σ ModLenth, + 8 for kinds that carry their tick."""
-    return 13 + n * octets + (0 if kind == Kind.PERIODIC else 8)
+    return 13 + n * octets + (0 if kind == StreamKind.PERIODIC else 8)
 
 
 @dataclass(frozen=True)

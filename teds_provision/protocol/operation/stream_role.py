@@ -9,20 +9,20 @@ from typing import Final, NamedTuple
 
 from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.protocol.operation import budget
-from teds_provision.protocol.operation.can_frames import Assembly
+from teds_provision.protocol.operation.can_frames import StreamAssembly
 from teds_provision.protocol.operation.claims import Claims
 from teds_provision.protocol.operation.commands import channel_list, demand_form
 from teds_provision.protocol.operation.datagram import (
     LAST_RUN,
     MOST_OCTETS,
+    DatagramSealer,
     DriveValues,
     Layout,
-    Sealer,
     counter_of,
     drive_key,
     drive_length,
 )
-from teds_provision.protocol.operation.hardware import Hardware, Port, teds_period
+from teds_provision.protocol.operation.hardware import Hardware, SessionPort, teds_period
 from teds_provision.protocol.operation.stream_commands import (
     MOST_STREAM_CHANNELS,
     NONE,
@@ -32,14 +32,14 @@ from teds_provision.protocol.operation.stream_commands import (
     Arm,
     Clock,
     Driven,
-    Kind,
+    StreamKind,
     Subscribe,
     Subscribed,
 )
 from teds_provision.protocol.operation.streams import MICRO, DataFrame, Sender, Stream
 from teds_provision.protocol.operation.timing import START_AFTER_MARK, commitment
 from teds_provision.protocol.session import NodeSession
-from teds_provision.teds.sheet import Kind as ChannelKind
+from teds_provision.teds.sheet import ChannelKind
 
 SECOND: Final = 10**9
 SOON_NS: Final = 30 * 10**6
@@ -62,8 +62,8 @@ class DriveRun:
     """The Drive of a session: ``last`` is the highest counter with a good tag."""
 
     layout: Layout
-    sealer: Sealer = field(repr=False)
-    assembly: Assembly
+    sealer: DatagramSealer = field(repr=False)
+    assembly: StreamAssembly
     last: int | None = None
 
 
@@ -123,7 +123,7 @@ class StreamRole:
 
     # -- commands --------------------------------------------------------------------------------------------------
 
-    def subscribe(self, payload: bytes, session: NodeSession, port: Port) -> bytes:
+    def subscribe(self, payload: bytes, session: NodeSession, port: SessionPort) -> bytes:
         """Subscribe: every check in the order of section 4, then the stream."""
         asked = Subscribe.decode(payload)
         demand(port.kind != "nfc", Reason.DOES_NOT_FIT)
@@ -132,7 +132,7 @@ class StreamRole:
         kinds = [self._hardware.channels[channel].kind for channel in asked.channels]
         demand(ChannelKind.ACTUATOR not in kinds, Reason.NOT_PERMITTED)
         events = [kind is ChannelKind.EVENT_SENSOR for kind in kinds]
-        demand(all(events) if asked.kind == Kind.EVENT else not any(events), Reason.OUT_OF_RANGE)
+        demand(all(events) if asked.kind == StreamKind.EVENT else not any(events), Reason.OUT_OF_RANGE)
         shortest = [self._hardware.channels[channel].shortest for channel in asked.channels]
         shortest += [teds_period(self._teds(channel)) for channel in asked.channels]
         demand(max(1, *shortest) <= asked.period <= LONGEST_PERIOD, Reason.OUT_OF_RANGE)
@@ -169,7 +169,7 @@ class StreamRole:
         self._end(stream)
         return min(stream.counter, NONE).to_bytes(4, "big")
 
-    def drive(self, payload: bytes, session: NodeSession, port: Port) -> bytes:
+    def drive(self, payload: bytes, session: NodeSession, port: SessionPort) -> bytes:
         """Drive: values for these actuators by message from now on."""
         channels = channel_list(payload, MOST_STREAM_CHANNELS)
         demand(port.kind != "nfc", Reason.DOES_NOT_FIT)
@@ -179,8 +179,8 @@ class StreamRole:
         demand(own.run < LAST_RUN, Reason.NO_ROOM)
         own.run += 1
         length = drive_length(layout.octets)
-        sealer = Sealer(drive_key(session.message_key, own.run))
-        own.drive = DriveRun(layout, sealer, Assembly(length, fd=port.fd, drive=True))
+        sealer = DatagramSealer(drive_key(session.message_key, own.run))
+        own.drive = DriveRun(layout, sealer, StreamAssembly(length, fd=port.fd, drive=True))
         return Driven(own.run, length).encode()
 
     def clock(self, payload: bytes, session: NodeSession, received: int) -> bytes:
@@ -190,7 +190,7 @@ class StreamRole:
         last = NONE if own.drive is None or own.drive.last is None else own.drive.last
         return Clock(received, hardware.now(), own.mark, hardware.step, hardware.drift, last).encode()
 
-    def arm(self, payload: bytes, session: NodeSession, port: Port) -> bytes:
+    def arm(self, payload: bytes, session: NodeSession, port: SessionPort) -> bytes:
         """Arm: one trigger per action; life 0 disarms."""
         asked = Arm.decode(payload)
         demand(asked.life <= LONGEST_LIFE and asked.action in set(Action), Reason.OUT_OF_RANGE)
@@ -338,7 +338,7 @@ class StreamRole:
         self._sender(stream.port.bus).take_back(stream)
 
 
-def _share(others: list[Stream], asked: Subscribe, length: int, port: Port) -> int:
+def _share(others: list[Stream], asked: Subscribe, length: int, port: SessionPort) -> int:
     """What the streams of a bus take of the node's budget, with one more, in ppm."""
     there = [stream for stream in others if stream.port.bus == port.bus]
     widest = max([1, asked.gap, *(stream.asked.gap for stream in there)])

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
-from teds_provision.protocol.operation.can_frames import DataAddress, Piece, ble_frame, cut
+from teds_provision.protocol.operation.can_frames import DataAddress, Segment, ble_frame, cut
 from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
-from teds_provision.protocol.operation.datagram import LAST_COUNTER, Layout, Sealer, pattern, stream_key
-from teds_provision.protocol.operation.hardware import Hardware, Port
-from teds_provision.protocol.operation.stream_commands import WAITS, Kind, Subscribe
+from teds_provision.protocol.operation.datagram import LAST_COUNTER, DatagramSealer, Layout, pattern, stream_key
+from teds_provision.protocol.operation.hardware import Hardware, SessionPort
+from teds_provision.protocol.operation.stream_commands import WAITS, StreamKind, Subscribe
 from teds_provision.protocol.session import NodeSession
 
 MICRO: Final = 1000
@@ -31,7 +31,7 @@ class Stream:
     """One run of one stream. ``start`` in ns, None while it waits for a trigger; ``session``'s replies go first."""
 
     def __init__(
-        self, session: NodeSession, port: Port, asked: Subscribe, layout: Layout, run: int, start: int | None
+        self, session: NodeSession, port: SessionPort, asked: Subscribe, layout: Layout, run: int, start: int | None
     ) -> None:
         self.session, self.port, self.asked, self.layout, self.run = session, port, asked, layout, run
         self.start = start
@@ -42,7 +42,7 @@ class Stream:
         self.ready = False
         self.ended = False
         self.waiting: Full | None = None
-        self._sealer = Sealer(stream_key(session.message_key, run))
+        self._sealer = DatagramSealer(stream_key(session.message_key, run))
         self._filling = bytearray()
         self._flags = 0
         self._held = 0
@@ -59,7 +59,7 @@ class Stream:
         """The tick of the next sample, None where events or a trigger are awaited."""
         if self.start is None or self.ended:
             return None
-        if self.asked.kind == Kind.EVENT:
+        if self.asked.kind == StreamKind.EVENT:
             return self.start + self._patterned * self.asked.period if self.asked.test_pattern else None
         return self.start + (self.counter * self.asked.n + self._held) * self.asked.period
 
@@ -71,7 +71,7 @@ class Stream:
     def sample(self, hardware: Hardware, now: int) -> None:
         """Take every sample that is due at tick ``now``."""
         while not self.ended and (due := self.next_instant) is not None and due <= now:
-            if self.asked.kind == Kind.EVENT:
+            if self.asked.kind == StreamKind.EVENT:
                 octets = pattern(self.channels[0], self.layout.octets, self._patterned)
                 self._patterned += 1
                 self._event(due, octets, valid=True)
@@ -82,7 +82,7 @@ class Stream:
 
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool) -> None:
         """An event sensor has seen something at ``tick``."""
-        if self.asked.kind != Kind.EVENT or self.asked.test_pattern or self.channels != (channel,) or self.ended:
+        if self.asked.kind != StreamKind.EVENT or self.asked.test_pattern or self.channels != (channel,) or self.ended:
             return
         if self.start is not None and tick >= self.start:
             self._event(tick, octets, valid=valid)
@@ -98,7 +98,7 @@ class Stream:
         self._full()
 
     def _instant(self, hardware: Hardware, tick: int) -> None:
-        if self._held == 0 and self.asked.kind == Kind.FREE:
+        if self._held == 0 and self.asked.kind == StreamKind.FREE:
             self._filling += tick.to_bytes(_TICK, "big")
         index = self.counter * self.asked.n + self._held
         for channel, width in zip(self.channels, self.layout.widths, strict=True):
@@ -149,8 +149,8 @@ class Sender:
     def __init__(self, address: Callable[[], int]) -> None:
         self._address = address
         self._stream: Stream | None = None
-        self._pieces: Iterator[Piece] | None = None
-        self._next: Piece | None = None
+        self._pieces: Iterator[Segment] | None = None
+        self._next: Segment | None = None
         self._free_at = 0
 
     def take_back(self, stream: Stream) -> None:
@@ -194,7 +194,7 @@ class Sender:
             return
         self._stream = chosen
         ble = chosen.port.kind == "ble"
-        self._pieces = iter([Piece(0, message)]) if ble else cut(message, fd=chosen.port.fd)
+        self._pieces = iter([Segment(0, message)]) if ble else cut(message, fd=chosen.port.fd)
         self._next = next(self._pieces)
 
     def _choice(self, streams: list[Stream]) -> Stream | None:

@@ -1,7 +1,7 @@
 """A stream as the station sees it: what it asks for, which messages it believes (operation.md sections 3 and 4).
 
-:class:`Plan` builds Subscribe and checks its reply; :class:`Receiver` opens messages, drops what section 3 says and
-counts each cause apart. No clock of its own: the caller hands in the bounds of the node's present tick.
+:class:`StreamPlan` builds Subscribe and checks its reply; :class:`Receiver` opens messages, drops what section 3 says
+and counts each cause apart. No clock of its own: the caller hands in the bounds of the node's present tick.
 """
 
 from __future__ import annotations
@@ -14,8 +14,22 @@ from typing import Final, NamedTuple
 from teds_provision.errors import NotAuthentic
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
-from teds_provision.protocol.operation.datagram import COUNTER_OCTETS, MOST_OCTETS, Layout, Sealer, pattern, stream_key
-from teds_provision.protocol.operation.stream_commands import SOON, WAITS, Kind, Subscribe, Subscribed, message_length
+from teds_provision.protocol.operation.datagram import (
+    COUNTER_OCTETS,
+    MOST_OCTETS,
+    DatagramSealer,
+    Layout,
+    pattern,
+    stream_key,
+)
+from teds_provision.protocol.operation.stream_commands import (
+    SOON,
+    WAITS,
+    StreamKind,
+    Subscribe,
+    Subscribed,
+    message_length,
+)
 
 START_WITHIN: Final = 10**9
 """A stream that was asked to begin soon begins within so many ns after the reply's tick."""
@@ -34,7 +48,7 @@ class TickBounds(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class StreamPlan:
     """A stream that a station wants; ``subscribe`` says it, ``layout`` the channels' widths (from the signed TEDS)."""
 
     subscribe: Subscribe
@@ -48,11 +62,11 @@ class Plan:
         *,
         n: int,
         period: int,
-        kind: Kind = Kind.PERIODIC,
+        kind: StreamKind = StreamKind.PERIODIC,
         gap: int = 0,
         start: int = SOON,
         test_pattern: bool = False,
-    ) -> Plan:
+    ) -> StreamPlan:
         """A plan over (channel, ModLenth) pairs; ``period`` and ``start`` in ns, ``gap`` in µs."""
         numbers, widths = tuple(c for c, _ in channels), tuple(w for _, w in channels)
         return cls(Subscribe(stream, kind, n, gap, period, start, numbers, test_pattern), Layout(numbers, widths))
@@ -99,13 +113,13 @@ def require_new_run(run: int, after: int) -> None:
         raise NotAuthentic(f"The node names {said}.", hint="Its firmware does not keep to the profile.")
 
 
-def most_instants(kind: Kind, octets: int, most: int = MOST_OCTETS) -> int:
+def most_instants(kind: StreamKind, octets: int, most: int = MOST_OCTETS) -> int:
     """The largest n whose message has at most ``most`` octets, one instant having ``octets``; 0 where none fits."""
     room = most - message_length(kind, 0, 0)
-    return max(0, min(255, room // octets, 1 if kind == Kind.EVENT else 255)) if octets else 0
+    return max(0, min(255, room // octets, 1 if kind == StreamKind.EVENT else 255)) if octets else 0
 
 
-class Message(NamedTuple):
+class StreamMessage(NamedTuple):
     """One good data message: ``index`` of its first sample, ``tick`` of that (ns), n instants one after another.
 
     Sample i of it was taken at ``tick`` + i · period (kinds periodic and free). For events ``index`` counts events.
@@ -163,7 +177,7 @@ class Receiver:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: StreamPlan,
         reply: Subscribed,
         message_key: bytes,
         *,
@@ -174,23 +188,23 @@ class Receiver:
         self.start: int | None = None if reply.start == WAITS else reply.start
         self.counts = Counts()
         self.last = -1
-        self._sealer = Sealer(stream_key(message_key, reply.run))
+        self._sealer = DatagramSealer(stream_key(message_key, reply.run))
         self._before = previous._sealer if previous is not None else None
         self._length = plan.length
         self._n, self._period = plan.subscribe.n, plan.subscribe.period
         # Of its last instant; a message is dated by its first one.
         self._oldest = (2 * plan.span + LATE_AFTER if oldest is None else oldest) + plan.span - self._period
-        self._timed = plan.subscribe.kind != Kind.PERIODIC
+        self._timed = plan.subscribe.kind != StreamKind.PERIODIC
         self._tick = -1  # of the last good message
         self._pattern = TEST_PATTERN if plan.subscribe.test_pattern else 0
-        self._held: deque[tuple[Message, TickBounds]] = deque()
+        self._held: deque[tuple[StreamMessage, TickBounds]] = deque()
 
-    def take(self, octets: bytes, now: TickBounds) -> Message | None:
+    def take(self, octets: bytes, now: TickBounds) -> StreamMessage | None:
         """Open one message; None where it is dropped (see ``counts``) or held until :meth:`begin`."""
         found = self.take_all(((octets, 0),), now)
         return found[0] if found else None
 
-    def take_all(self, came: Iterable[tuple[bytes, int]], ahead: TickBounds) -> list[Message]:
+    def take_all(self, came: Iterable[tuple[bytes, int]], ahead: TickBounds) -> list[StreamMessage]:
         """Open messages in the order in which they came, each with its time of arrival by the host's clock (ns).
 
         ``ahead`` bounds what the node's tick is ahead of that clock. Gives the good ones that are not held.
@@ -232,13 +246,15 @@ class Receiver:
         self.counts.lost += counter - self.last - 1
         return True
 
-    def _read(self, counter: int, plain: bytes) -> Message:
+    def _read(self, counter: int, plain: bytes) -> StreamMessage:
         index = counter * self._n
         if self._timed:
-            return Message(counter, index, int.from_bytes(plain[1 : 1 + _TICK], "big"), plain[0], plain[1 + _TICK :])
-        return Message(counter, index, index * self._period + (self.start or 0), plain[0], plain[1:])
+            return StreamMessage(
+                counter, index, int.from_bytes(plain[1 : 1 + _TICK], "big"), plain[0], plain[1 + _TICK :]
+            )
+        return StreamMessage(counter, index, index * self._period + (self.start or 0), plain[0], plain[1:])
 
-    def begin(self, start: int) -> list[Message]:
+    def begin(self, start: int) -> list[StreamMessage]:
         """The first instant of a stream that waited is known (mark + 10 ms): gives the messages held, where fresh."""
         self.start = start
         held, self._held = self._held, deque()
@@ -249,7 +265,7 @@ class Receiver:
 
     def begun(self, tick: int) -> int:
         """How many messages of this run had begun by a tick (ns), by period and start; 0 where that is not known."""
-        if self.start is None or self.plan.subscribe.kind == Kind.EVENT:
+        if self.start is None or self.plan.subscribe.kind == StreamKind.EVENT:
             return 0
         return max(0, (tick - self.start) // self.plan.span + 1)
 
@@ -264,7 +280,7 @@ class Receiver:
         self.counts.cut += counter - max(due, self.last + 1) if counter > self.last + 1 else 0
         self.last = max(self.last, counter - 1)
 
-    def expected(self, message: Message) -> bytes:
+    def expected(self, message: StreamMessage) -> bytes:
         """The test pattern that this message must hold."""
         layout, n = self.plan.layout, self.plan.subscribe.n
         rows = (

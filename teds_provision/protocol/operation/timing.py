@@ -51,13 +51,13 @@ class ClockSample:
         return TickBounds(int(middle - error), int(middle + error) + 1)
 
 
-class Token(NamedTuple):
+class TriggerToken(NamedTuple):
     """T of one trigger, 8 octets that only the station knows; its commitment C goes to the nodes, T on the bus."""
 
     octets: bytes
 
     @classmethod
-    def draw(cls) -> Token:
+    def draw(cls) -> TriggerToken:
         """A new one; each is for one use."""
         return cls(os.urandom(TOKEN_OCTETS))
 

@@ -31,7 +31,7 @@ _HEADER: Final = frozenset({"alg", "kid", "typ"})
 
 
 @dataclass(frozen=True)
-class Kind:
+class DocumentKind:
     """One kind of document: its ``typ``, the most octets that are read, its ``format``, and what people call it."""
 
     typ: str
@@ -40,12 +40,12 @@ class Kind:
     what: str
 
 
-ROSTER: Final = Kind("teds-roster+jws", 1 << 20, "teds-roster/1", "the roster")
-PAGE: Final = Kind("teds-page+jws", 1 << 20, "teds-page/1", "the page")
-MEMBER_REQUEST: Final = Kind("teds-member-request+jws", 16 << 10, "teds-member-request/1", "the request")
-JOB: Final = Kind("teds-job+jws", 4 << 20, "teds-job/1", "the job")
-SIGN_REQUEST: Final = Kind("teds-sign-request+jws", 1 << 20, "teds-sign-request/1", "the sign request")
-SIGNED: Final = Kind("teds-signed+jws", 64 << 10, "teds-signed/1", "the office's answer")
+ROSTER: Final = DocumentKind("teds-roster+jws", 1 << 20, "teds-roster/1", "the roster")
+PAGE: Final = DocumentKind("teds-page+jws", 1 << 20, "teds-page/1", "the page")
+MEMBER_REQUEST: Final = DocumentKind("teds-member-request+jws", 16 << 10, "teds-member-request/1", "the request")
+JOB: Final = DocumentKind("teds-job+jws", 4 << 20, "teds-job/1", "the job")
+SIGN_REQUEST: Final = DocumentKind("teds-sign-request+jws", 1 << 20, "teds-sign-request/1", "the sign request")
+SIGNED: Final = DocumentKind("teds-signed+jws", 64 << 10, "teds-signed/1", "the office's answer")
 
 
 class NewerFormat(BadData):
@@ -55,7 +55,7 @@ class NewerFormat(BadData):
 
 
 @dataclass(frozen=True)
-class Document:
+class SignedDocument:
     """A document under a good signature: the signer's fingerprint and point, H, and what it says."""
 
     signer: str
@@ -70,7 +70,7 @@ def payload(members: Mapping[str, Any]) -> bytes:
     return json.dumps(members, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 
-def seal(members: Mapping[str, Any], key: PrivateKey, kind: Kind) -> bytes:
+def seal(members: Mapping[str, Any], key: PrivateKey, kind: DocumentKind) -> bytes:
     """Sign a document; raises BadData where it is larger than anybody reads."""
     octets = jose.sign_compact(payload(members), key, typ=kind.typ)
     check_size(len(octets), kind.most, kind.what)
@@ -82,7 +82,7 @@ def hash_of(octets: bytes) -> str:
     return hashlib.sha256(octets.rpartition(b".")[0]).hexdigest()
 
 
-def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: Kind) -> Document:
+def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: DocumentKind) -> SignedDocument:
     """Check who signed a document and read its members; their values are the caller's to look at.
 
     ``find_key`` gives the point of a fingerprint that may sign this kind. Raises NotAuthentic (nobody known signed
@@ -102,7 +102,7 @@ def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: 
                 f"T{kind.what[1:]} is of a newer version ({told}).", hint="Use a newer version of teds-provision."
             )
         raise BadData(f"The format of {kind.what} is not {kind.format}.")
-    return Document(verified.kid, verified.signer, hash_of(octets), members, octets)
+    return SignedDocument(verified.kid, verified.signer, hash_of(octets), members, octets)
 
 
 def split(octets: bytes) -> tuple[bytes, bytes, bytes]:

@@ -60,7 +60,7 @@ _TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 
 
 @dataclass(frozen=True)
-class Facts:
+class BoardFacts:
     """What the board signs, beside which datasheet it has: who made it, for which job, from what, step by step.
 
     ``epoch``, ``sequence`` and ``blocks`` (channel, access code, SHA-256) are those of the Security TEDS. ``job`` and
@@ -96,12 +96,12 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Claim:
+class EvidenceClaim:
     """What is to be proven of a board: its UUID, the Security TEDS that it shows (framed), and the facts."""
 
     uuid: bytes
     teds: bytes = field(repr=False)
-    facts: Facts
+    facts: BoardFacts
 
     @property
     def subject(self) -> list[dict[str, Any]]:
@@ -134,7 +134,7 @@ def pae(payload: bytes) -> bytes:
 def seal(
     key: PrivateKey,
     certificate: bytes,
-    claim: Claim,
+    claim: EvidenceClaim,
     *,
     nonce: bytes,
     proof: bytes,
@@ -183,7 +183,7 @@ class Evidence:
 
     uuid: bytes
     digest: str
-    facts: Facts
+    facts: BoardFacts
     verdict: str
     finished: str
     operator: str | None
@@ -382,10 +382,10 @@ def _subject(subject: object) -> tuple[bytes, str]:
     raise BadData("The subject of the statement is not one teds:UUID with its SHA-256.")
 
 
-def _facts(members: Members, raw: dict[str, Any]) -> Facts:
+def _facts(members: Members, raw: dict[str, Any]) -> BoardFacts:
     _require_plain(raw)
     heads = members.get("heads")
-    return Facts(
+    return BoardFacts(
         station=_sha256(members, "station"),
         job=None if members.get("job") is None else members.random_id("job"),
         unit=None if members.get("unit") is None else members.u32("unit", 1),

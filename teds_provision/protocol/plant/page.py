@@ -98,7 +98,7 @@ def _heads(value: object) -> dict[str, tuple[int, str]]:
 
 
 @dataclass(frozen=True)
-class Draft:
+class PageDraft:
     """What goes into the next page of a station, beside its events."""
 
     registry: str
@@ -110,7 +110,7 @@ class Draft:
     audit: tuple[int, str]
 
 
-def seal_page(draft: Draft, events: Sequence[Mapping[str, Any]], key: PrivateKey) -> bytes:
+def seal_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: PrivateKey) -> bytes:
     """Sign a page; raises BadData where more is in it than a page takes."""
     if len(events) > MOST_EVENTS:
         raise BadData(f"A page takes {MOST_EVENTS} events, not {len(events)}.")

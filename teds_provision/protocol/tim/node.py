@@ -31,7 +31,7 @@ from teds_provision.protocol.messages.frames import (
 )
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
-from teds_provision.protocol.operation.hardware import Hardware, Port, port_of
+from teds_provision.protocol.operation.hardware import Hardware, SessionPort, port_of
 from teds_provision.protocol.operation.role import Inner, OperationRole
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import LAST_COUNTER, NodeSession, OneTime
@@ -136,7 +136,7 @@ class Tim:
         self._taken_address = address
 
     def handle(
-        self, frame: bytes, *, link: str, tapped: bool, port: Port | None = None, received: int | None = None
+        self, frame: bytes, *, link: str, tapped: bool, port: SessionPort | None = None, received: int | None = None
     ) -> bytes:
         """Run one whole command frame and return the whole reply frame. Never raises on any octets.
 

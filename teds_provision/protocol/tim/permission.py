@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, Refused, TedsFunction
-from teds_provision.protocol.operation.hardware import Port
+from teds_provision.protocol.operation.hardware import SessionPort
 from teds_provision.protocol.operation.role import OperationRole
 from teds_provision.protocol.session import OPEN_OCTETS, NodeSession
 
@@ -24,7 +24,7 @@ class Origin:
 
     link: str
     tapped: bool
-    port: Port
+    port: SessionPort
     received: int
     session: NodeSession | None = None
 

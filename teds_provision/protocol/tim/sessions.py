@@ -38,7 +38,7 @@ class _Link:
     half_open_at: float = 0.0
 
 
-class Taken(NamedTuple):
+class OpenedFrame(NamedTuple):
     """A good Sealed frame: its session, counter and inner frame. ``room`` is False where a new session found none."""
 
     session: NodeSession
@@ -105,7 +105,7 @@ class Sessions:
         held = self._links.get(link)
         return held.session if held is not None else None
 
-    def take(self, payload: bytes, link: str) -> Taken:
+    def take(self, payload: bytes, link: str) -> OpenedFrame:
         """A Sealed frame: tried under the session, then under the half-open Open. Raises Refused; changes nothing then.
 
         A link must have a session or half-open Open (:meth:`any_on`).
@@ -125,11 +125,11 @@ class Sessions:
         if session is held.half_open:
             held.half_open = None
             if not self._make_room(held):
-                return Taken(session, counter, inner, room=False)
+                return OpenedFrame(session, counter, inner, room=False)
             self._end(held)
             held.session = session
         session.counter, session.good_at = counter, self._clock()
-        return Taken(session, counter, inner)
+        return OpenedFrame(session, counter, inner)
 
     def end(self, link: str, session: NodeSession) -> None:
         """End this session, if it still is the one of its link."""

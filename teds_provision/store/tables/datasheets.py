@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from teds_provision.errors import BadData
 from teds_provision.lazy import late
 from teds_provision.store.database import Database, places
-from teds_provision.store.records import DatasheetRecord, Draft, Reading, iso, utc_now
+from teds_provision.store.records import DatasheetRecord, Draft, NodeReading, iso, utc_now
 from teds_provision.teds.image import BlockId, Image
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def unpacked(uuid: bytes, octets: bytes) -> Image:
 KEPT = 11
 """The present datasheet of a node and ten older ones."""
 
-READING_FIELDS = tuple(column.name for column in fields(Reading))
+READING_FIELDS = tuple(column.name for column in fields(NodeReading))
 _READING = ", ".join(READING_FIELDS)
 _COLUMNS = "uuid, sequence, epoch, signed, profile, seen, digest, blocks"
 
@@ -145,16 +145,16 @@ class DatasheetTables:
 
     # -- readings --------------------------------------------------------------------------------------------------
 
-    def reading_of(self, uuid: bytes) -> Reading | None:
+    def reading_of(self, uuid: bytes) -> NodeReading | None:
         """Return what was read of this node last, None where nothing was."""
         return self._database.read_one(_reading, f"SELECT {_READING} FROM readings WHERE uuid = ?", (uuid,))
 
-    def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, Reading]:
+    def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeReading]:
         """Return what was read last of these nodes (a page of them), by UUID."""
         statement = f"SELECT {_READING} FROM readings WHERE uuid IN ({places(uuids)})"
         return {reading.uuid: reading for reading in self._database.read(_reading, statement, uuids)}
 
-    def put_reading(self, reading: Reading) -> bool:
+    def put_reading(self, reading: NodeReading) -> bool:
         """Keep a reading in place of the one before; False where that was made in a session and this one was not."""
         values = tuple(getattr(reading, name) for name in READING_FIELDS)
         changed = ", ".join(f"{name} = excluded.{name}" for name in READING_FIELDS[1:])
@@ -185,9 +185,9 @@ class DatasheetTables:
                 self._database.execute(f"INSERT INTO datasheets({_COLUMNS}) VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
 
 
-def _reading(*row: Any) -> Reading:
+def _reading(*row: Any) -> NodeReading:
     values = dict(zip(READING_FIELDS, row, strict=True))
-    return Reading(**(values | {"whole": bool(values["whole"])}))
+    return NodeReading(**(values | {"whole": bool(values["whole"])}))
 
 
 def _draft(uuid: bytes, blocks: bytes, stage: Any, profile: str | None, created: str) -> Draft:

@@ -8,9 +8,9 @@ from operator import attrgetter
 from typing import Any
 
 from teds_provision.store.database import Database, places
-from teds_provision.store.records import Facts, Marks
+from teds_provision.store.records import Marks, StationRecord
 
-_FACTS = ", ".join(column.name for column in fields(Facts))
+_FACTS = ", ".join(column.name for column in fields(StationRecord))
 _MARKS = ", ".join(column.name for column in fields(Marks))
 _NONE = Marks()
 _values = attrgetter(*(column.name for column in fields(Marks)))
@@ -21,20 +21,20 @@ class FactTables:
 
     _database: Database
 
-    _seen: tuple[tuple[int, int], Facts | None] | None = None
+    _seen: tuple[tuple[int, int], StationRecord | None] | None = None
     """The facts as they were read last, and the state of the file then: every step asks for them again and again."""
 
-    def facts(self) -> Facts | None:
+    def facts(self) -> StationRecord | None:
         """Return what the station knows of itself, None before init made anything."""
         state = self._database.state()
         if self._seen is None or self._seen[0] != state:
-            self._seen = state, self._database.read_one(Facts, f"SELECT {_FACTS} FROM station")
+            self._seen = state, self._database.read_one(StationRecord, f"SELECT {_FACTS} FROM station")
         return self._seen[1]
 
-    def put_facts(self, facts: Facts) -> None:
+    def put_facts(self, facts: StationRecord) -> None:
         """Keep the station's facts, all of them."""
         self._seen = None
-        values = tuple(getattr(facts, column.name) for column in fields(Facts))
+        values = tuple(getattr(facts, column.name) for column in fields(StationRecord))
         self._database.execute(f"INSERT OR REPLACE INTO station(one, {_FACTS}) VALUES(1, {places(values)})", values)
 
     # -- certificates ----------------------------------------------------------------------------------------------

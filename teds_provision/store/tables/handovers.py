@@ -11,7 +11,7 @@ from typing import Any
 
 from teds_provision.errors import PolicyRefused, UsageFailure
 from teds_provision.store.database import Database, places
-from teds_provision.store.records import Direction, Handover, Holder, Revocation, Tombstone, TrustRecord, utc_now
+from teds_provision.store.records import Direction, Handover, Holder, RevocationRecord, Tombstone, TrustRecord, utc_now
 
 _MIN_FINGERPRINT_PREFIX = 16  # what people are shown
 
@@ -127,19 +127,21 @@ class HandoverTables:
         statement = "DELETE FROM holders WHERE uuid = ? AND fingerprint = ?"
         return self._database.change(statement, (uuid, fingerprint)) > 0
 
-    def revocations(self) -> list[Revocation]:
+    def revocations(self) -> list[RevocationRecord]:
         """Return the deny list, by UUID."""
-        return self._database.read(Revocation, "SELECT * FROM revocations ORDER BY uuid")
+        return self._database.read(RevocationRecord, "SELECT * FROM revocations ORDER BY uuid")
 
-    def revocation(self, uuid: bytes) -> Revocation | None:
+    def revocation(self, uuid: bytes) -> RevocationRecord | None:
         """Return why this node is denied, None if it is not."""
-        return self._database.read_one(Revocation, "SELECT * FROM revocations WHERE uuid = ?", (uuid,))
+        return self._database.read_one(RevocationRecord, "SELECT * FROM revocations WHERE uuid = ?", (uuid,))
 
-    def revocations_of(self, uuids: Sequence[bytes]) -> list[Revocation]:
+    def revocations_of(self, uuids: Sequence[bytes]) -> list[RevocationRecord]:
         """The entries of these nodes, at most a page of them."""
-        return self._database.read(Revocation, f"SELECT * FROM revocations WHERE uuid IN ({places(uuids)})", uuids)
+        return self._database.read(
+            RevocationRecord, f"SELECT * FROM revocations WHERE uuid IN ({places(uuids)})", uuids
+        )
 
-    def put_revocation(self, revocation: Revocation) -> None:
+    def put_revocation(self, revocation: RevocationRecord) -> None:
         """Deny a node."""
         self._database.execute(
             "INSERT OR REPLACE INTO revocations VALUES(?, ?, ?, ?, ?)",

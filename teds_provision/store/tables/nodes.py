@@ -15,11 +15,11 @@ from teds_provision.errors import NotFound, OtherKey, UsageFailure
 from teds_provision.store.database import PAGE, Database, places
 from teds_provision.store.records import (
     UUID_OCTETS,
+    ExportFacts,
     Handed,
     Holder,
     KeyRecord,
     NodeRecord,
-    Shown,
     Tombstone,
     WhitelistEntry,
 )
@@ -78,11 +78,11 @@ class NodeTables:
         """Return all nodes, by UUID."""
         return self._database.read(_node, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
-    def each_shown(self) -> Iterator[Shown]:
+    def each_shown(self) -> Iterator[ExportFacts]:
         """Give identity key and retirement of all nodes, by UUID, a page at a time."""
         after = b""
         statement = "SELECT uuid, point, point_mac, retired FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
-        while page := self._database.read(Shown, statement, (after, PAGE)):
+        while page := self._database.read(ExportFacts, statement, (after, PAGE)):
             yield from page
             after = page[-1].uuid
 

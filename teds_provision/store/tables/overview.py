@@ -37,7 +37,7 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Known:
+class NodeOverview:
     """What the tables say of one node; None and empty where they say nothing."""
 
     uuid: bytes
@@ -74,7 +74,7 @@ class OverviewTables:
             LEFT JOIN whitelist w ON w.uuid = k.uuid WHERE {" AND ".join(terms) or "1"} ORDER BY k.uuid"""
         return [bytes(uuid) for (uuid,) in self._database.execute(statement, values)]
 
-    def overview(self, uuids: Sequence[bytes]) -> Iterator[Known]:
+    def overview(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
         """Give what is known of these nodes, in their order, a page at a time; holds no lock between pages."""
         for first in range(0, len(uuids), PAGE):
             yield from self._page(uuids[first : first + PAGE])
@@ -113,7 +113,7 @@ class OverviewTables:
         rows = self._database.execute(statement, (name, name))
         return bytes(rows[0][0]) if len(rows) == 1 else None
 
-    def _page(self, uuids: Sequence[bytes]) -> Iterator[Known]:
+    def _page(self, uuids: Sequence[bytes]) -> Iterator[NodeOverview]:
         nodes = self._rows("nodes", _NODE, uuids)
         whitelist = self._rows("whitelist", ("fingerprint", "assurance", "name", "added"), uuids)
         moved = self._rows("tombstones", ("to_fingerprint", "handover_id"), uuids)
@@ -125,7 +125,7 @@ class OverviewTables:
         holders = self._lists("holders", ("fingerprint", "mode", "since"), uuids, "since, fingerprint")
         groups = self._lists("group_members", ("name",), uuids, "name")
         for uuid in uuids:
-            yield Known(
+            yield NodeOverview(
                 uuid,
                 nodes.get(uuid),
                 whitelist.get(uuid),

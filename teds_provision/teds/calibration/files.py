@@ -18,9 +18,9 @@ from typing import Final
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_size, load_json
 from teds_provision.teds.calibration.model import PLAIN, Calibration
-from teds_provision.teds.calibration.order import Order, calibration_of
+from teds_provision.teds.calibration.order import CalibrationOrder, calibration_of
 from teds_provision.teds.profile.model import ChannelProfile, Profile
-from teds_provision.teds.profile.reader import Item, Table, Where, parse, read_text
+from teds_provision.teds.profile.reader import Item, TomlTable, Where, parse, read_text
 from teds_provision.teds.units import parse_unit
 
 # The CSV reader takes delimiter, decimal comma, header, units and metadata as instruments and spreadsheets write them.
@@ -319,10 +319,10 @@ def fit_points(text: str, file: str, *, method: str | None = None, degree: int |
 _SENSOR: Final[Mapping[str, object]] = {"ChanType": 0}
 
 
-def _from_csv(table: CsvTable) -> list[Order]:
+def _from_csv(table: CsvTable) -> list[CalibrationOrder]:
     orders = []
     for channel, rows in table.by_channel().items():
-        order = Order(table.file, rows[0].line, dict(table.metadata))
+        order = CalibrationOrder(table.file, rows[0].line, dict(table.metadata))
         if channel is not None:
             order.values["channel"] = (channel, rows[0].line)
         if table.unit and "unit" not in order.values:
@@ -335,7 +335,7 @@ def _from_csv(table: CsvTable) -> list[Order]:
     return orders
 
 
-def _json(text: str, file: str) -> Table:
+def _json(text: str, file: str) -> TomlTable:
     data = load_json(text, "the calibration", octets=LIMITS.text_file, file=file)
     if not isinstance(data, dict):
         raise BadData(f"{file}:1: an object is expected, with points or coefficients.")
@@ -344,10 +344,10 @@ def _json(text: str, file: str) -> Table:
         at = text.find(f'"{key}"')
         return Where(file, text.count("\n", 0, max(at, 0)) + 1)
 
-    def table(value: Mapping[str, object], where: Where, path: str) -> Table:
-        return Table({key: entry(part, line(key), f"{path}{key}") for key, part in value.items()}, where, path)
+    def table(value: Mapping[str, object], where: Where, path: str) -> TomlTable:
+        return TomlTable({key: entry(part, line(key), f"{path}{key}") for key, part in value.items()}, where, path)
 
-    def entry(value: object, where: Where, path: str) -> Item | Table:
+    def entry(value: object, where: Where, path: str) -> Item | TomlTable:
         if isinstance(value, dict):
             return table(value, where, f"{path}.")
         if isinstance(value, list) and value and all(isinstance(part, dict) for part in value):
@@ -357,18 +357,18 @@ def _json(text: str, file: str) -> Table:
     return table(data, Where(file, 1), "")
 
 
-def _from_table(table: Table, file: str) -> list[Order]:
+def _from_table(table: TomlTable, file: str) -> list[CalibrationOrder]:
     many = table.entries.get("calibration")
     if isinstance(many, Item) and isinstance(many.value, tuple):
         shared = {key: entry for key, entry in table.entries.items() if key != "calibration"}
-        return [_order(Table({**shared, **part.entries}, part.where), file) for part in many.value]
+        return [_order(TomlTable({**shared, **part.entries}, part.where), file) for part in many.value]
     return [_order(table, file)]
 
 
-def _order(table: Table, file: str) -> Order:
-    order = Order(file, table.where.line)
+def _order(table: TomlTable, file: str) -> CalibrationOrder:
+    order = CalibrationOrder(file, table.where.line)
     for key, entry in table.entries.items():
-        if key not in KEYS or key == "calibration" or isinstance(entry, Table):
+        if key not in KEYS or key == "calibration" or isinstance(entry, TomlTable):
             near = get_close_matches(key[:64], KEYS, n=1)
             guess = f' Did you mean "{near[0]}"?' if near else f" Known are: {', '.join(KEYS)}."
             raise BadData(f"{entry.where}: {key}: there is no such key.{guess}")
@@ -376,7 +376,7 @@ def _order(table: Table, file: str) -> Order:
     return order
 
 
-def _only_channel(order: Order, profile: Profile) -> ChannelProfile:
+def _only_channel(order: CalibrationOrder, profile: Profile) -> ChannelProfile:
     """The one channel that wants a calibration, or the one that there is."""
     wanting = [channel for channel in profile.channels if channel.calibration.required] or profile.channels
     if len(wanting) != 1:
@@ -384,7 +384,7 @@ def _only_channel(order: Order, profile: Profile) -> ChannelProfile:
     return wanting[0]
 
 
-def _channels(order: Order, profile: Profile) -> list[ChannelProfile]:
+def _channels(order: CalibrationOrder, profile: Profile) -> list[ChannelProfile]:
     value = order.get("channel")
     if value is None:
         return [_only_channel(order, profile)]

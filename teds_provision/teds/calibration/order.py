@@ -12,7 +12,7 @@ from teds_provision.errors import BadData
 from teds_provision.teds.calibration.formula import fit, residuals
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
 from teds_provision.teds.profile.model import ChannelProfile
-from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Table
+from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, TomlTable
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 
@@ -22,7 +22,7 @@ def is_number(value: object) -> bool:
 
 
 @dataclass
-class Order:
+class CalibrationOrder:
     """What a file says about one calibration, before it is fitted to a channel: values with their places."""
 
     file: str
@@ -61,7 +61,7 @@ class Order:
         raise self.wrong(key, f"a list of numbers is expected, not {str(value)[:60]}.")
 
 
-def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
+def calibration_of(order: CalibrationOrder, channel: ChannelProfile) -> Calibration:
     """Fit or take over what the file says for a channel; raises BadData with file, line and field."""
     unit = _unit(order, channel)
     try:
@@ -88,7 +88,7 @@ def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
     )
 
 
-def _limits(order: Order) -> tuple[float | None, float | None]:
+def _limits(order: CalibrationOrder) -> tuple[float | None, float | None]:
     low, high = order.number("low-limit"), order.number("high-limit")
     if low is not None and high is not None and low >= high:
         raise order.wrong("low-limit", "it must be below the high limit.")
@@ -103,7 +103,7 @@ def _misfit(curve: Calibration) -> float | None:
     return left.maximum if left.maximum > 1e-5 * max(map(abs, left.references)) else None
 
 
-def _curve(order: Order, channel: ChannelProfile) -> Calibration:
+def _curve(order: CalibrationOrder, channel: ChannelProfile) -> Calibration:
     method, degree = _method(order), _degree(order)
     sources = [key for key in ("points", "segments", "inputs", "slope", "coefficients") if order.get(key) is not None]
     match sources:
@@ -125,7 +125,7 @@ def _curve(order: Order, channel: ChannelProfile) -> Calibration:
             raise order.wrong(sources[0], f"only one of {', '.join(sources)} can be the calibration.")
 
 
-def _fitted(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:
+def _fitted(order: CalibrationOrder, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:
     points = _points(order)
     return fit(
         points,
@@ -141,7 +141,7 @@ def _asked(channel: ChannelProfile) -> Method | None:
     return next((method for method in METHODS if method == channel.calibration.method), None)
 
 
-def _points(order: Order) -> list[tuple[float, float]]:
+def _points(order: CalibrationOrder) -> list[tuple[float, float]]:
     value = order.get("points")
     rows = value if isinstance(value, list | tuple) else []
     points = []
@@ -154,7 +154,7 @@ def _points(order: Order) -> list[tuple[float, float]]:
     return points
 
 
-def _segments(order: Order, channel: ChannelProfile, method: Method | None) -> Calibration:
+def _segments(order: CalibrationOrder, channel: ChannelProfile, method: Method | None) -> Calibration:
     rows = _connected(order)
     boundaries = (*(row[0] for row in rows), rows[-1][1])
     degree = len(rows[0]) - 4
@@ -165,7 +165,7 @@ def _segments(order: Order, channel: ChannelProfile, method: Method | None) -> C
     return Calibration(channel.number, chosen, (part,), coefficients, actuator=channel.type == 1)
 
 
-def _connected(order: Order) -> list[tuple[float, ...]]:
+def _connected(order: CalibrationOrder) -> list[tuple[float, ...]]:
     """Rows of the table of segments (from, to, offset, C0, C1 …), each of which begins where the last one ends."""
     value, line = order.values["segments"]
     rows = value if isinstance(value, list) else []
@@ -177,7 +177,9 @@ def _connected(order: Order) -> list[tuple[float, ...]]:
     return rows
 
 
-def _with_coefficients(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:
+def _with_coefficients(
+    order: CalibrationOrder, channel: ChannelProfile, method: Method | None, degree: int | None
+) -> Calibration:
     coefficients = order.numbers("coefficients") or ()
     boundaries = order.numbers("boundaries") or _ends(order, channel)
     segments = max(len(boundaries) - 1, 1)
@@ -191,20 +193,20 @@ def _with_coefficients(order: Order, channel: ChannelProfile, method: Method | N
     return Calibration(channel.number, chosen, (part,), coefficients, actuator=channel.type == 1)
 
 
-def _multinomial(order: Order, channel: ChannelProfile, method: Method | None) -> Calibration:
+def _multinomial(order: CalibrationOrder, channel: ChannelProfile, method: Method | None) -> Calibration:
     value = order.get("inputs")
-    if not isinstance(value, tuple) or not all(isinstance(part, Table) for part in value):
+    if not isinstance(value, tuple) or not all(isinstance(part, TomlTable) for part in value):
         raise order.wrong("inputs", "tables [[inputs]] with channel, degree, boundaries and offsets are expected.")
     parts = tuple(_input(order, table, channel) for table in value)
     coefficients = order.numbers("coefficients") or ()
     return Calibration(channel.number, method or "polynomial", parts, coefficients, actuator=channel.type == 1)
 
 
-def _input(order: Order, table: Table, channel: ChannelProfile) -> CalibrationInput:
+def _input(order: CalibrationOrder, table: TomlTable, channel: ChannelProfile) -> CalibrationInput:
     """One ``[[inputs]]`` table."""
-    inner = Order(order.file, table.where.line)
+    inner = CalibrationOrder(order.file, table.where.line)
     for key, entry in table.entries.items():
-        if isinstance(entry, Table) or key not in ("channel", "key", "degree", "boundaries", "offsets"):
+        if isinstance(entry, TomlTable) or key not in ("channel", "key", "degree", "boundaries", "offsets"):
             raise BadData(f"{entry.where}: inputs.{key}: there is no such key.")
         inner.values[key] = (entry.value, entry.where.line)
     number, degree = inner.number("channel"), _degree(inner)
@@ -219,12 +221,12 @@ def _input(order: Order, table: Table, channel: ChannelProfile) -> CalibrationIn
     return part
 
 
-def _ascending(order: Order, key: str, part: CalibrationInput) -> None:
+def _ascending(order: CalibrationOrder, key: str, part: CalibrationInput) -> None:
     if not part.ascending:
         raise order.wrong(key, "the boundaries of the segments must ascend.")
 
 
-def _ends(order: Order, channel: ChannelProfile) -> tuple[float, ...]:
+def _ends(order: CalibrationOrder, channel: ChannelProfile) -> tuple[float, ...]:
     given = order.numbers("boundaries")
     if given:
         return given
@@ -236,7 +238,7 @@ def _ends(order: Order, channel: ChannelProfile) -> tuple[float, ...]:
     return ends
 
 
-def _unit(order: Order, channel: ChannelProfile) -> WrittenUnit:
+def _unit(order: CalibrationOrder, channel: ChannelProfile) -> WrittenUnit:
     text = order.get("unit")
     if text is None:
         return channel.unit
@@ -249,7 +251,7 @@ def _unit(order: Order, channel: ChannelProfile) -> WrittenUnit:
     return unit
 
 
-def _uncertainty(order: Order, unit: WrittenUnit) -> float | None:
+def _uncertainty(order: CalibrationOrder, unit: WrittenUnit) -> float | None:
     value = order.get("uncertainty")
     if isinstance(value, str) and " " in value.strip():
         number, _, text = value.strip().partition(" ")
@@ -269,7 +271,7 @@ def _uncertainty(order: Order, unit: WrittenUnit) -> float | None:
     return found
 
 
-def _method(order: Order) -> Method | None:
+def _method(order: CalibrationOrder) -> Method | None:
     value = order.get("method")
     if value is None:
         return None
@@ -281,7 +283,7 @@ def _method(order: Order) -> Method | None:
     raise order.wrong("method", f"{value!r} is no method. {guess}")
 
 
-def _degree(order: Order) -> int | None:
+def _degree(order: CalibrationOrder) -> int | None:
     value = order.number("degree")
     if value is None:
         return None
@@ -290,7 +292,7 @@ def _degree(order: Order) -> int | None:
     return int(value)
 
 
-def _date(order: Order) -> datetime | None:
+def _date(order: CalibrationOrder) -> datetime | None:
     value = order.get("date")
     if value is None:
         return None
@@ -309,7 +311,7 @@ def _date(order: Order) -> datetime | None:
     return moment
 
 
-def _interval(order: Order, channel: ChannelProfile) -> float | None:
+def _interval(order: CalibrationOrder, channel: ChannelProfile) -> float | None:
     value = order.get("interval")
     if value is None:
         return channel.calibration.interval

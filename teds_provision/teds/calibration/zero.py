@@ -31,7 +31,7 @@ _STEP: Final = 2.0**-23
 
 
 @dataclass(frozen=True)
-class Reading:
+class SampleStatistics:
     """What ``count`` samples of one quantity say: mean, standard deviation, and by how much the mean moved meanwhile.
 
     ``drift`` is the mean of the second half less that of the first.
@@ -52,7 +52,7 @@ class Reading:
         return max(self.spread, abs(self.drift)) > most
 
 
-def reading_of(values: NDArray[np.float64], turn: float = math.inf) -> Reading:
+def reading_of(values: NDArray[np.float64], turn: float = math.inf) -> SampleStatistics:
     """Reading of samples; ``turn``: they are angles in a unit in which this is a turn, and their mean is circular.
 
     The mean of angles lies within half a turn of the first one.
@@ -65,7 +65,7 @@ def reading_of(values: NDArray[np.float64], turn: float = math.inf) -> Reading:
         away = middle + shortest(away - middle, turn)
     half = len(away) // 2
     drift = float(away[half:].mean() - away[:half].mean()) if half else 0.0
-    return Reading(first + float(away.mean()), float(away.std()), drift, len(away))
+    return SampleStatistics(first + float(away.mean()), float(away.std()), drift, len(away))
 
 
 def shortest(difference: NDArray[np.float64], turn: float) -> NDArray[np.float64]:

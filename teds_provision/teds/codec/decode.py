@@ -15,13 +15,13 @@ from teds_provision.teds.codec.frame import MINIMUM_OCTETS, TEDSID, checksum, sh
 from teds_provision.teds.codec.model import (
     MALFORMED_CODES,
     AccessCode,
+    Conformity,
     Decoded,
     Edition,
     Field,
     Finding,
     Severity,
     Value,
-    Verdict,
 )
 from teds_provision.teds.codec.plausibility import check
 from teds_provision.teds.codec.tables import MANUFACTURER, ONLY_2024, TEXT_BASED, FieldSpec, Table, name_of, table
@@ -174,7 +174,7 @@ def decode(octets: bytes, *, strict: bool = False) -> Decoded:
     octets = bytes(octets)
     shape = shape_of(octets)
     if shape == "message":
-        return Decoded(octets, False, None, None, "message", (), (), Verdict.MESSAGE)
+        return Decoded(octets, False, None, None, "message", (), (), Conformity.MESSAGE)
     walk = _Walk(octets, framed=shape == "framed")
     decoded = walk.decode()
     if strict:
@@ -206,7 +206,7 @@ class _Walk(Head):
             name,
             fields,
             findings,
-            Verdict.of(self.framed, findings),
+            Conformity.of(self.framed, findings),
             self.text,
         )
 

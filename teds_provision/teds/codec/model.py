@@ -61,7 +61,7 @@ MALFORMED_CODES: Final = frozenset({"not-closed", "too-short", "too-large", "too
 """Codes of findings that decide the verdict by themselves."""
 
 
-class Verdict(StrEnum):
+class Conformity(StrEnum):
     """How far octets keep to the standard; framed TEDS, bare data blocks and messages are told apart."""
 
     CLEAN = "clean"
@@ -74,7 +74,7 @@ class Verdict(StrEnum):
     MESSAGE = "message"
 
     @classmethod
-    def of(cls, framed: bool, findings: Iterable[Finding]) -> Verdict:
+    def of(cls, framed: bool, findings: Iterable[Finding]) -> Conformity:
         """Verdict from the errors found; warnings and notes do not count."""
         frame = content = False
         for finding in findings:
@@ -181,7 +181,7 @@ class Decoded:
     name: str
     fields: tuple[Field, ...]
     findings: tuple[Finding, ...]
-    verdict: Verdict
+    verdict: Conformity
     text: tuple[bytes, ...] = ()
 
     def get(self, name: str) -> Value:

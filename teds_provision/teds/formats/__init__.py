@@ -31,14 +31,14 @@ from teds_provision.teds.formats.intelhex import looks_like_hex, read_hex, read_
 from teds_provision.teds.formats.jsonform import read_json, write_json
 from teds_provision.teds.formats.profileform import read_profile, write_profile
 from teds_provision.teds.formats.xmlform import read_xml, write_xml
-from teds_provision.teds.image import Block, BlockId, Image, class_of, is_run, split_run, with_class
+from teds_provision.teds.image import BlockId, Image, TedsBlock, class_of, is_run, split_run, with_class
 from teds_provision.teds.sheet import Sheet
 
 __all__ = [
     "FORMATS",
-    "Block",
     "Format",
     "Kind",
+    "TedsBlock",
     "class_of",
     "detect",
     "lost",
@@ -94,7 +94,7 @@ def _json_kind(text: str) -> Kind:
     return "bundle" if isinstance(data, dict) and "ciphertext" in data else "json"
 
 
-def read_blocks(octets: bytes, kind: Kind | None = None, *, path: Path | None = None) -> list[Block]:
+def read_blocks(octets: bytes, kind: Kind | None = None, *, path: Path | None = None) -> list[TedsBlock]:
     """TEDS of a file as (channel or None, access code or None, octets).
 
     ``path`` is where a profile lies, so that what it extends is found beside it. Raises BadData for a file that does
@@ -107,7 +107,7 @@ def read_blocks(octets: bytes, kind: Kind | None = None, *, path: Path | None = 
     return blocks
 
 
-def _read(octets: bytes, kind: Kind, path: Path | None) -> list[Block]:
+def _read(octets: bytes, kind: Kind, path: Path | None) -> list[TedsBlock]:
     if kind == "binary":
         return [with_class(piece) for piece in split_run(octets)]
     if kind == "xml":
@@ -119,7 +119,7 @@ def _read(octets: bytes, kind: Kind, path: Path | None) -> list[Block]:
     return _read_text(text, kind, path)
 
 
-def _read_text(text: str, kind: Kind, path: Path | None) -> list[Block]:
+def _read_text(text: str, kind: Kind, path: Path | None) -> list[TedsBlock]:
     if kind == "hex":
         return read_hex(text)
     if kind == "ihex":
@@ -128,13 +128,13 @@ def _read_text(text: str, kind: Kind, path: Path | None) -> list[Block]:
         return read_json(text)
     if kind == "image":
         image = Image.from_json(text)
-        return [Block(channel, code, image.blocks[channel, code]) for channel, code in image]
+        return [TedsBlock(channel, code, image.blocks[channel, code]) for channel, code in image]
     if kind == "toml":
         return read_profile(text, path)
     raise BadData("A sealed bundle holds keys for other stations, no TEDS that can be read here.")
 
 
-def write_blocks(blocks: Sequence[Block], format: Format) -> bytes | str:
+def write_blocks(blocks: Sequence[TedsBlock], format: Format) -> bytes | str:
     """Write TEDS: octets for binary, text for every other format; :func:`lost` says what the format cannot hold.
 
     Raises BadData where nothing sensible can be written: several TEDS that would run into each other in a binary file,
@@ -161,7 +161,7 @@ def write_blocks(blocks: Sequence[Block], format: Format) -> bytes | str:
     return write_profile(blocks)[0]
 
 
-def lost(blocks: Sequence[Block], format: Format) -> tuple[str, ...]:
+def lost(blocks: Sequence[TedsBlock], format: Format) -> tuple[str, ...]:
     """What the format cannot hold of these TEDS, one sentence each; empty where writing loses nothing."""
     if format == "toml":
         return write_profile(blocks)[1]
@@ -170,7 +170,7 @@ def lost(blocks: Sequence[Block], format: Format) -> tuple[str, ...]:
     return ()
 
 
-def _image(blocks: Sequence[Block]) -> str:
+def _image(blocks: Sequence[TedsBlock]) -> str:
     placed: dict[tuple[int, int], bytes] = {}
     for channel, code, octets in blocks:
         if channel is None or code is None:

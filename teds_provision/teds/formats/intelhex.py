@@ -13,7 +13,7 @@ from typing import Final
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_count
 from teds_provision.teds.codec.tables import name_of
-from teds_provision.teds.image import Block, class_of, split_run, with_class
+from teds_provision.teds.image import TedsBlock, class_of, split_run, with_class
 
 # Hex digits in a text: ``#`` comments, white space, commas and ``0x`` are skipped.
 #
@@ -37,9 +37,9 @@ def looks_like_hex(text: str) -> bool:
     return some
 
 
-def read_hex(text: str) -> list[Block]:
+def read_hex(text: str) -> list[TedsBlock]:
     """Read a hex text; raises BadData naming line and character."""
-    blocks: list[Block] = []
+    blocks: list[TedsBlock] = []
     place: tuple[int | None, int | None] | None = None
     digits: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -64,18 +64,18 @@ def _digits(line: str) -> str:
     return _SKIP.sub("", line.partition("#")[0])
 
 
-def _finish(place: tuple[int | None, int | None] | None, parts: list[str]) -> list[Block]:
+def _finish(place: tuple[int | None, int | None] | None, parts: list[str]) -> list[TedsBlock]:
     digits = "".join(parts)
     if len(digits) % 2:
         raise BadData(f"There are {len(digits)} hex digits; whole octets need an even number.")
     octets = bytes.fromhex(digits)
     if place is not None:
         channel, code = place
-        return [Block(channel, code, octets)]
+        return [TedsBlock(channel, code, octets)]
     return [with_class(piece) for piece in split_run(octets)] if octets else []
 
 
-def write_hex(blocks: Sequence[Block]) -> str:
+def write_hex(blocks: Sequence[TedsBlock]) -> str:
     """Write one comment and the digits of each TEDS; nothing is lost."""
     lines: list[str] = []
     for channel, code, octets in blocks:
@@ -94,7 +94,7 @@ _ALIGNED: Final = 16
 _LENGTHS: Final = {END: 0, SEGMENT_BASE: 2, SEGMENT_START: 4, LINEAR_BASE: 2, LINEAR_START: 4}
 
 
-def read_intel_hex(text: str) -> list[Block]:
+def read_intel_hex(text: str) -> list[TedsBlock]:
     """Read the TEDS of an Intel HEX text, by address; raises BadData naming the line."""
     return [with_class(piece) for _, octets in stretches(text) for piece in split_run(octets)]
 
@@ -163,7 +163,7 @@ def _joined(pieces: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
     return [(address, b"".join(parts)) for address, parts in runs]
 
 
-def write_intel_hex(blocks: Sequence[Block], *, address: int = 0) -> str:
+def write_intel_hex(blocks: Sequence[TedsBlock], *, address: int = 0) -> str:
     """Write each TEDS as a stretch of its own, from ``address`` on; channels are lost."""
     lines: list[str] = []
     at, high = address, 0

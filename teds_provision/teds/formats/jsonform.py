@@ -12,16 +12,16 @@ from teds_provision.limits import LIMITS, check_count, load_json
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats.tree import (
     MAX_DEPTH,
-    Entry,
     EntryValue,
     Kind,
     Tree,
+    TreeEntry,
     from_tree,
     to_tree,
     units_from_parts,
     units_to_parts,
 )
-from teds_provision.teds.image import Block
+from teds_provision.teds.image import TedsBlock
 
 FORMAT: Final = "teds/1"
 _HEAD: Final = {
@@ -35,12 +35,12 @@ _HEAD: Final = {
 _WORDS: Final = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
 
 
-def write_json(blocks: Sequence[Block]) -> str:
+def write_json(blocks: Sequence[TedsBlock]) -> str:
     """Write blocks as one JSON document; nothing is lost."""
     return json.dumps({"format": FORMAT, "teds": [teds_to_json(block) for block in blocks]}, indent=1) + "\n"
 
 
-def read_json(text: str | bytes) -> list[Block]:
+def read_json(text: str | bytes) -> list[TedsBlock]:
     """Read a JSON document of this format; raises BadData naming what is wrong."""
     data = load_json(text, "the JSON document")
     if not isinstance(data, dict) or data.get("format") != FORMAT or not isinstance(data.get("teds"), list):
@@ -49,7 +49,7 @@ def read_json(text: str | bytes) -> list[Block]:
     return [_block(entry, number) for number, entry in enumerate(data["teds"], 1)]
 
 
-def teds_to_json(block: Block) -> dict[str, Any]:
+def teds_to_json(block: TedsBlock) -> dict[str, Any]:
     """One TEDS as a JSON object."""
     tree = to_tree(block)
     head = {name: getattr(tree, name) for name in _HEAD}
@@ -60,7 +60,7 @@ def teds_to_json(block: Block) -> dict[str, Any]:
     return {key: value for key, value in out.items() if value is not None or key in {"channel", "access_code"}}
 
 
-def entry_to_json(entry: Entry) -> dict[str, Any]:
+def entry_to_json(entry: TreeEntry) -> dict[str, Any]:
     """One field as a JSON object: type, name, kind, and value or fields."""
     out: dict[str, Any] = {} if entry.type is None else {"type": entry.type}
     out |= {"name": entry.name, "kind": entry.kind}
@@ -85,7 +85,7 @@ def value_to_json(value: object) -> Any:
     return [value_to_json(part) for part in value] if isinstance(value, tuple) else value
 
 
-def _block(entry: object, number: int) -> Block:
+def _block(entry: object, number: int) -> TedsBlock:
     where = f"TEDS {number}"
     if not isinstance(entry, Mapping):
         raise BadData(f"{where} is not an object.")
@@ -123,7 +123,7 @@ def _hex(value: object, what: str) -> bytes:
         raise BadData(f"The {what} are not hex digits.") from error
 
 
-def _entry(data: object, where: str, depth: int) -> Entry:
+def _entry(data: object, where: str, depth: int) -> TreeEntry:
     if not isinstance(data, Mapping) or not isinstance(data.get("name", ""), str) or depth > MAX_DEPTH:
         raise BadData(f"A field of {where} is not an object with a name, or nests too deep.")
     number, name = _number(data.get("type"), 0xFF, f"type of a field of {where}"), data.get("name", "")
@@ -132,9 +132,9 @@ def _entry(data: object, where: str, depth: int) -> Entry:
         inner = data["fields"] if isinstance(data["fields"], list) else None
         if inner is None:
             raise BadData(f'"fields" of {where} is not a list.')
-        return Entry(number, name, "fields", children=tuple(_entry(field, where, depth + 1) for field in inner))
+        return TreeEntry(number, name, "fields", children=tuple(_entry(field, where, depth + 1) for field in inner))
     kind, value = _value(data.get("kind"), data.get("value"), where)
-    return Entry(number, name, kind, value)
+    return TreeEntry(number, name, kind, value)
 
 
 def _value(kind: object, value: object, where: str) -> tuple[Kind, EntryValue]:

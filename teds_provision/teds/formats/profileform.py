@@ -17,7 +17,7 @@ from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, AccessCode, Decoded, Edition, Field, Units
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.tree import shortest
-from teds_provision.teds.image import Block
+from teds_provision.teds.image import TedsBlock
 from teds_provision.teds.profile.interpret import TEXT_CLASSES, interpret
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
@@ -44,18 +44,18 @@ _SPELLING: Final = ("rad", "sr", "m", "kg", "s", "A", "K", "mol", "cd")
 Placed = dict[tuple[int, int], bytes]
 
 
-def read_profile(text: str, path: Path | None = None) -> list[Block]:
+def read_profile(text: str, path: Path | None = None) -> list[TedsBlock]:
     """TEDS that a profile gives for a node with UUID 0; raises BadData and NotFound as the profile loader does."""
     return profile_blocks(parse_profile(text) if path is None else load_profile(path))
 
 
-def profile_blocks(profile: Profile) -> list[Block]:
+def profile_blocks(profile: Profile) -> list[TedsBlock]:
     """TEDS of a loaded profile, the UUID all zeros."""
     blocks = profile.build(NO_UUID).blocks
-    return [Block(channel, code, octets) for (channel, code), octets in blocks.items()]
+    return [TedsBlock(channel, code, octets) for (channel, code), octets in blocks.items()]
 
 
-def write_profile(blocks: Sequence[Block]) -> tuple[str, tuple[str, ...]]:
+def write_profile(blocks: Sequence[TedsBlock]) -> tuple[str, tuple[str, ...]]:
     """Text of a profile, and what it cannot hold, one sentence each."""
     placed, lost = _place(blocks)
     decoded = {key: decode(octets) for key, octets in placed.items()}
@@ -66,7 +66,7 @@ def write_profile(blocks: Sequence[Block]) -> tuple[str, tuple[str, ...]]:
     return "\n".join(head) + "\n" + body, tuple(lost)
 
 
-def _place(blocks: Sequence[Block]) -> tuple[Placed, list[str]]:
+def _place(blocks: Sequence[TedsBlock]) -> tuple[Placed, list[str]]:
     placed: Placed = {}
     lost: list[str] = []
     for channel, code, octets in blocks:

@@ -19,7 +19,7 @@ from teds_provision.teds.codec.composer import compose
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import TEXT_BASED, FieldSpec, name_of, table
-from teds_provision.teds.image import Block
+from teds_provision.teds.image import TedsBlock
 
 Kind = Literal["integer", "number", "text", "octets", "units", "time", "integers", "numbers", "fields"]
 EntryValue = int | float | str | bytes | Units | TimeInstance | tuple[int, ...] | tuple[float, ...] | None
@@ -32,14 +32,14 @@ _UNFIT_FOR_XML: Final = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0
 
 
 @dataclass(frozen=True)
-class Entry:
+class TreeEntry:
     """One field: tuple type (None for a text of a text-based TEDS), name, and a value of ``kind`` or ``children``."""
 
     type: int | None
     name: str
     kind: Kind
     value: EntryValue = None
-    children: tuple[Entry, ...] = ()
+    children: tuple[TreeEntry, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Tree:
     subfamily: int | None = None
     version: int | None = None
     width: int | None = None
-    entries: tuple[Entry, ...] = ()
+    entries: tuple[TreeEntry, ...] = ()
     octets: bytes | None = None
 
     @property
@@ -63,7 +63,7 @@ class Tree:
         return "" if self.access_code is None else name_of(self.access_code)
 
 
-def to_tree(block: Block) -> Tree:
+def to_tree(block: TedsBlock) -> Tree:
     """Turn a block into a tree; the octets are kept where the entries would not give them back."""
     decoded = decode(block.octets)
     tree = _described(block, decoded)
@@ -74,20 +74,20 @@ def to_tree(block: Block) -> Tree:
     return tree if again == block else replace(tree, octets=block.octets)
 
 
-def from_tree(tree: Tree) -> Block:
+def from_tree(tree: Tree) -> TedsBlock:
     """Turn a tree back into a block: its octets where it has them, else composed from its entries; raises BadData."""
     if tree.octets is not None:
-        return Block(tree.channel, tree.access_code, tree.octets)
+        return TedsBlock(tree.channel, tree.access_code, tree.octets)
     if tree.access_code is None or not tree.entries:
         raise BadData("A TEDS without octets needs an access code and fields.")
     parts = {"family": tree.family, "version": tree.version, "subfamily": tree.subfamily}
     given = {key: value for key, value in parts.items() if value is not None}
     pairs = [*([("TEDSID", given)] if given else []), *(_pair(entry, tree.access_code, 0) for entry in tree.entries)]
     octets = compose(tree.access_code, pairs, edition=tree.edition or 2007, width=tree.width)
-    return Block(tree.channel, tree.access_code, octets if tree.framed else octets[4:-2])
+    return TedsBlock(tree.channel, tree.access_code, octets if tree.framed else octets[4:-2])
 
 
-def _described(block: Block, decoded: Decoded) -> Tree:
+def _described(block: TedsBlock, decoded: Decoded) -> Tree:
     tedsid = next((field.raw for field in decoded.fields if field.name == "TEDSID"), b"")
     long = len(tedsid) == 5
     known = len(tedsid) in (4, 5)
@@ -104,7 +104,7 @@ def _described(block: Block, decoded: Decoded) -> Tree:
     )
 
 
-def _entries(decoded: Decoded) -> Iterator[Entry]:
+def _entries(decoded: Decoded) -> Iterator[TreeEntry]:
     if decoded.access_code in TEXT_BASED and decoded.text:
         yield from _texts(decoded)
         return
@@ -114,37 +114,43 @@ def _entries(decoded: Decoded) -> Iterator[Entry]:
             yield _entry(field, known)
 
 
-def _texts(decoded: Decoded) -> Iterator[Entry]:
+def _texts(decoded: Decoded) -> Iterator[TreeEntry]:
     """One entry per language; the directory follows from them."""
     languages = [field for field in decoded.fields if field.name == "DirBlock"]
     for number, text in enumerate(decoded.text):
         parts = languages[number].children if number < len(languages) else ()
         children = [_entry(part, {}) for part in parts if part.name in {"LangCode", "Compress"}]
-        yield Entry(None, "Text", "fields", children=(*children, _text(None, "Text", text)))
+        yield TreeEntry(None, "Text", "fields", children=(*children, _text(None, "Text", text)))
 
 
-def _text(number: int | None, name: str, octets: bytes) -> Entry:
+def _text(number: int | None, name: str, octets: bytes) -> TreeEntry:
     try:
         text = octets.decode()
     except UnicodeDecodeError:
-        return Entry(number, name, "octets", octets)
-    return Entry(number, name, "octets", octets) if _UNFIT_FOR_XML.search(text) else Entry(number, name, "text", text)
+        return TreeEntry(number, name, "octets", octets)
+    return (
+        TreeEntry(number, name, "octets", octets)
+        if _UNFIT_FOR_XML.search(text)
+        else TreeEntry(number, name, "text", text)
+    )
 
 
-def _entry(field: Field, known: Mapping[int, FieldSpec]) -> Entry:
+def _entry(field: Field, known: Mapping[int, FieldSpec]) -> TreeEntry:
     value = field.value
     if isinstance(value, Units):
-        return Entry(field.type, field.name, "units", value)
+        return TreeEntry(field.type, field.name, "units", value)
     if field.children:
         spec = known.get(field.type)
         inner = spec.by_type if spec is not None else {}
-        return Entry(field.type, field.name, "fields", children=tuple(_entry(child, inner) for child in field.children))
+        return TreeEntry(
+            field.type, field.name, "fields", children=tuple(_entry(child, inner) for child in field.children)
+        )
     if isinstance(value, str):
         return _text(field.type, field.name, value.encode())
     if not field.name or value is None or isinstance(value, bytes):
-        return Entry(field.type, field.name, "octets", field.raw)
+        return TreeEntry(field.type, field.name, "octets", field.raw)
     kind = _kind(value)
-    return Entry(field.type, field.name, kind, _shortest_of(kind, value))
+    return TreeEntry(field.type, field.name, kind, _shortest_of(kind, value))
 
 
 def _shortest_of(kind: Kind, value: EntryValue) -> EntryValue:
@@ -174,7 +180,7 @@ def _kind(value: object) -> Kind:
     return "number" if isinstance(value, float) else "integer"
 
 
-def _pair(entry: Entry, access_code: int, depth: int) -> tuple[str, object]:
+def _pair(entry: TreeEntry, access_code: int, depth: int) -> tuple[str, object]:
     if depth > MAX_DEPTH:
         raise BadData(f"The field {entry.name} nests deeper than {MAX_DEPTH} levels.")
     key = entry.name or str(entry.type)

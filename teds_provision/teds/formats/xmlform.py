@@ -17,16 +17,16 @@ from teds_provision.limits import LIMITS, check_count, check_size, check_xml, wh
 from teds_provision.teds.codec.model import Edition, TimeInstance, Units
 from teds_provision.teds.formats.tree import (
     MAX_DEPTH,
-    Entry,
     EntryValue,
     Kind,
     Tree,
+    TreeEntry,
     from_tree,
     to_tree,
     units_from_parts,
     units_to_parts,
 )
-from teds_provision.teds.image import Block
+from teds_provision.teds.image import TedsBlock
 
 NAMESPACE: Final = "urn:teds-provision:teds:1"
 SCHEMA: Final = Path(__file__).resolve().parent.parent / "schema" / "teds-1.xsd"
@@ -43,7 +43,7 @@ _HEAD: Final = {
 }
 
 
-def write_xml(blocks: Sequence[Block]) -> str:
+def write_xml(blocks: Sequence[TedsBlock]) -> str:
     """Write blocks as one XML document; nothing is lost."""
     root = ET.Element("teds-set", {"xmlns": NAMESPACE})
     for block in blocks:
@@ -63,7 +63,7 @@ def _teds(tree: Tree) -> ET.Element:
     return element
 
 
-def _field(entry: Entry) -> ET.Element:
+def _field(entry: TreeEntry) -> ET.Element:
     attributes = {} if entry.type is None else {"type": str(entry.type)}
     element = ET.Element("field", attributes | ({"name": entry.name} if entry.name else {}))
     value = entry.value
@@ -89,7 +89,7 @@ def _text(value: object) -> str:
     return repr(value) if isinstance(value, float) else str(value)
 
 
-def read_xml(octets: bytes) -> list[Block]:
+def read_xml(octets: bytes) -> list[TedsBlock]:
     """Read an XML document of this format; raises BadData naming what is wrong."""
     root = parse(octets)
     if root.tag != f"{{{NAMESPACE}}}teds-set":
@@ -158,7 +158,7 @@ def _tree(element: ET.Element, number: int) -> Tree:
     if given not in (2007, 2024, None):
         raise BadData(f"{where} names the edition {given}; 2007 and 2024 are known.")
     edition: Edition | None = given  # type: ignore[assignment]
-    entries: list[Entry] = []
+    entries: list[TreeEntry] = []
     octets: bytes | None = None
     for child in element:
         if octets is not None:
@@ -178,7 +178,7 @@ def _hex(element: ET.Element, where: str) -> bytes:
         raise BadData(f"The octets of {where} are not hex digits.") from error
 
 
-def _entry(element: ET.Element, where: str, depth: int) -> Entry:
+def _entry(element: ET.Element, where: str, depth: int) -> TreeEntry:
     if _local(element, where) != "field" or depth > MAX_DEPTH:
         raise BadData(f"{where} holds {_local(element, where)!r} where field is asked, or nests too deep.")
     _attributes(element, {"type", "name"}, where)
@@ -186,11 +186,11 @@ def _entry(element: ET.Element, where: str, depth: int) -> Entry:
     where = f"{where}, {name or f'type {number}'}"
     children = list(element)
     if not children or _local(children[0], where) == "field":
-        return Entry(number, name, "fields", children=tuple(_entry(child, where, depth + 1) for child in children))
+        return TreeEntry(number, name, "fields", children=tuple(_entry(child, where, depth + 1) for child in children))
     if len(children) > 1:
         raise BadData(f"{where} holds more than one value.")
     kind, value = _value(children[0], where)
-    return Entry(number, name, kind, value)
+    return TreeEntry(number, name, kind, value)
 
 
 def _value(element: ET.Element, where: str) -> tuple[Kind, EntryValue]:

@@ -4,7 +4,7 @@ Pure but for reading the files themselves. ``load_profile`` finds and checks, :m
 """
 
 from teds_provision.teds.profile.load import (
-    Listed,
+    ListedProfile,
     check,
     default_folders,
     describe,
@@ -20,15 +20,15 @@ from teds_provision.teds.profile.load import (
     template,
 )
 from teds_provision.teds.profile.model import BuiltDatasheet, CalibrationDemand, ChannelProfile, Profile, TextProfile
-from teds_provision.teds.profile.reader import Problem
+from teds_provision.teds.profile.reader import ProfileProblem
 
 __all__ = [
     "BuiltDatasheet",
     "CalibrationDemand",
     "ChannelProfile",
-    "Listed",
-    "Problem",
+    "ListedProfile",
     "Profile",
+    "ProfileProblem",
     "TextProfile",
     "check",
     "default_folders",

@@ -22,7 +22,7 @@ from teds_provision.teds.profile.keys import (
     Kind,
 )
 from teds_provision.teds.profile.model import CalibrationDemand, ChannelProfile, Pairs, Profile, TextProfile
-from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Problems, Section, Table
+from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Problems, Section, TomlTable
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 # The channels of a profile: ``[channel.all]``, ``[channel.1-12]``, ``[channel.3]``, laid over each other, checked.
@@ -51,13 +51,13 @@ def channels_of(top: Section, abstract: bool) -> tuple[ChannelProfile, ...]:
     return tuple(channel for channel in found if channel)
 
 
-def _selections(section: Section) -> dict[int, Table]:
+def _selections(section: Section) -> dict[int, TomlTable]:
     """Tables by channel number: ``all`` first, then the selections ``1-12`` from the widest to the narrowest."""
-    everywhere: Table | None = None
-    selections: list[tuple[range, Table]] = []
+    everywhere: TomlTable | None = None
+    selections: list[tuple[range, TomlTable]] = []
     for key, entry in section.table.entries.items():
         match = _RANGE.match(key)
-        if not isinstance(entry, Table) or not (match or key == "all"):
+        if not isinstance(entry, TomlTable) or not (match or key == "all"):
             section.error(key, "channels are written [channel.1], [channel.1-12] or [channel.all].")
         elif match is None:
             everywhere = entry
@@ -70,8 +70,8 @@ def _selections(section: Section) -> dict[int, Table]:
     return _laid_over(everywhere, selections)
 
 
-def _laid_over(everywhere: Table | None, selections: list[tuple[range, Table]]) -> dict[int, Table]:
-    tables: dict[int, Table] = {}
+def _laid_over(everywhere: TomlTable | None, selections: list[tuple[range, TomlTable]]) -> dict[int, TomlTable]:
+    tables: dict[int, TomlTable] = {}
     for numbers, table in sorted(selections, key=lambda one: -len(one[0])):
         for number in numbers:
             below = tables.get(number, everywhere)
@@ -295,7 +295,7 @@ TEXT_CLASSES: Final = {
 }
 
 
-def interpret(table: Table, name: str, file: str, lineage: tuple[str, ...], problems: Problems) -> Profile | None:
+def interpret(table: TomlTable, name: str, file: str, lineage: tuple[str, ...], problems: Problems) -> Profile | None:
     """Read a merged profile; what is wrong goes into ``problems``. None when nothing usable came out."""
     top = Section(table, problems)
     abstract = top.flag("abstract")

@@ -27,14 +27,14 @@ from teds_provision.teds.profile.keys import (
     Need,
 )
 from teds_provision.teds.profile.model import ChannelProfile, Profile
-from teds_provision.teds.profile.reader import Problem, Problems, Table, Where, parse, read_text
+from teds_provision.teds.profile.reader import Problems, ProfileProblem, TomlTable, Where, parse, read_text
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}\Z")
 MAXIMUM_DEPTH: Final = 16
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListedProfile:
     """A profile as it stands in a folder; ``error`` says why it cannot be used."""
 
     name: str
@@ -106,7 +106,9 @@ def passed_over(name: str, folders: Sequence[Path]) -> tuple[str, ...]:
     return tuple(f"{other} was not used: {name} is {found[0]}. Give its path to use it." for other in found[1:])
 
 
-def check(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> tuple[Profile | None, list[Problem]]:
+def check(
+    name_or_path: str | Path, folders: Sequence[Path] | None = None
+) -> tuple[Profile | None, list[ProfileProblem]]:
     """All problems of a profile, errors and warnings; the profile itself where there is no error.
 
     Raises NotFound and, for a file that is not TOML or inherits in a circle, BadData.
@@ -151,9 +153,9 @@ def _files(folders: Sequence[Path]) -> Iterator[Path]:
             yield from sorted(path for path in folder.glob("*.toml") if path.is_file())
 
 
-def list_profiles(folders: Sequence[Path] | None = None) -> list[Listed]:
+def list_profiles(folders: Sequence[Path] | None = None) -> list[ListedProfile]:
     """Every profile of the folders by name; one that hides another of the same name comes alone."""
-    found: dict[str, Listed] = {}
+    found: dict[str, ListedProfile] = {}
     places = default_folders() if folders is None else folders
     for path in _files(places):
         if path.stem in found:
@@ -162,31 +164,31 @@ def list_profiles(folders: Sequence[Path] | None = None) -> list[Listed]:
             profile, error = load_profile(path, places), ""
         except (BadData, NotFound) as failure:
             profile, error = None, failure.message
-        found[path.stem] = Listed(path.stem, path, profile, error)
+        found[path.stem] = ListedProfile(path.stem, path, profile, error)
     return [found[name] for name in sorted(found)]
 
 
-def _merged(path: Path, folders: Sequence[Path], chain: tuple[Path, ...]) -> tuple[Table, tuple[str, ...]]:
+def _merged(path: Path, folders: Sequence[Path], chain: tuple[Path, ...]) -> tuple[TomlTable, tuple[str, ...]]:
     """Table of a profile's file laid over those it extends, and their names from this one up."""
     return _laid_over(parse(read_text(path), str(path)), path, folders, (*chain, path.resolve()))
 
 
 def _laid_over(
-    table: Table, path: Path, folders: Sequence[Path], chain: tuple[Path, ...]
-) -> tuple[Table, tuple[str, ...]]:
+    table: TomlTable, path: Path, folders: Sequence[Path], chain: tuple[Path, ...]
+) -> tuple[TomlTable, tuple[str, ...]]:
     """The same of a table that is read already; ``chain`` are the files so far, its own included."""
     entry = table.entries.get("extends")
     if entry is None:
         return table, (path.stem,)
     where = entry.where
-    if isinstance(entry, Table) or not isinstance(entry.value, str):
+    if isinstance(entry, TomlTable) or not isinstance(entry.value, str):
         raise BadData(f'{where}: extends: the name of one profile is expected, like extends = "smart-sensor".')
     base = _base(entry.value, where, path, folders, chain)
     if len(chain) > MAXIMUM_DEPTH:
         raise BadData(f"{where}: extends: more than {MAXIMUM_DEPTH} profiles extend each other.")
     below, lineage = _merged(base, folders, chain)
     inherited = {key: value for key, value in below.entries.items() if key not in ("abstract", "extends")}
-    return Table(inherited, below.where).merged(table), (path.stem, *lineage)
+    return TomlTable(inherited, below.where).merged(table), (path.stem, *lineage)
 
 
 def _base(name: str, where: Where, path: Path, folders: Sequence[Path], chain: Sequence[Path]) -> Path:
@@ -230,7 +232,7 @@ def summary(profile: Profile) -> dict[str, Any]:
     }
 
 
-def listed(entry: Listed) -> dict[str, Any]:
+def listed(entry: ListedProfile) -> dict[str, Any]:
     """The line of a file found in a folder, with its error where it cannot be read."""
     if entry.profile is None:
         return {"name": entry.name, "file": str(entry.path), "error": entry.error}

@@ -53,21 +53,21 @@ class Item:
 
 
 @dataclass(frozen=True)
-class Table:
+class TomlTable:
     """A TOML table with the place of each entry."""
 
-    entries: Mapping[str, Item | Table]
+    entries: Mapping[str, Item | TomlTable]
     where: Where
     path: str = ""
 
-    def merged(self, over: Table) -> Table:
+    def merged(self, over: TomlTable) -> TomlTable:
         """Return this table with another laid over it, key by key; arrays and values are replaced whole."""
         entries = dict(self.entries)
         for key, entry in over.entries.items():
             below = entries.get(key)
-            both = isinstance(below, Table) and isinstance(entry, Table)
+            both = isinstance(below, TomlTable) and isinstance(entry, TomlTable)
             entries[key] = below.merged(entry) if both else entry  # type: ignore[union-attr, arg-type]
-        return Table(entries, over.where, over.path)
+        return TomlTable(entries, over.where, over.path)
 
 
 @dataclass
@@ -124,7 +124,7 @@ def key_lines(text: str) -> dict[KeyPath, int]:
     return scan.lines
 
 
-def parse(text: str, file: str) -> Table:
+def parse(text: str, file: str) -> TomlTable:
     """Read TOML text; ``file`` is the name shown in errors. Raises BadData with file and line."""
     check_toml(text, file)
     try:
@@ -142,13 +142,13 @@ def parse(text: str, file: str) -> Table:
             path = path[:-1]
         return Where(file, lines.get(path, 1))
 
-    def build(value: dict[str, object], path: KeyPath) -> Table:
+    def build(value: dict[str, object], path: KeyPath) -> TomlTable:
         text = ""
         for part in path:
             text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
-        return Table({key: entry(item, (*path, key)) for key, item in value.items()}, place(path), text)
+        return TomlTable({key: entry(item, (*path, key)) for key, item in value.items()}, place(path), text)
 
-    def entry(value: object, path: KeyPath) -> Item | Table:
+    def entry(value: object, path: KeyPath) -> Item | TomlTable:
         if isinstance(value, dict):
             return build(value, path)
         if isinstance(value, list) and value and all(isinstance(part, dict) for part in value):
@@ -163,11 +163,11 @@ def read_text(path: Path) -> str:
     return files.read_text(path, LIMITS.text_file, "profile or calibration", failure=StoreFailure)
 
 
-def walk(table: Table) -> Iterator[tuple[str, Item]]:
+def walk(table: TomlTable) -> Iterator[tuple[str, Item]]:
     """Every value of a table with its dotted path."""
     for key, entry in table.entries.items():
         path = f"{table.path}.{key}" if table.path else key
-        if isinstance(entry, Table):
+        if isinstance(entry, TomlTable):
             yield from walk(entry)
         else:
             yield path, entry
@@ -181,7 +181,7 @@ NAME_OCTETS = 120
 
 
 @dataclass(frozen=True)
-class Problem:
+class ProfileProblem:
     """One thing wrong with a profile; ``field`` is the dotted path of the key."""
 
     where: Where
@@ -210,18 +210,18 @@ class _Wrong(Exception):
 class Problems:
     """All problems of one profile, in the order in which they were found."""
 
-    found: list[Problem] = field(default_factory=list)
+    found: list[ProfileProblem] = field(default_factory=list)
 
     def error(self, where: Where, path: str, message: str) -> None:
         """Add an error."""
-        self.found.append(Problem(where, path, message))
+        self.found.append(ProfileProblem(where, path, message))
 
     def warning(self, where: Where, path: str, message: str) -> None:
         """Add a warning."""
-        self.found.append(Problem(where, path, message, "warning"))
+        self.found.append(ProfileProblem(where, path, message, "warning"))
 
     @property
-    def errors(self) -> list[Problem]:
+    def errors(self) -> list[ProfileProblem]:
         """The errors alone."""
         return [problem for problem in self.found if problem.severity == "error"]
 
@@ -238,7 +238,7 @@ class Problems:
 class Section:
     """One table being read: keys are taken one by one, what is left at ``finish`` is unknown."""
 
-    def __init__(self, table: Table, problems: Problems, unit: WrittenUnit | None = None) -> None:
+    def __init__(self, table: TomlTable, problems: Problems, unit: WrittenUnit | None = None) -> None:
         self.table = table
         self.problems = problems
         self.unit = unit
@@ -265,7 +265,7 @@ class Section:
         """Value of a key, None where it is absent; a table there is an error."""
         self._known.add(key)
         entry = self.table.entries.get(key)
-        if isinstance(entry, Table):
+        if isinstance(entry, TomlTable):
             self.error(key, "a value is expected here, not a table.")
             return None
         return None if entry is None else entry.value

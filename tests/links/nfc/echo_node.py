@@ -15,7 +15,7 @@ from typing import Any
 
 from teds_provision.node.nfc.server import NfcServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from teds_provision.talk.meeting import Patience
+from teds_provision.talk.meeting import IdleStop
 
 
 class Echo:
@@ -71,7 +71,7 @@ def main() -> None:
         queue=True,
     )
     spoil(server, options)
-    done = Patience(None)
+    done = IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: done.ask())
     server.start()
     print("ready", flush=True)

@@ -14,7 +14,7 @@ from teds_provision.errors import Garbled, NodeSilent, NoNode, NoReader, UsageFa
 from teds_provision.links import Contact, LinkSettings, Notice, Port, open_port
 from teds_provision.links.nfc import message
 from teds_provision.links.nfc import port as port_module
-from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, Record
+from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.tnep import ID_TYPE, SERVICE, ServiceParameters
 from teds_provision.protocol.messages.identity import NodeState
 from tests.pace import PATIENCE, best_of
@@ -144,7 +144,7 @@ def test_answers_that_stay_torn_are_garbled_at_last(start_node: StartNode, port:
 
 def foreign_message() -> str:
     other_service = ServiceParameters(b"urn:nfc:sn:handover", 20, 4, 300).record()
-    return message.encode([Record(WELL_KNOWN, b"U", b"\x04example.org"), other_service]).hex()
+    return message.encode([NdefRecord(WELL_KNOWN, b"U", b"\x04example.org"), other_service]).hex()
 
 
 @pytest.mark.parametrize("tag", ["4", "2"])
@@ -174,7 +174,7 @@ def test_a_node_put_down_after_a_foreign_tag_is_found(start_node: StartNode, por
         (message.encode([ServiceParameters(SERVICE, 20, 15, 500).record()]).hex(), "no id record"),
         (
             message.encode(
-                [ServiceParameters(SERVICE, 20, 15, 500).record(), Record(EXTERNAL, ID_TYPE, b"\x02" * 23)]
+                [ServiceParameters(SERVICE, 20, 15, 500).record(), NdefRecord(EXTERNAL, ID_TYPE, b"\x02" * 23)]
             ).hex(),
             "version 2",
         ),
@@ -193,11 +193,11 @@ def test_other_records_and_services_beside_ours_do_not_matter(start_node: StartN
 
     identity = Identity(bytes.fromhex(OTHER), NodeState.FACTORY, 0, 0, 1024, 0).encode()
     records = [
-        Record(WELL_KNOWN, b"T", b"\xff\xff not even text"),
-        Record(WELL_KNOWN, b"Tp", b"\x10\xf0short"),
+        NdefRecord(WELL_KNOWN, b"T", b"\xff\xff not even text"),
+        NdefRecord(WELL_KNOWN, b"Tp", b"\x10\xf0short"),
         ServiceParameters(b"urn:nfc:sn:handover", 20, 4, 300).record(),
-        Record(EXTERNAL, b"Teds-Provision:ID", identity),
-        Record(2, b"text/plain", b"x" * 300, b"id"),
+        NdefRecord(EXTERNAL, b"Teds-Provision:ID", identity),
+        NdefRecord(2, b"text/plain", b"x" * 300, b"id"),
         ServiceParameters(SERVICE, 12, 15, 120).record(),
     ]
     start_node(initial=message.encode(records).hex(), max_ndef=700)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.links.nfc import hints, message
-from teds_provision.links.nfc.message import WELL_KNOWN, Record
+from teds_provision.links.nfc.message import WELL_KNOWN, NdefRecord
 
 from .conftest import StartNode
 
@@ -16,8 +16,8 @@ SOLD_TAG = bytes.fromhex("910606574C434341502001091E030A510703574C43535441490564
 """The message of a product's tag, seen in public: WLCCAP and WLCSTAI."""
 
 
-def well_known(name: str, octets: str) -> Record:
-    return Record(WELL_KNOWN, name.encode(), bytes.fromhex(octets))
+def well_known(name: str, octets: str) -> NdefRecord:
+    return NdefRecord(WELL_KNOWN, name.encode(), bytes.fromhex(octets))
 
 
 def test_the_records_of_a_sold_tag() -> None:
@@ -58,16 +58,16 @@ def test_states(records: list[tuple[str, str]], state: str, percent: int | None,
 
 def test_a_bluetooth_address_is_little_endian_in_its_record() -> None:
     octets = bytes.fromhex("081B01010057D8C101021C00")
-    record = Record(2, b"application/vnd.Bluetooth.le.oob", octets)
+    record = NdefRecord(2, b"application/vnd.Bluetooth.le.oob", octets)
     assert hints.ble_address([record]) == BleAddress(bytes.fromhex("C1D857000101"), random=True)
-    assert hints.ble_address([Record(2, hints.OUT_OF_BAND, b"\x02\x1c\x00" + octets[:9])]) is not None
-    assert hints.ble_address([Record(2, hints.OUT_OF_BAND, octets[:8])]) is None
+    assert hints.ble_address([NdefRecord(2, hints.OUT_OF_BAND, b"\x02\x1c\x00" + octets[:9])]) is not None
+    assert hints.ble_address([NdefRecord(2, hints.OUT_OF_BAND, octets[:8])]) is None
     assert BleAddress(bytes.fromhex("C1D857000101"), random=True).text == "C1:D8:57:00:01:01"
 
 
 @given(st.sampled_from(["WLCCAP", "WLCSTAI", "WLCCTL"]), st.binary(max_size=12))
 def test_no_octets_are_an_error(name: str, octets: bytes) -> None:
-    found = hints.charging([Record(WELL_KNOWN, name.encode(), octets)])
+    found = hints.charging([NdefRecord(WELL_KNOWN, name.encode(), octets)])
     assert isinstance(found, Charging)
     assert found.battery_percent is None or 0 <= found.battery_percent <= 100
     assert found.text
@@ -75,7 +75,7 @@ def test_no_octets_are_an_error(name: str, octets: bytes) -> None:
 
 @given(st.binary(max_size=40))
 def test_no_structures_are_an_error(octets: bytes) -> None:
-    found = hints.ble_address([Record(2, hints.OUT_OF_BAND, octets)])
+    found = hints.ble_address([NdefRecord(2, hints.OUT_OF_BAND, octets)])
     assert found is None or len(found.octets) == 6
 
 
@@ -90,7 +90,7 @@ def test_a_contact_carries_what_its_initial_message_says(start_node: StartNode, 
         *message.decode(SOLD_TAG),
         tnep.ServiceParameters(tnep.SERVICE, 4, 15, 2000).record(),
         tnep.id_record(identify),
-        Record(2, hints.OUT_OF_BAND, bytes.fromhex("081B01010057D8C101021C00")),
+        NdefRecord(2, hints.OUT_OF_BAND, bytes.fromhex("081B01010057D8C101021C00")),
     ]
     start_node(initial=message.encode(initial).hex())
     port = open_port(LinkSettings(nfc=path))

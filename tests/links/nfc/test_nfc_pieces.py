@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import Garbled
 from teds_provision.links.nfc import message, tnep
-from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, Record
+from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, Requester, Responder, room
 
 U16 = st.integers(0, 0xFFFF)
 records = st.lists(
     st.builds(
-        Record,
+        NdefRecord,
         st.sampled_from([1, 2, 3, 4]),
         st.binary(min_size=1, max_size=40),
         st.binary(max_size=400),
@@ -29,7 +29,7 @@ records = st.lists(
 
 
 @given(records)
-def test_ndef_messages_come_back_as_they_were(given_records: tuple[Record, ...]) -> None:
+def test_ndef_messages_come_back_as_they_were(given_records: tuple[NdefRecord, ...]) -> None:
     assert message.decode(message.encode(given_records)) == given_records
 
 
@@ -41,7 +41,7 @@ def test_ndef_framing_never_raises_anything_but_garbled(octets: bytes) -> None:
 
 @given(records, st.data())
 def test_a_mutated_ndef_message_never_raises_anything_but_garbled(
-    given: tuple[Record, ...], data: st.DataObject
+    given: tuple[NdefRecord, ...], data: st.DataObject
 ) -> None:
     octets = bytearray(message.encode(given) or b"\xd0\x00\x00")
     octets[data.draw(st.integers(0, len(octets) - 1))] ^= data.draw(st.integers(1, 255))
@@ -64,7 +64,7 @@ def test_we_read_what_ndeflib_writes() -> None:
 
 def test_chunks_are_put_together() -> None:
     octets = bytes.fromhex("B1 01 02 54 AABB") + bytes.fromhex("36 00 01 CC") + bytes.fromhex("56 00 01 DD")
-    assert message.decode(octets) == (Record(WELL_KNOWN, b"T", b"\xaa\xbb\xcc\xdd"),)
+    assert message.decode(octets) == (NdefRecord(WELL_KNOWN, b"T", b"\xaa\xbb\xcc\xdd"),)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_tnep_records_have_the_published_layout() -> None:
 @given(st.binary(max_size=60))
 def test_tnep_records_never_raise_anything_but_garbled(payload: bytes) -> None:
     for kind in (b"Tp", b"Ts", b"Te"):
-        found = [Record(WELL_KNOWN, kind, payload), Record(EXTERNAL, tnep.TIM_TYPE, payload)]
+        found = [NdefRecord(WELL_KNOWN, kind, payload), NdefRecord(EXTERNAL, tnep.TIM_TYPE, payload)]
         tnep.our_service(found)
         tnep.status_of(found)
         with contextlib.suppress(Garbled):

@@ -17,7 +17,7 @@ from teds_provision.errors import UsageFailure
 from teds_provision.measure.blocks import Block, GroupRows, NodeReport, Note
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
-from teds_provision.measure.recordings.summary import Summary
+from teds_provision.measure.recordings.summary import RecordingSummary
 from teds_provision.measure.sinks import open_sink
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 from teds_provision.teds.units import parse_units, recognize
@@ -68,7 +68,7 @@ def convert_to(folder: Path, suffix: str, target: Path) -> None:
 
 
 def told(path: Path) -> dict[str, Any]:
-    recording, summary = open_recording(path), Summary()
+    recording, summary = open_recording(path), RecordingSummary()
     for entry in recording.entries():
         summary.take(entry)
     return summary.to_json(recording)

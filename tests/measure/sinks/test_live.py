@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import UsageFailure
-from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.sinks.joints import joints_of
-from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, Status, TopicSink
+from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning, compounds_of, is_range, meaning_of, variance_of
 from teds_provision.teds.calibration.formula import evaluate
@@ -222,7 +222,7 @@ def test_a_range_finder_is_one_by_name_and_has_no_plain_number_beside() -> None:
 class Carrier(TopicSink):
     """Keeps what went out."""
 
-    def __init__(self, commands: list[Command] | None = None) -> None:
+    def __init__(self, commands: list[SetPointCommand] | None = None) -> None:
         super().__init__("carrier", None if commands is None else commands.append)
         self.arrays: list[tuple[str, float, list[str], list[float]]] = []
         self.scalars: list[tuple[str, str, float, float]] = []
@@ -232,7 +232,7 @@ class Carrier(TopicSink):
         self.words: dict[str, str] = {}
         self.parameters: dict[str, object] = {}
         self.listens: list[tuple[str, str, int]] = []
-        self.statuses: list[Status] = []
+        self.statuses: list[DiagnosticEntry] = []
         self.advertised: list[tuple[str, str]] = []
 
     def _advertise(self, topic: str, kind: str) -> None:
@@ -275,7 +275,7 @@ class Carrier(TopicSink):
     def _listen_joints(self, topic: str) -> None:
         self.listens.append((topic, "", 0))
 
-    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+    def _diagnose(self, stamp: float, statuses: Sequence[DiagnosticEntry]) -> None:
         self.statuses = list(statuses)
 
     def _finish(self) -> None:
@@ -287,7 +287,7 @@ def carried(
     items: Sequence[Block | GroupRows | NodeReport | list[ChannelFacts]],
     facts: Sequence[ChannelFacts] = (ANGLE, FORCE),
     station: StationFacts = STATION,
-    commands: list[Command] | None = None,
+    commands: list[SetPointCommand] | None = None,
 ) -> Carrier:
     sink = Carrier(commands)
     sink.open(facts, station)
@@ -336,7 +336,7 @@ def gripper() -> list[ChannelFacts]:
 def test_a_gripper_is_a_joint_whose_state_goes_out_and_whose_set_points_come_in() -> None:
     keys = ((HAND, 2), (HAND, 3))
     rows = GroupRows("crane", keys, np.array([1.0, 2.0]), np.array([[0.05, 4.0], [np.nan, 5.0]]), np.zeros((2, 2)))
-    came: list[Command] = []
+    came: list[SetPointCommand] = []
     sink = carried([rows], facts=[ANGLE, *gripper()], commands=came)
     assert sink.joints == [(["hand"], [0.05], [], [4.0])], "without a position there is no state"
     assert ("/bench/joint_states", "sensor_msgs/JointState") in sink.advertised
@@ -420,7 +420,7 @@ def test_only_actuators_listen_and_only_where_somebody_takes_commands() -> None:
 
 
 def test_a_command_that_is_no_number_moves_nothing() -> None:
-    commands: list[Command] = []
+    commands: list[SetPointCommand] = []
     sink = Carrier(commands)
     for value in (float("nan"), float("inf"), 1.5):
         sink._command(HAND, 2, value)

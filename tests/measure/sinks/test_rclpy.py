@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import UsageFailure
-from teds_provision.measure.blocks import Command, NodeReport
+from teds_provision.measure.blocks import NodeReport, SetPointCommand
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import sourced
 from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
@@ -59,7 +59,7 @@ def sink(request: pytest.FixtureRequest, domain: Domain, monkeypatch: pytest.Mon
     """A sink of each way, open, running, with what takes its set points."""
     if request.param != "rclpy":
         monkeypatch.delenv(sourced.CHOSEN)
-    came: queue.Queue[Command] = queue.Queue()
+    came: queue.Queue[SetPointCommand] = queue.Queue()
     made = open_sink(f"ros2:{domain.number}", came.put)
     assert isinstance(made, RclpySink if request.param == "rclpy" else Ros2Sink)
     made.came = came  # type: ignore[attr-defined]

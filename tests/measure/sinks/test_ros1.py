@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from teds_provision.measure.blocks import Command, GroupRows, NodeReport
+from teds_provision.measure.blocks import GroupRows, NodeReport, SetPointCommand
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import ros1_child
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
@@ -90,7 +90,7 @@ def master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
     one.stop()
 
 
-def ros1(master: Master, commands: Callable[[Command], None] | None = None) -> Ros1Sink:
+def ros1(master: Master, commands: Callable[[SetPointCommand], None] | None = None) -> Ros1Sink:
     sink = open_sink(f"ros1:{master.uri}", commands)
     assert isinstance(sink, Ros1Sink)
     return sink
@@ -181,7 +181,7 @@ def test_a_vector_and_a_wrench_are_messages_of_their_own(master: Master) -> None
 
 def test_a_command_topic_moves_an_actuator(master: Master) -> None:
     master.start()
-    came: queue.Queue[Command] = queue.Queue()
+    came: queue.Queue[SetPointCommand] = queue.Queue()
     sink = ros1(master, came.put)
     sink.open([GRIP], STATION)
     until(lambda: sink.stats.state == "running")

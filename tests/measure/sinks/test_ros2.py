@@ -18,7 +18,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from teds_provision.errors import UsageFailure
-from teds_provision.measure.blocks import Command
+from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros.ros2_types import HUMBLE_HASHES, TYPE_HASHES
 from tests.measure.sinks.parts import ANGLE, AXES, DISTANCE, GRIP, HAND, OIL, STATION, feed_robot
@@ -111,7 +111,7 @@ class TestSeenByFastDds:
         self, reader: Path, domain: int, release: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("ROS_DISTRO", release)
-        came: queue.Queue[Command] = queue.Queue()
+        came: queue.Queue[SetPointCommand] = queue.Queue()
         sink = open_sink(f"ros2:{domain}", came.put)
         sink.open([ANGLE, OIL, GRIP, *AXES, DISTANCE], STATION)
         seen = Seen(reader, domain, "rt/bench/hand/force/cmd", TOPICS)

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.protocol.messages.frames import Command, Reply, decode_reply
-from teds_provision.protocol.operation.commands import Operate, Operation, Power, idle
-from teds_provision.protocol.operation.hardware import ChannelHardware, Port, Reading
+from teds_provision.protocol.operation.commands import Operate, OperationReply, Power, idle
+from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading, SessionPort
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim import Tim
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, BlockId
-from teds_provision.teds.sheet import Kind
+from teds_provision.teds.sheet import ChannelKind
 
 from ..memory import RamFlash
 from .kat import KAT, UUID
@@ -26,7 +26,7 @@ SECOND = 1000 * MS
 K = bytes.fromhex(KAT["open"]["K"])
 NODE_KEY = SoftwareKey(7)
 DIGEST = bytes.fromhex(KAT["digest"])
-KINDS = {"sensor": Kind.SENSOR, "actuator": Kind.ACTUATOR, "event sensor": Kind.EVENT_SENSOR}
+KINDS = {"sensor": ChannelKind.SENSOR, "actuator": ChannelKind.ACTUATOR, "event sensor": ChannelKind.EVENT_SENSOR}
 LOW, HIGH = 100, 4000
 SAFE_VALUE = (100).to_bytes(2, "big")
 
@@ -77,8 +77,8 @@ class FakeHardware:
         width = self.channels[channel].octets
         return (channel * (tick // MS) % (1 << 8 * width)).to_bytes(width, "big")
 
-    def read(self, channel: int, tick: int) -> Reading:
-        return Reading(self.value(channel, tick), channel not in self.invalid)
+    def read(self, channel: int, tick: int) -> RawReading:
+        return RawReading(self.value(channel, tick), channel not in self.invalid)
 
     def bears(self, channel: int, data_set: bytes) -> bool:
         return LOW <= int.from_bytes(data_set, "big") <= HIGH
@@ -122,7 +122,7 @@ class Bench:
         self.memory = RamFlash(flash)
         self.limits = limits
         self.sessions: dict[str, StationSession] = {}
-        self.ports: dict[str, Port] = {}
+        self.ports: dict[str, SessionPort] = {}
         self.frames: list[tuple[int, DataFrame]] = []
         self.buses = {"can"}
         self.restart()
@@ -146,7 +146,7 @@ class Bench:
             self.tim.reply_left(link)
         return decode_reply(reply)
 
-    def open(self, link: str = "can:f1", port: Port | None = None) -> Bench:
+    def open(self, link: str = "can:f1", port: SessionPort | None = None) -> Bench:
         """Open a session on a link; its first good frame is the next command."""
         if port is not None:
             self.ports[link] = port
@@ -179,9 +179,9 @@ class Bench:
             assert self.reason(asked.command(), link) is None
         return self
 
-    def operation(self, link: str = "can:f1") -> Operation:
+    def operation(self, link: str = "can:f1") -> OperationReply:
         """What Operation says."""
-        return Operation.decode(self.send(Command(0, 128, 19), link).payload)
+        return OperationReply.decode(self.send(Command(0, 128, 19), link).payload)
 
     def idle(self, channel: int = 0, link: str = "can:f1") -> None:
         assert self.send(idle(channel), link).ok

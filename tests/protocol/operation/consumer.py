@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from teds_provision.protocol.operation.can_frames import Assembly, data_address
+from teds_provision.protocol.operation.can_frames import StreamAssembly, data_address
 from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
     Clock,
     decode_stopped,
     stop,
 )
-from teds_provision.protocol.operation.subscription import Message, Plan, Receiver, TickBounds
+from teds_provision.protocol.operation.subscription import Receiver, StreamMessage, StreamPlan, TickBounds
 
 from .bench import MS, Bench
 
@@ -23,15 +23,15 @@ class Consumer:
                  left: bool = True, **more: object) -> None:  # fmt: skip
         asked = {"n": 2, "period": 10 * MS} | more
         self.bench, self.link = bench, link
-        self.plan = Plan.of(stream, tuple((channel, WIDTHS[channel]) for channel in channels), **asked)  # type: ignore[arg-type]
+        self.plan = StreamPlan.of(stream, tuple((channel, WIDTHS[channel]) for channel in channels), **asked)  # type: ignore[arg-type]
         reply = bench.send(self.plan.command(), link, left=left)
         assert reply.ok, reply.reason
         self.reply = self.plan.accept(reply.payload, TickBounds(bench.hardware.tick, bench.hardware.tick))
         self.receiver = Receiver(self.plan, self.reply, bench.sessions[link].message_key, oldest=1 << 62)
-        self.assembly = Assembly(self.plan.length, fd=False)
+        self.assembly = StreamAssembly(self.plan.length, fd=False)
         self.taken = len(bench.frames)
 
-    def messages(self) -> list[Message]:
+    def messages(self) -> list[StreamMessage]:
         """Messages that came whole since the last call."""
         found = []
         for tick, frame in self.bench.frames[self.taken :]:
@@ -55,7 +55,7 @@ class Consumer:
         return counter
 
 
-def values(message: Message, width: int = 2) -> list[int]:
+def values(message: StreamMessage, width: int = 2) -> list[int]:
     return [int.from_bytes(message.data[at : at + width], "big") for at in range(0, len(message.data), width)]
 
 

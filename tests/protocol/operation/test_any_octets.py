@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.protocol.messages.frames import Command, Function
-from teds_provision.protocol.operation.datagram import Sealer
-from teds_provision.protocol.operation.stream_commands import CLOCK, Kind, Subscribe, stop
+from teds_provision.protocol.operation.datagram import DatagramSealer
+from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, Subscribe, stop
 
 from .bench import DIGEST, MS, SAFE_VALUE, Bench
 
@@ -44,7 +44,7 @@ def test_no_inner_command_makes_the_node_raise(said: list[tuple[tuple, int]], ju
     assert len(bench.frames) == sent
 
 
-class Recording(Sealer):
+class Recording(DatagramSealer):
     """A sealer that notes each key and counter, of every sealer there is."""
 
     used: list[tuple[bytes, int]]
@@ -60,10 +60,10 @@ class Recording(Sealer):
 
 subscriptions = st.builds(
     lambda stream, kind, n, period, start: Subscribe(
-        stream, kind, 1 if kind == Kind.EVENT else n, 0, period, start, (5,) if kind == Kind.EVENT else (1,)
+        stream, kind, 1 if kind == StreamKind.EVENT else n, 0, period, start, (5,) if kind == StreamKind.EVENT else (1,)
     ),
     st.integers(0, 3),
-    st.sampled_from(Kind),
+    st.sampled_from(StreamKind),
     st.integers(1, 5),
     st.sampled_from([MS, 7 * MS]),
     st.sampled_from([0, (1 << 64) - 1]),
@@ -79,7 +79,7 @@ acts = st.one_of(
 @given(st.lists(st.tuples(acts, st.integers(0, 60 * MS)), min_size=3, max_size=20))
 def test_no_key_and_nonce_come_twice_whatever_a_station_asks(said: list[tuple[Command | str, int]]) -> None:
     Recording.used = []
-    with patch("teds_provision.protocol.operation.streams.Sealer", Recording):
+    with patch("teds_provision.protocol.operation.streams.DatagramSealer", Recording):
         bench = Bench().open().operate(0)
         for act, pause in said:
             if isinstance(act, Command):

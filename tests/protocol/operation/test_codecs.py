@@ -13,9 +13,9 @@ from teds_provision.errors import Garbled
 from teds_provision.protocol.messages.frames import Refused
 from teds_provision.protocol.operation import budget
 from teds_provision.protocol.operation.can_frames import (
-    Assembly,
     DataAddress,
     DriveAddress,
+    StreamAssembly,
     ble_frame,
     cut,
     data_address,
@@ -27,14 +27,21 @@ from teds_provision.protocol.operation.can_frames import (
     trigger_identifier,
     trigger_station,
 )
-from teds_provision.protocol.operation.commands import ChannelState, Operate, Operation, Power, Sampled, decode_data_set
-from teds_provision.protocol.operation.datagram import DriveValues, Layout, Sealer, drive_length, pattern
-from teds_provision.protocol.operation.hardware import Port, port_of
+from teds_provision.protocol.operation.commands import (
+    ChannelState,
+    Operate,
+    OperationReply,
+    Power,
+    Sampled,
+    decode_data_set,
+)
+from teds_provision.protocol.operation.datagram import DatagramSealer, DriveValues, Layout, drive_length, pattern
+from teds_provision.protocol.operation.hardware import SessionPort, port_of
 from teds_provision.protocol.operation.stream_commands import (
     Arm,
     Clock,
     Driven,
-    Kind,
+    StreamKind,
     Subscribe,
     Subscribed,
     decode_stopped,
@@ -72,7 +79,7 @@ def test_messages_are_cut_and_put_together(message: bytes, fd: bool, drive: bool
     pieces = list(cut(message, fd=fd, drive=drive))
     assert len(pieces) == frames_of(len(message), fd=fd, drive=drive)
     assert [piece.segment for piece in pieces[:9]] == [0, 1, 2, 3, 4, 5, 6, 7, 1][: len(pieces)]
-    assembly = Assembly(len(message), fd=fd, drive=drive)
+    assembly = StreamAssembly(len(message), fd=fd, drive=drive)
     take: Callable[[int, bytes], bytes | None] = (lambda _, data: assembly.take_drive(data)) if drive else assembly.take
     assert [take(*piece) for piece in pieces] == [None] * (len(pieces) - 1) + [message]
     assert assembly.broken == 0
@@ -96,7 +103,7 @@ def test_a_missing_doubled_or_swapped_frame_drops_its_message_and_no_other(data:
     else:
         other = (at + 1) % len(hurt)
         hurt[at], hurt[other] = hurt[other], hurt[at]
-    assembly = Assembly(length, fd=False)
+    assembly = StreamAssembly(length, fd=False)
     whole = [assembly.take(*piece) for piece in (*pieces[0], *hurt, *pieces[2])]
     found = [message for message in whole if message is not None]
     harmless = fault == "doubled" and at in (0, len(pieces[1]) - 1)  # segment 0 begins anew; after the last is nothing
@@ -106,7 +113,7 @@ def test_a_missing_doubled_or_swapped_frame_drops_its_message_and_no_other(data:
 
 @given(st.lists(st.tuples(st.integers(0, 7), st.binary(max_size=64)), max_size=60), st.integers(9, 240), st.booleans())
 def test_junk_frames_make_no_message_of_another_length(frames: list[tuple[int, bytes]], length: int, fd: bool) -> None:
-    assembly = Assembly(length, fd=fd)
+    assembly = StreamAssembly(length, fd=fd)
     for frame in frames:
         message = assembly.take(*frame)
         assert message is None or len(message) == length
@@ -130,11 +137,11 @@ def test_ble_notifications(stream: int, message: bytes) -> None:
 # -- payloads ----------------------------------------------------------------------------------------------------------
 
 
-@given(st.integers(0, 3), st.sampled_from(Kind), st.integers(1, 255), u16, u64, u64, channel_lists, st.booleans())
+@given(st.integers(0, 3), st.sampled_from(StreamKind), st.integers(1, 255), u16, u64, u64, channel_lists, st.booleans())
 def test_subscribe(
-    stream: int, kind: Kind, n: int, gap: int, period: int, start: int, channels: tuple[int, ...], test: bool
+    stream: int, kind: StreamKind, n: int, gap: int, period: int, start: int, channels: tuple[int, ...], test: bool
 ) -> None:
-    if kind == Kind.EVENT:
+    if kind == StreamKind.EVENT:
         n, channels = 1, channels[:1]
     asked = Subscribe(stream, kind, n, gap, period, start, channels, test)
     assert Subscribe.decode(asked.encode()) == asked
@@ -160,8 +167,8 @@ def test_operate_and_arm(octets: bytes, life: int, action: int, channel: int, de
 
 @given(st.booleans(), st.dictionaries(st.integers(1, 255), st.tuples(u8.map(ChannelState), u8)))
 def test_operation(measuring: bool, channels: dict[int, tuple[ChannelState, int]]) -> None:
-    told = Operation(measuring, channels)
-    assert Operation.decode(told.encode()) == told
+    told = OperationReply(measuring, channels)
+    assert OperationReply.decode(told.encode()) == told
 
 
 @given(
@@ -188,7 +195,7 @@ def test_samples_and_drive_values(tick: int, flags: int, data: bytes, until: int
 @given(st.binary(max_size=60))
 def test_no_octets_of_a_node_do_harm(octets: bytes) -> None:
     """A reply is read or it is Garbled; nothing else comes out."""
-    for decode in (Subscribed.decode, Driven.decode, Clock.decode, Operation.decode, Power.decode, decode_stopped):
+    for decode in (Subscribed.decode, Driven.decode, Clock.decode, OperationReply.decode, Power.decode, decode_stopped):
         with contextlib.suppress(Garbled):
             decode(octets)
     for width in (0, 1, 8):
@@ -210,7 +217,7 @@ def test_no_octets_of_a_station_do_harm(octets: bytes) -> None:
 
 @given(st.binary(min_size=16, max_size=16), u32, st.binary(min_size=1, max_size=200), st.data())
 def test_a_message_opens_whole_and_unchanged_alone(key: bytes, counter: int, plain: bytes, data: st.DataObject) -> None:
-    sealer = Sealer(key)
+    sealer = DatagramSealer(key)
     message = sealer.seal(counter, plain)
     assert len(message) == 4 + len(plain) + 8
     assert sealer.open(message) == plain
@@ -240,13 +247,13 @@ def test_the_test_pattern_counts_and_runs_over() -> None:
 @pytest.mark.parametrize(
     ("link", "port"),
     [
-        ("nfc", Port("nfc", "nfc", 1)),
-        ("can:f1", Port("can", "can", 0xF1)),
-        ("can1:f7", Port("can", "can1", 0xF7)),
-        ("ble:2", Port("ble", "ble", 2)),
+        ("nfc", SessionPort("nfc", "nfc", 1)),
+        ("can:f1", SessionPort("can", "can", 0xF1)),
+        ("can1:f7", SessionPort("can", "can1", 0xF7)),
+        ("ble:2", SessionPort("ble", "ble", 2)),
     ],
 )
-def test_a_links_name_says_its_port(link: str, port: Port) -> None:
+def test_a_links_name_says_its_port(link: str, port: SessionPort) -> None:
     assert port_of(link) == port
 
 

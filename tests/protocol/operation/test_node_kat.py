@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.operation.can_frames import drive_address
-from teds_provision.protocol.operation.hardware import Port
+from teds_provision.protocol.operation.hardware import SessionPort
 from teds_provision.protocol.session import StationSession
 
 from .bench import MS, Bench, K
@@ -54,7 +54,7 @@ def message_key(bench: Bench) -> bytes:
 def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
     bench, told = Bench(), KAT["open"]
     load_dice(bench, int(told["c"], 16), SoftwareKey(int(told["En"]["d"], 16)))
-    bench.ports["can:f1"] = Port("can", "can", 0xF1, fd=fd)
+    bench.ports["can:f1"] = SessionPort("can", "can", 0xF1, fd=fd)
     session = StationSession(K, UUID, one_time=SoftwareKey(int(told["Es"]["d"], 16)))
     opened = bench.tim.handle(bytes.fromhex(told["open_frame"]), link="can:f1", tapped=False)
     assert opened.hex() == told["open_reply"]

@@ -8,19 +8,28 @@ import pytest
 
 from teds_provision.errors import Garbled, NotAuthentic
 from teds_provision.protocol.operation.commands import TEST_PATTERN
-from teds_provision.protocol.operation.datagram import MOST_OCTETS, Layout, Sealer, drive_key, stream_key
+from teds_provision.protocol.operation.datagram import MOST_OCTETS, DatagramSealer, Layout, drive_key, stream_key
 from teds_provision.protocol.operation.driving import Driver
-from teds_provision.protocol.operation.stream_commands import NONE, SOON, WAITS, Action, Clock, Driven, Kind, Subscribed
+from teds_provision.protocol.operation.stream_commands import (
+    NONE,
+    SOON,
+    WAITS,
+    Action,
+    Clock,
+    Driven,
+    StreamKind,
+    Subscribed,
+)
 from teds_provision.protocol.operation.subscription import (
     MOST_HELD,
     Counts,
-    Message,
-    Plan,
     Receiver,
+    StreamMessage,
+    StreamPlan,
     TickBounds,
     most_instants,
 )
-from teds_provision.protocol.operation.timing import ClockSample, Token, mark_is_honest
+from teds_provision.protocol.operation.timing import ClockSample, TriggerToken, mark_is_honest
 
 MS = 1_000_000
 K_M = bytes(range(32))
@@ -28,9 +37,9 @@ START = 3000 * MS
 LATER = TickBounds(START + 100 * MS, START + 100 * MS)
 
 
-def plan(**changes: object) -> Plan:
+def plan(**changes: object) -> StreamPlan:
     asked: dict[str, object] = {"n": 2, "period": 10 * MS} | changes
-    return Plan.of(0, ((1, 2),), **asked)  # type: ignore[arg-type]
+    return StreamPlan.of(0, ((1, 2),), **asked)  # type: ignore[arg-type]
 
 
 def receiver(run: int = 1, *, start: int = START, previous: Receiver | None = None, **changes: object) -> Receiver:
@@ -39,7 +48,7 @@ def receiver(run: int = 1, *, start: int = START, previous: Receiver | None = No
 
 
 def sealed(counter: int, run: int = 1, *, flags: int = 0, body: bytes = bytes(4)) -> bytes:
-    return Sealer(stream_key(K_M, run)).seal(counter, bytes([flags]) + body)
+    return DatagramSealer(stream_key(K_M, run)).seal(counter, bytes([flags]) + body)
 
 
 def counted(taker: Receiver, **counts: int) -> None:
@@ -48,7 +57,7 @@ def counted(taker: Receiver, **counts: int) -> None:
 
 def test_good_messages_carry_index_and_tick() -> None:
     taker = receiver()
-    assert taker.take(sealed(0, body=b"abcd"), LATER) == Message(0, 0, START, 0, b"abcd")
+    assert taker.take(sealed(0, body=b"abcd"), LATER) == StreamMessage(0, 0, START, 0, b"abcd")
     found = taker.take(sealed(3), LATER)
     assert found is not None
     assert (found.index, found.tick) == (6, START + 60 * MS)
@@ -126,15 +135,15 @@ def test_messages_are_held_until_the_mark_is_read() -> None:
 
 
 def test_events_and_free_streams_carry_their_tick() -> None:
-    taker = receiver(kind=Kind.EVENT, n=1)
+    taker = receiver(kind=StreamKind.EVENT, n=1)
     found = taker.take(sealed(4, body=START.to_bytes(8, "big") + b"ab"), LATER)
-    assert found == Message(4, 4, START, 0, b"ab")
-    waiting = receiver(start=WAITS, kind=Kind.FREE)
+    assert found == StreamMessage(4, 4, START, 0, b"ab")
+    waiting = receiver(start=WAITS, kind=StreamKind.FREE)
     assert waiting.take(sealed(0, body=START.to_bytes(8, "big") + b"abcd"), LATER) is not None
 
 
-@pytest.mark.parametrize("kind", [Kind.EVENT, Kind.FREE])
-def test_ticks_of_messages_that_do_not_go_forward_are_counted_and_not_believed(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", [StreamKind.EVENT, StreamKind.FREE])
+def test_ticks_of_messages_that_do_not_go_forward_are_counted_and_not_believed(kind: StreamKind) -> None:
     """Stamps never go back, so such samples were handed on with the time of the ones before."""
     taker = receiver(kind=kind, n=1)
     ticks = (0, 10, 10, 3, 20)
@@ -146,7 +155,7 @@ def test_ticks_of_messages_that_do_not_go_forward_are_counted_and_not_believed(k
 
 @pytest.mark.parametrize("jump", [2**31, -(2**31), 2**63, -START])
 def test_a_tick_that_jumps_is_no_time_of_a_sample(jump: int) -> None:
-    taker = receiver(kind=Kind.FREE, n=1)
+    taker = receiver(kind=StreamKind.FREE, n=1)
     lie = ((START + jump) % 2**64).to_bytes(8, "big")
     for counter, tick in enumerate((START.to_bytes(8, "big"), lie, (START + 10 * MS).to_bytes(8, "big"))):
         taker.take(sealed(counter, body=tick + b"ab"), LATER)
@@ -204,15 +213,15 @@ def test_a_run_that_was_there_before_is_reported() -> None:
 
 
 def test_how_many_instants_fit() -> None:
-    assert [most_instants(Kind.PERIODIC, octets) for octets in (1, 2, 6, 227, 228, 0)] == [227, 113, 37, 1, 0, 0]
-    assert most_instants(Kind.FREE, 2) == 109
-    assert most_instants(Kind.EVENT, 2) == 1
-    assert most_instants(Kind.PERIODIC, 2, most=23 - 4) == 3, "BLE with an MTU of 23"
-    assert most_instants(Kind.EVENT, 1, most=23 - 4) == 0
+    assert [most_instants(StreamKind.PERIODIC, octets) for octets in (1, 2, 6, 227, 228, 0)] == [227, 113, 37, 1, 0, 0]
+    assert most_instants(StreamKind.FREE, 2) == 109
+    assert most_instants(StreamKind.EVENT, 2) == 1
+    assert most_instants(StreamKind.PERIODIC, 2, most=23 - 4) == 3, "BLE with an MTU of 23"
+    assert most_instants(StreamKind.EVENT, 1, most=23 - 4) == 0
     assert plan(n=113).fits
     assert not plan(n=114).fits
     assert plan(n=113).length == MOST_OCTETS - 1
-    exactly = Plan.of(0, ((1, 1),), n=227, period=MS)
+    exactly = StreamPlan.of(0, ((1, 1),), n=227, period=MS)
     assert (exactly.length, exactly.fits) == (MOST_OCTETS, True)
 
 
@@ -246,7 +255,7 @@ def test_the_bound_grows_with_the_drift_of_both_clocks() -> None:
 
 
 def test_tokens_are_new_each_time_and_marks_are_held_against_the_frame() -> None:
-    one, other = Token.draw(), Token.draw()
+    one, other = TriggerToken.draw(), TriggerToken.draw()
     assert one.octets != other.octets
     assert len(one.octets) == 8
     assert one.arm(Action.STOP, 5).commitment == one.commitment != other.commitment
@@ -260,7 +269,7 @@ def test_tokens_are_new_each_time_and_marks_are_held_against_the_frame() -> None
 
 def test_a_drive_message_holds_no_longer_than_the_dead_man() -> None:
     driver = Driver(Layout((4,), (2,)), Driven(3, 18), K_M, dead_man=50)
-    opener = Sealer(drive_key(K_M, 3))
+    opener = DatagramSealer(drive_key(K_M, 3))
     for hold, until in [(None, 50), (20 * MS, 20), (80 * MS, 50)]:
         plain = opener.open(driver.seal((b"ab",), TickBounds(START, START + 5 * MS), hold=hold))
         assert plain is not None

@@ -16,8 +16,17 @@ from teds_provision.protocol.operation.commands import (
     set_values,
     write_data_set,
 )
-from teds_provision.protocol.operation.hardware import Port
-from teds_provision.protocol.operation.stream_commands import CLOCK, WAITS, Action, Arm, Kind, Subscribe, drive, stop
+from teds_provision.protocol.operation.hardware import SessionPort
+from teds_provision.protocol.operation.stream_commands import (
+    CLOCK,
+    WAITS,
+    Action,
+    Arm,
+    StreamKind,
+    Subscribe,
+    drive,
+    stop,
+)
 
 from .bench import DIGEST, MS, SECOND, Bench, channel_teds, channels
 
@@ -208,7 +217,7 @@ def test_self_test_power_operation_clock_and_idle() -> None:
 
 def subscribe(**changes: object) -> Command:
     asked: dict[str, object] = {
-        "stream": 0, "kind": Kind.PERIODIC, "n": 2, "gap": 0, "period": 10 * MS, "start": 0, "channels": (1,)
+        "stream": 0, "kind": StreamKind.PERIODIC, "n": 2, "gap": 0, "period": 10 * MS, "start": 0, "channels": (1,)
     }  # fmt: skip
     return Subscribe(**{**asked, **changes}).command()  # type: ignore[arg-type]
 
@@ -239,8 +248,8 @@ def test_subscribe_in_the_order_of_section_4() -> None:
             ("one not claimed", subscribe(channels=(1, 2)), U.WRONG_STATE),
             ("an actuator, period 0", subscribe(channels=(4,), period=0), U.NOT_PERMITTED),
             ("periodic of an event sensor", subscribe(channels=(5,)), U.OUT_OF_RANGE),
-            ("free with an event sensor", subscribe(kind=Kind.FREE, channels=(1, 5)), U.OUT_OF_RANGE),
-            ("events of a sensor", subscribe(kind=Kind.EVENT, n=1), U.OUT_OF_RANGE),
+            ("free with an event sensor", subscribe(kind=StreamKind.FREE, channels=(1, 5)), U.OUT_OF_RANGE),
+            ("events of a sensor", subscribe(kind=StreamKind.EVENT, n=1), U.OUT_OF_RANGE),
             ("period 0, too long as well", subscribe(period=0, n=200), U.OUT_OF_RANGE),
             ("period above 10^12", subscribe(period=10**12 + 1), U.OUT_OF_RANGE),
             ("shorter than SPeriod", subscribe(channels=(3,), period=19 * MS), U.OUT_OF_RANGE),
@@ -298,7 +307,7 @@ def test_links_that_do_not_offer_all() -> None:
         ],
         "nfc",
     )
-    bench.open("ble:2", Port("ble", "ble", 2, mtu=247)).operate(1, link="ble:2")
+    bench.open("ble:2", SessionPort("ble", "ble", 2, mtu=247)).operate(1, link="ble:2")
     sent(
         bench,
         [
@@ -308,13 +317,13 @@ def test_links_that_do_not_offer_all() -> None:
         ],
         "ble:2",
     )
-    bench.open("ble:3", Port("ble", "ble", 3, mtu=23)).operate(1, 5, link="ble:3")
+    bench.open("ble:3", SessionPort("ble", "ble", 3, mtu=23)).operate(1, 5, link="ble:3")
     sent(
         bench,
         [
             ("n = 3 of 2 octets fits an MTU of 23", subscribe(n=3), None),
             ("n = 4 does not", subscribe(n=4), U.TOO_LARGE),
-            ("nor does an event", subscribe(kind=Kind.EVENT, n=1, channels=(5,)), U.TOO_LARGE),
+            ("nor does an event", subscribe(kind=StreamKind.EVENT, n=1, channels=(5,)), U.TOO_LARGE),
         ],
         "ble:3",
     )

@@ -8,9 +8,9 @@ from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.frames import Command, decode_reply
 from teds_provision.protocol.operation import budget
 from teds_provision.protocol.operation.can_frames import (
-    Assembly,
     DataAddress,
     DriveAddress,
+    StreamAssembly,
     ble_frame,
     cut,
     data_address,
@@ -24,7 +24,7 @@ from teds_provision.protocol.operation.commands import (
     POWER,
     ChannelState,
     Operate,
-    Operation,
+    OperationReply,
     Power,
     PowerFlag,
     Sampled,
@@ -45,15 +45,15 @@ from teds_provision.protocol.operation.stream_commands import (
     Action,
     Clock,
     Driven,
-    Kind,
+    StreamKind,
     Subscribe,
     Subscribed,
     decode_stopped,
     drive,
     stop,
 )
-from teds_provision.protocol.operation.subscription import Plan, Receiver, TickBounds
-from teds_provision.protocol.operation.timing import START_AFTER_MARK, ClockSample, Token
+from teds_provision.protocol.operation.subscription import Receiver, StreamPlan, TickBounds
+from teds_provision.protocol.operation.timing import START_AFTER_MARK, ClockSample, TriggerToken
 
 from .kat import KAT, MESSAGE_KEY, NODE, STATION, UUID, WIDTHS, can_frame
 
@@ -62,15 +62,15 @@ ANY = TickBounds(0, 1 << 63)
 COMMANDS = {entry["counter"]: entry for entry in KAT["commands"]}
 
 
-def plan_of(stream: dict) -> Plan:
+def plan_of(stream: dict) -> StreamPlan:
     channels = tuple((channel, WIDTHS[channel]) for channel in stream["channels"])
     start = stream["start"] if stream["start"] == WAITS else 0
-    return Plan.of(
+    return StreamPlan.of(
         stream["stream"],
         channels,
         n=stream["n"],
         period=stream["period"],
-        kind=Kind(stream["kind"]),
+        kind=StreamKind(stream["kind"]),
         gap=1000,
         start=start,
         test_pattern=stream["test_pattern"],
@@ -90,7 +90,7 @@ def test_messages_are_opened_as_published(stream: dict) -> None:
             (found,) = receiver.begin(KAT["trigger"]["start"])
         assert found is not None
         plain = bytes.fromhex(entry["plaintext"])
-        timed = stream["kind"] != Kind.PERIODIC
+        timed = stream["kind"] != StreamKind.PERIODIC
         assert (found.counter, found.flags) == (entry["counter"], plain[0])
         assert found.data == plain[9 if timed else 1 :]
         assert found.test_pattern == stream["test_pattern"]
@@ -117,7 +117,7 @@ def test_messages_are_cut_and_put_together_as_published(stream: dict) -> None:
                 (DataAddress(STATION, stream["stream"], piece.segment, NODE).identifier, piece.data) for piece in pieces
             ] == frames
             assert budget.frames(len(message), link="can", fd=fd) == len(frames)
-            assembly, whole = Assembly(len(message), fd=fd), None
+            assembly, whole = StreamAssembly(len(message), fd=fd), None
             for identifier, data in frames:
                 address = data_address(identifier)
                 assert address is not None
@@ -149,14 +149,14 @@ def test_drive_messages_are_sealed_as_published() -> None:
             frames = [can_frame(text) for text in entry[form]]
             assert [piece.data for piece in cut(message, fd=fd, drive=True)] == [data for _, data in frames]
             assert {drive_address(identifier) for identifier, _ in frames} == {DriveAddress(NODE, STATION)}
-            assembly = Assembly(len(message), fd=fd, drive=True)
+            assembly = StreamAssembly(len(message), fd=fd, drive=True)
             assert [assembly.take_drive(data) for _, data in frames][-1] == message
         assert ble_frame(0, message).hex() == entry["ble"]
 
 
 def test_the_trigger_is_the_vectors() -> None:
     told = KAT["trigger"]
-    token = Token(bytes.fromhex(told["T"]))
+    token = TriggerToken(bytes.fromhex(told["T"]))
     assert token.commitment.hex() == told["C"]
     identifier, data = can_frame(told["can"])
     assert (trigger_identifier(STATION), token.octets) == (identifier, data)
@@ -187,7 +187,7 @@ def payload(counter: int) -> bytes:
 
 def test_every_command_is_built_as_published() -> None:
     digest = bytes.fromhex(KAT["digest"])
-    trigger = Token(bytes.fromhex(KAT["trigger"]["T"]))
+    trigger = TriggerToken(bytes.fromhex(KAT["trigger"]["T"]))
     built = {
         1: OPERATION,
         2: sample([1]),
@@ -222,11 +222,11 @@ def test_every_command_is_built_as_published() -> None:
 
 
 def test_every_reply_is_read_as_published() -> None:
-    idle_state = Operation.decode(payload(1))
+    idle_state = OperationReply.decode(payload(1))
     assert not idle_state.measuring
     assert idle_state.channels[4] == (ChannelState.ACTUATOR | ChannelState.SAFE, 0)
     assert idle_state.channels[5] == (ChannelState.EVENT_SENSOR, 0)
-    claimed = Operation.decode(payload(41))
+    claimed = OperationReply.decode(payload(41))
     assert claimed.measuring
     assert claimed.channels[4] == (ChannelState.ACTUATOR | ChannelState.CLAIMED_HERE, STATION)
     assert Clock.decode(payload(5)) == Clock(67_900_000, 67_900_000, 0, 1000, 50, NONE)
@@ -237,7 +237,7 @@ def test_every_reply_is_read_as_published() -> None:
     assert Driven.decode(payload(37)) == Driven(9, 20)
     assert Power.decode(payload(42)) == Power(PowerFlag.BATTERY, 87, 3.7, -0.012, 23)
     for counter in (1, 5, 8, 37, 42):
-        reply = {1: Operation, 5: Clock, 37: Driven, 42: Power}.get(counter)
+        reply = {1: OperationReply, 5: Clock, 37: Driven, 42: Power}.get(counter)
         if reply is not None:
             assert reply.decode(payload(counter)).encode() == payload(counter)
 

@@ -9,13 +9,13 @@ import pytest
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.can_frames import data_address
 from teds_provision.protocol.operation.datagram import LAST_COUNTER
-from teds_provision.protocol.operation.hardware import Port
+from teds_provision.protocol.operation.hardware import SessionPort
 from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
-    Kind,
+    StreamKind,
     stop,
 )
-from teds_provision.protocol.operation.subscription import Plan, Receiver, TickBounds
+from teds_provision.protocol.operation.subscription import Receiver, StreamPlan, TickBounds
 
 from .bench import MS, SECOND, Bench
 from .consumer import Consumer, values
@@ -100,7 +100,7 @@ def test_a_half_open_open_ends_nothing() -> None:
 def test_a_new_subscribe_ends_the_run_before_and_a_refused_one_does_not() -> None:
     bench = Bench().open().operate(1)
     first = Consumer(bench, start=100 * MS)
-    assert bench.reason(Plan.of(0, ((2, 2),), n=1, period=10 * MS).command()) == Reason.WRONG_STATE
+    assert bench.reason(StreamPlan.of(0, ((2, 2),), n=1, period=10 * MS).command()) == Reason.WRONG_STATE
     bench.until(130 * MS)
     assert first.messages()
     second = Consumer(bench, start=200 * MS)
@@ -163,8 +163,8 @@ def test_the_last_counter_is_sent_and_ends_the_stream() -> None:
 
 
 def test_ble_streams_are_whole_notifications_of_their_connection() -> None:
-    bench = Bench().open("ble:2", Port("ble", "ble", 2, mtu=247)).operate(1, link="ble:2")
-    plan = Plan.of(3, ((1, 2),), n=2, period=10 * MS, start=100 * MS)
+    bench = Bench().open("ble:2", SessionPort("ble", "ble", 2, mtu=247)).operate(1, link="ble:2")
+    plan = StreamPlan.of(3, ((1, 2),), n=2, period=10 * MS, start=100 * MS)
     reply = plan.accept(bench.send(plan.command(), "ble:2").payload, TickBounds(0, 0))
     bench.until(150 * MS)
     _, frame = bench.frames[0]
@@ -180,7 +180,7 @@ def test_ble_streams_are_whole_notifications_of_their_connection() -> None:
 
 def test_events_before_the_start_do_not_count_and_those_too_soon_do() -> None:
     bench = Bench().open().operate(5)
-    consumer = Consumer(bench, channels=(5,), kind=Kind.EVENT, n=1, period=20 * MS, start=100 * MS)
+    consumer = Consumer(bench, channels=(5,), kind=StreamKind.EVENT, n=1, period=20 * MS, start=100 * MS)
     for tick in (90, 100, 119, 120, 139, 141):
         bench.until(tick * MS)
         bench.tim.event(5, tick * MS, bytes([tick]), valid=tick != 120)
@@ -197,7 +197,9 @@ def test_events_before_the_start_do_not_count_and_those_too_soon_do() -> None:
 
 def test_events_of_the_test_pattern_come_one_every_period() -> None:
     bench = Bench().open().operate(5)
-    consumer = Consumer(bench, channels=(5,), kind=Kind.EVENT, n=1, period=20 * MS, start=100 * MS, test_pattern=True)
+    consumer = Consumer(
+        bench, channels=(5,), kind=StreamKind.EVENT, n=1, period=20 * MS, start=100 * MS, test_pattern=True
+    )
     bench.tim.event(5, 110 * MS, b"\xff")
     bench.until(165 * MS)
     found = consumer.messages()

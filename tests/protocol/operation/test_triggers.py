@@ -8,14 +8,14 @@ from teds_provision.protocol.operation.stream_commands import (
     Action,
     Arm,
 )
-from teds_provision.protocol.operation.timing import Token
+from teds_provision.protocol.operation.timing import TriggerToken
 
 from .bench import MS, SAFE_VALUE, SECOND, Bench
 from .consumer import Consumer, clock, values
 
 
-def armed(bench: Bench, action: Action, *, life: int = 10, link: str = "can:f1") -> Token:
-    token = Token.draw()
+def armed(bench: Bench, action: Action, *, life: int = 10, link: str = "can:f1") -> TriggerToken:
+    token = TriggerToken.draw()
     assert bench.send(token.arm(action, life).command(), link).ok
     return token
 

@@ -38,7 +38,7 @@ from teds_provision.measure.sinks.mcap.writer import (
     METADATA,
     METADATA_INDEX,
     SCHEMA,
-    Summary,
+    McapSummary,
     chunk_index,
     record,
     text,
@@ -141,7 +141,7 @@ def _finished(scan: _Scan, file: int, path: Path, output: Path | None) -> Recove
     return Recovered(messages, until, whole, cut, tuple(scan.damaged), None if whole else output)
 
 
-def _end_in_place(scan: _Scan, summary: Summary, file: int, path: Path) -> None:
+def _end_in_place(scan: _Scan, summary: McapSummary, file: int, path: Path) -> None:
     """Cut the torn end off and write the one that belongs there; cut off itself, it leaves a torn end again."""
     with path.open("r+b") as same:
         if not os.path.samestat(os.fstat(file), os.fstat(same.fileno())):
@@ -376,9 +376,9 @@ class _Scan:
 
     # -- the end that belongs to it -----------------------------------------------------------------------------------
 
-    def assembled(self, put: Callable[[bytes], object] | None) -> Summary:
+    def assembled(self, put: Callable[[bytes], object] | None) -> McapSummary:
         """The summary of all that is whole, as it stands, or as ``put`` gets it, from the first octet to the last."""
-        summary, at = Summary(), len(MAGIC)
+        summary, at = McapSummary(), len(MAGIC)
         if put is not None:
             put(MAGIC)
         for count, one in enumerate(self._kept):
@@ -394,7 +394,7 @@ class _Scan:
             put(summary.tail(at))
         return summary
 
-    def _chunk_into(self, summary: Summary, chunk: _Chunk, at: int, put: Callable[[bytes], object] | None) -> int:
+    def _chunk_into(self, summary: McapSummary, chunk: _Chunk, at: int, put: Callable[[bytes], object] | None) -> int:
         for code, content in chunk.described:
             _describe(summary, code, content)
         for channel, (count, first, last) in chunk.counts.items():
@@ -426,13 +426,13 @@ class _Scan:
 
     def _rescued(self) -> list[bytes]:
         """Schemas and channels of messages that are whole, which stood in a damaged chunk: as the summary has them."""
-        known, used = Summary(), set[int]()
+        known, used = McapSummary(), set[int]()
         for one in self._kept:
             if isinstance(one, _Chunk):
                 used |= one.counts.keys()
                 for code, content in one.described:
                     _describe(known, code, content)
-        elsewhere = Summary()
+        elsewhere = McapSummary()
         for body in (*self._spoiled, self._summary):  # the summary, whose checksum holds, has the last word
             for _, code, content in _inside(body):
                 if code in (SCHEMA, CHANNEL) and _parses(code, content):
@@ -458,7 +458,7 @@ def _nameless(number: int) -> bytes:
     return record(CHANNEL, content)
 
 
-def _record_into(summary: Summary, octets: bytes, at: int, put: Callable[[bytes], object] | None) -> int:
+def _record_into(summary: McapSummary, octets: bytes, at: int, put: Callable[[bytes], object] | None) -> int:
     code, content = octets[0], octets[HEAD.size :]
     if code == METADATA:
         name = content[4 : 4 + int.from_bytes(content[:4], "little")]
@@ -474,7 +474,7 @@ def _record_into(summary: Summary, octets: bytes, at: int, put: Callable[[bytes]
     return at + len(octets)
 
 
-def _describe(summary: Summary, code: int, content: bytes) -> None:
+def _describe(summary: McapSummary, code: int, content: bytes) -> None:
     """Take a schema or a channel into the summary, wherever it stands."""
     number = int.from_bytes(content[:2], "little")
     if code == SCHEMA:

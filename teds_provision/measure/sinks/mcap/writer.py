@@ -36,7 +36,7 @@ def _map(pairs: Mapping[str, str]) -> bytes:
 
 
 @dataclass
-class Summary:
+class McapSummary:
     """What the end of a file says of all of it; kept while writing, gathered anew when a file is made whole."""
 
     schemas: dict[int, bytes] = field(default_factory=dict)  # whole records
@@ -100,7 +100,7 @@ class McapWriter:
         self._compressor = zstandard.ZstdCompressor(level=1)
         self._put_octets = put
         self._offset = 0
-        self.summary = Summary()
+        self.summary = McapSummary()
         self._chunk: list[bytes] = []
         self._chunk_offset = 0
         self._first = self._last = 0

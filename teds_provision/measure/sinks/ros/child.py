@@ -23,7 +23,7 @@ from itertools import count
 from teds_provision.measure.blocks import Block, GroupRows
 from teds_provision.measure.sinks.base import CommandTaker, Item
 from teds_provision.measure.sinks.joints import INTERFACES
-from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
+from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 
 # The Python that a ROS came with: another one than ours, with other versions of everything.
@@ -244,7 +244,7 @@ class ChildSink(TopicSink):
     def _listen_joints(self, topic: str) -> None:
         self._send(op="listen_joints", topic=topic)
 
-    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+    def _diagnose(self, stamp: float, statuses: Sequence[DiagnosticEntry]) -> None:
         number = self._number("/diagnostics", DIAGNOSTICS)
         entries = [[one.level, one.name, one.message, one.hardware, one.values] for one in statuses]
         self._send(op="status", id=number, t=stamp, v=entries)

@@ -19,7 +19,7 @@ from teds_provision.errors import TedsProvisionError, UsageFailure
 from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
-from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
+from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, DiagnosticEntry, TopicSink
 from teds_provision.measure.sinks.ros.rclpy_child import keep_on_loopback, ports_of
 from teds_provision.measure.sinks.vectors import FieldValue, Meaning
 
@@ -258,7 +258,7 @@ class Ros2Sink(TopicSink):
             except DDSException:
                 time.sleep(LISTENING)
 
-    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+    def _diagnose(self, stamp: float, statuses: Sequence[DiagnosticEntry]) -> None:
         types = self._types
         entries = []
         for one in statuses:
