@@ -129,7 +129,7 @@ typedef struct walk {
 static uint32_t number_at(const walk *in, uint32_t at, uint32_t octets)
 {
     uint8_t read[4] = {0};
-    if (octets > 4 || at + octets > in->source.length ||
+    if (octets - 1 > 3 || at + octets > in->source.length ||
         teds_source_read(in->node, &in->source, at, read + 4 - octets, octets) != 0) {
         return UINT32_MAX;
     }
@@ -183,10 +183,10 @@ int teds_channel_fits(const teds_node *node, int place, uint64_t *period)
     in.width = number_at(&in, in.at - 1, 1);
     in.width = in.width >= 1 && in.width <= 4 ? in.width : 1;
     while (next_tuple(&in, &type, &value, &length)) {
-        if (type == 11 && length == 1) {
-            kind = number_at(&in, value, 1);
-        } else if (type == 36 && length == 1) {
-            halt = number_at(&in, value, 1);
+        if (type == 11) {
+            kind = number_at(&in, value, length);
+        } else if (type == 36) {
+            halt = number_at(&in, value, length);
         } else if (type == 23 && length == 4) {
             *period = period_of(number_at(&in, value, 4));
         } else if (type == 18) {
@@ -194,8 +194,8 @@ int teds_channel_fits(const teds_node *node, int place, uint64_t *period)
             within.at = value;
             within.end = value + length;
             while (next_tuple(&within, &type, &value, &length)) {
-                model = type == 40 && length == 1 ? number_at(&in, value, 1) : model;
-                octets = type == 41 && length == 1 ? number_at(&in, value, 1) : octets;
+                model = type == 40 ? number_at(&in, value, length) : model;
+                octets = type == 41 ? number_at(&in, value, length) : octets;
             }
         }
     }

@@ -250,6 +250,14 @@ class MemoryNode:
         """It has an antenna; before the start."""
         self._library.memory_nfc(self._board, ctypes.c_uint8(wt_int), ctypes.c_uint8(n_wait), ctypes.c_uint16(max_ndef))
 
+    def has_battery(self, flags: int, level: int) -> None:
+        """It has a battery; before the start."""
+        self._library.memory_battery(self._board, ctypes.c_uint8(flags), ctypes.c_uint8(level))
+
+    def is_in_the_air(self, address: bytes) -> None:
+        """It has BLE, and this address; before the start."""
+        self._library.memory_in_the_air(self._board, address)
+
     def nfc_field(self, present: bool) -> None:
         """A reader activates its tag, or the field is gone."""
         self._now()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -11,9 +12,10 @@ from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, room
 from teds_provision.node.nfc.tags import ATS, IsoDepTag, NdefApplication, Type4Memory
-from teds_provision.node.nfc.tnep import TnepTag
+from teds_provision.node.nfc.tnep import Extras, TnepTag, charge_records, out_of_band_record
 from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import Command, Function, security_command
+from teds_provision.protocol.operation.commands import Power
 from tests.firmware.memory_node import MemoryNode
 from tests.firmware.test_beside_python import Twins
 from tests.protocol.desk import CREDENTIALS, NODE, UUID
@@ -171,6 +173,37 @@ def test_both_tags_answer_a_random_reader_alike(taps: Callable[[int, int], Taps]
         for _ in range(100):
             talk(reader)
         assert reader.told > 60
+
+
+@pytest.mark.parametrize("address", [None, bytes.fromhex("c0ffee123456")], ids=["wired", "in the air"])
+@pytest.mark.parametrize("power", [(0, 50), (1, 0xFF), (1, 0), (1, 87), (5, 100), (3, 20), (None, 0)])
+def test_both_show_their_charge_and_where_they_are_in_the_air(
+    power: tuple[int | None, int], address: bytes | None
+) -> None:
+    flags, level = power
+    node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else bytes(size), lambda: 0.0, uuid=UUID)
+    node.has_nfc(max_ndef=160)
+    if flags is not None:
+        node.has_battery(flags, level)
+    if address is not None:
+        node.is_in_the_air(address)
+    assert node.start() == 0
+    charge = charge_records(Power(flags or 0, None if level == 0xFF else level))
+    extras = Extras(
+        before=lambda: charge,
+        after=lambda: (out_of_band_record(address, random=True),) if address is not None else (),
+    )
+    twins = Twins(1)
+    twins.memory.state = replace(twins.flash, can_address=node.can_address)
+    twins.restart()
+    mailbox = Mailbox(160)
+    tag = TnepTag(mailbox, TagHandler(twins.py), wt_int=4, n_wait=15, extras=extras)
+    tag.start()
+    node.nfc_field(True)
+    assert node.nfc_message().hex() == mailbox.shown.get().hex()
+    tag.stop()
+    node.close()
+    twins.c.close()
 
 
 def reader_frame(dice: random.Random, number: int, length: int) -> bytes:

@@ -595,6 +595,26 @@ void memory_nfc(memory_board *board, uint8_t wt_int, uint8_t n_wait, uint16_t ma
     board->config.nfc.max_ndef = max_ndef;
 }
 
+static void battery(void *user, teds_power *out)
+{
+    const memory_board *board = user;
+    out->flags = board->power[0];
+    out->level = board->power[1];
+}
+
+void memory_battery(memory_board *board, uint8_t flags, uint8_t level)
+{
+    board->power[0] = flags;
+    board->power[1] = level;
+    board->port.power = battery;
+}
+
+void memory_in_the_air(memory_board *board, const uint8_t address[6])
+{
+    memcpy(board->air, address, sizeof board->air);
+    board->config.ble_address = board->air;
+}
+
 void memory_nfc_field(memory_board *board, bool present)
 {
     teds_nfc_field(&board->node, present);

@@ -37,6 +37,7 @@ typedef struct memory_board {
     bool fd; /* how commands come */
 #if TEDS_NFC
     teds_isodep card;
+    uint8_t power[2], air[6]; /* flags and level of its battery; its BLE address */
 #endif
 } memory_board;
 
@@ -96,6 +97,9 @@ size_t memory_node_octets(void);
 #if TEDS_NFC
 /* Before the start: an antenna, and what the tag says of itself. */
 void memory_nfc(memory_board *board, uint8_t wt_int, uint8_t n_wait, uint16_t max_ndef);
+/* It has a battery with these flags and this level; an address in the air. Before the start. */
+void memory_battery(memory_board *board, uint8_t flags, uint8_t level);
+void memory_in_the_air(memory_board *board, const uint8_t address[6]);
 void memory_nfc_field(memory_board *board, bool present);
 bool memory_nfc_written(memory_board *board, const uint8_t *message, size_t length);
 size_t memory_nfc_message(const memory_board *board, uint8_t *out);
