@@ -29,7 +29,7 @@ from teds_provision.measure.blocks import Block
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
-from teds_provision.measure.running.job import MeasurementJob
+from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.described import create
 from teds_provision.node.hardware.board import Board

@@ -22,7 +22,7 @@ from click.shell_completion import (
 
 from teds_provision import station as station_room
 from teds_provision import teds
-from teds_provision.cli.configuration import home_of
+from teds_provision.cli.config_file import home_of
 from teds_provision.errors import TedsProvisionError
 from teds_provision.sanitize import printable
 

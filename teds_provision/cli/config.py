@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision.cli import completing
-from teds_provision.cli.configuration import (
+from teds_provision.cli.config_file import (
     anchored,
     config_path,
     parameter_of,

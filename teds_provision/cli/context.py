@@ -13,7 +13,7 @@ import click
 
 from teds_provision import protocol, vault
 from teds_provision import station as station_room
-from teds_provision.cli.configuration import home_of
+from teds_provision.cli.config_file import home_of
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize, sanitize_json

@@ -10,7 +10,7 @@ import click
 
 from teds_provision import doctor as doctor_room
 from teds_provision.cli.config import check_values
-from teds_provision.cli.configuration import config_path
+from teds_provision.cli.config_file import config_path
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.table import COMMANDS
@@ -19,7 +19,7 @@ from teds_provision.errors import BadData
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.doctor.registry import Finding
+    from teds_provision.doctor.checks import Finding
 
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
 
@@ -40,13 +40,13 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
     group = root.command
     settings = known_settings(group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    system = doctor_room.registry.System(
+    system = doctor_room.checks.System(
         app.home, nfc, can, ble, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root)
     )
-    found = list(doctor_room.registry.examine(system))
+    found = list(doctor_room.checks.examine(system))
     findings = [finding for _, finding in found]
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
-    code = doctor_room.registry.exit_code(found)
+    code = doctor_room.checks.exit_code(found)
     counts = {word: sum(one.result == word for one in findings) for word in _STYLES}
     app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
     app.note(", ".join(f"{count} {word}" for word, count in counts.items()) + ".")

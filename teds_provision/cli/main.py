@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import click
 
 from teds_provision import __version__
-from teds_provision.cli.configuration import Defaults, anchored, config_path, read_config
+from teds_provision.cli.config_file import Defaults, anchored, config_path, read_config
 from teds_provision.cli.context import App, nowhere, say
 from teds_provision.cli.option_names import PARAMETERS
 from teds_provision.cli.table import COMMANDS, SECTIONS

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from teds_provision.cli import measure_view
     from teds_provision.measure.request import Requirements
     from teds_provision.measure.runner import Ended
-    from teds_provision.measure.running.job import MeasurementJob
+    from teds_provision.measure.running.measurement_job import MeasurementJob
     from teds_provision.measure.sinks.mcap.recover import Recovered
     from teds_provision.station.station import Station
 else:  # loads the sinks and numpy
@@ -113,7 +113,7 @@ def measure(
     kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished | {"require": _requirements(require)})
     if group and duration is None:
         kept = _carried_on(app, station, kept)
-    job = measure_room.running.job.MeasurementJob(
+    job = measure_room.running.measurement_job.MeasurementJob(
         station, kept, request=measure_room.request.MeasurementRequest(timeout=links.timeout)
     )
     for uuid in uuids:
@@ -144,7 +144,7 @@ def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Map
         actuators=wished["actuators"] and (wished["ros1"] or wished["ros2"]),
         dead_man=wished["dead_man"],
         scalar_rate=wished["scalar_rate"],
-        sinks=tuple(measure_room.running.job.whole_path(spec) for spec in sinks),
+        sinks=tuple(measure_room.running.measurement_job.whole_path(spec) for spec in sinks),
         lasting=False,
         test_pattern=wished["test_pattern"],
         unsigned=wished["unsigned"],

@@ -61,7 +61,7 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
         )
     _require_channel(station, uuid, channel)
     if uuid != STATION:
-        topics = measure.sinks.names.Topics(measure.running.job.station_facts(station))
+        topics = measure.sinks.names.Topics(measure.running.measurement_job.station_facts(station))
         topics.learn(one for _, _, one in _channels(station))
         topics.require_free(uuid.hex(), channel, chosen)
     if not dry_run:
@@ -149,7 +149,7 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
 
 def _tell(app: App, station: Station) -> None:
     chosen = station.measurements.names
-    facts = measure.running.job.station_facts(station)
+    facts = measure.running.measurement_job.station_facts(station)
     topics = measure.sinks.names.Topics(facts)
     channels = _channels(station)
     topics.learn(one for _, _, one in channels)

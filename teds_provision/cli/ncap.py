@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from teds_provision import client, plant
-from teds_provision.cli.configuration import brokers_of, config_path
+from teds_provision.cli.config_file import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,

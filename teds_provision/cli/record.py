@@ -132,7 +132,7 @@ def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> 
     left: float = limit or (math.inf if app.json else SHOWN)
     for entry in recording.entries():
         summary.take(entry)
-        if left > 0 and (cut := recordings.selecting.first(entry, channels, left)) is not None:
+        if left > 0 and (cut := recordings.source.first_instants(entry, channels, left)) is not None:
             left -= len(cut.time)
             app.lines(list(_events(cut, summary) if app.json else _values(cut, summary)))
     if app.json:

@@ -37,7 +37,7 @@ def start(app: App, ctx: click.Context) -> None:
         }
     else:
         found = _of_service(app, station) or _of_links(station, _named(ctx))
-        waiting = doctor.fleet.nodes(doctor.registry.System(app.home))
+        waiting = doctor.fleet.nodes(doctor.checks.System(app.home))
         found["problems"] += [{"what": one.why, "fix": one.fix} for one in waiting if one.result == "warning"]
         found["next"] = _next(found)
     app.emit(found, lambda console: _print(console, found))

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision import teds
-from teds_provision.doctor.registry import Finding, System, check
+from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import BadData, NotFound, StoreChanged, StoreFailure, VaultFailure
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.doctor.registry import Finding, Result, System, check
+from teds_provision.doctor.checks import Finding, Result, System, check
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
 from teds_provision.links import can as can_room
 from teds_provision.links import nfc as nfc_room

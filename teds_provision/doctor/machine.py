@@ -13,7 +13,7 @@ from typing import Final
 
 from teds_provision import store as store_room
 from teds_provision import vault
-from teds_provision.doctor.registry import Finding, System, check
+from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import StoreFailure
 from teds_provision.lazy import install_command
 from teds_provision.store.database import has_store

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 
-from teds_provision.doctor.registry import Finding, System, check
+from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
 from teds_provision.store import Store
 from teds_provision.store.database import has_store

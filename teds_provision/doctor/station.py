@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision import vault as vault_room
-from teds_provision.doctor.registry import Finding, System, check
+from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import NoKeyring, NotFound, StoreFailure, VaultFailure
 from teds_provision.files import open_to_read
 from teds_provision.store import Choice, Store

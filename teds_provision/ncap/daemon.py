@@ -19,9 +19,9 @@ from teds_provision.ncap.live import Live
 from teds_provision.ncap.measuring import Measuring
 from teds_provision.ncap.names import Names
 from teds_provision.ncap.nodes.desk import Desk, Turns
+from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.holding import Holding
 from teds_provision.ncap.nodes.provisioning import Adopting, Provisioning
-from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.ncap.nodes.sheets import Sheets
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.nodes.watching import Watch

@@ -29,15 +29,15 @@ from teds_provision.measure.matching import Match, Of, Unsigned, why_not_measure
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
-from teds_provision.measure.running.job import MeasurementJob
+from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.sinks.base import BUDGET
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.newcomers import Newcomers
 from teds_provision.ncap.nodes.desk import Turns
+from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.looking import as_problem
-from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.station.station import Station

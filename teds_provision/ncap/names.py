@@ -8,10 +8,10 @@ from typing import Any
 
 from teds_provision.errors import Frozen, UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
-from teds_provision.measure.running.job import station_facts
+from teds_provision.measure.running.measurement_job import station_facts
 from teds_provision.measure.sinks.names import Topics, is_topic
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.roster import NodeDirectory
+from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.station.station import Station
 
 

@@ -23,11 +23,11 @@ from teds_provision.measure.keeper import NodeKeeper
 from teds_provision.measure.lookout import Lookout
 from teds_provision.measure.matching import Load, Match, Of, Unsigned, load_of, why_not_measured
 from teds_provision.measure.runner import Measurement
-from teds_provision.measure.running.job import MeasurementJob
+from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.sightings import Sighting
 from teds_provision.ncap.nodes.desk import Turns
+from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.looking import is_listed
-from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 

@@ -12,7 +12,7 @@ from typing import Any
 import click
 import pytest
 
-from teds_provision.cli.configuration import Defaults, anchored
+from teds_provision.cli.config_file import Defaults, anchored
 from teds_provision.cli.main import cli
 
 from .shell import call, clean_environment

@@ -12,7 +12,7 @@ OURS = {
     "teds_provision",
     "teds_provision.__main__",
     "teds_provision.cli",
-    "teds_provision.cli.configuration",
+    "teds_provision.cli.config_file",
     "teds_provision.cli.context",
     "teds_provision.cli.main",
     "teds_provision.cli.option_names",

@@ -9,7 +9,7 @@ from typing import Any
 import click
 import pytest
 
-from teds_provision.cli.configuration import Defaults
+from teds_provision.cli.config_file import Defaults
 from teds_provision.cli.options import link_options
 from teds_provision.cli.sample import over_the_bus
 from teds_provision.errors import TedsProvisionError

@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 
 import teds_provision.links
+from teds_provision.doctor import checks
 from teds_provision.doctor import machine as doctor_machine
-from teds_provision.doctor import registry
+from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code
 from teds_provision.doctor.links import READERS
-from teds_provision.doctor.registry import CHECKS, Finding, System, examine, exit_code
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.store import Draft, KeyRecord, Marks, NodeRecord, StationRecord, Store, StoreLock, WhitelistEntry
@@ -282,7 +282,7 @@ def test_a_check_that_breaks_is_a_finding_and_the_others_run(system: System, mon
         yield
 
     list(examine(system))
-    monkeypatch.setitem(registry.CHECKS, "clock", ("machine", broken))
+    monkeypatch.setitem(checks.CHECKS, "clock", ("machine", broken))
     found = by_name(system)
     assert (found["clock"].result, "fell over" in found["clock"].why) == ("failed", True)
     assert "keys folder" in found

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.ncap.nodes.roster import MOST_GONE, NodeDirectory
+from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, events
 from tests.ncap.service import Service, until, verdict

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.cli.configuration import brokers_of
+from teds_provision.cli.config_file import brokers_of
 from teds_provision.client import ApiError
 from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
 from teds_provision.ncap.sinks import DaemonSinks, for_readers

@@ -14,7 +14,7 @@ import pytest
 from teds_provision.errors import LinkFailure
 from teds_provision.ncap.nodes import watching
 from teds_provision.ncap.nodes.desk import Turns
-from teds_provision.ncap.nodes.roster import MOST_GONE, NodeDirectory
+from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
 from teds_provision.ncap.nodes.watching import MOST_KNOWN, Watch
 from tests.pace import until
 

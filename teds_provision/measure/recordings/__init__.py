@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.measure.recordings import converting, opening, selecting, source, summary
+    from teds_provision.measure.recordings import converting, opening, source, summary
 else:
     __getattr__ = lazy(__name__)

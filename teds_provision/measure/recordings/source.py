@@ -10,8 +10,8 @@ import fcntl
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -76,6 +76,28 @@ class Recording(ABC):
         if facts.key not in self.facts and len(self.facts) >= MOST.channels:
             raise BadData(f"{self.path} names more than {MOST.channels} channels.")
         self.facts.setdefault(facts.key, facts)
+
+
+def first_instants(entry: Entry, channels: Collection[int], most: float) -> Block | GroupRows | None:
+    """The first ``most`` instants of these channels (all where empty); None where the entry has none of them."""
+    if not isinstance(entry, Block | GroupRows):
+        return None
+    kept = [column for column, (_, number) in enumerate(entry.keys) if not channels or number in channels]
+    if not kept:
+        return None
+    n = int(min(most, len(entry.time)))
+    if isinstance(entry, GroupRows):
+        keys = tuple(entry.channels[column] for column in kept)
+        return replace(entry, channels=keys, time=entry.time[:n], value=entry.value[:n, kept], age=entry.age[:n, kept])
+    return replace(
+        entry,
+        channels=tuple(entry.channels[column] for column in kept),
+        time=entry.time[:n],
+        tick=entry.tick[:n],
+        raw=entry.raw[:n, kept],
+        value=entry.value[:n, kept],
+        valid=entry.valid[:n, kept],
+    )
 
 
 def is_locked(path: Path) -> bool:

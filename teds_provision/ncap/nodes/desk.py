@@ -16,7 +16,7 @@ from typing import Any, Final, Generic, TypeVar, cast
 from teds_provision.errors import Frozen, NodeBusy, NoNode, TedsProvisionError
 from teds_provision.links import Port
 from teds_provision.links.ports import Contact, Notice
-from teds_provision.ncap.nodes.roster import NodeDirectory
+from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 # One thing at a time with each node: sessions of this process share one address, and a second Open ends the first.

@@ -27,8 +27,8 @@ from teds_provision.errors import (
 from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk, Errand
+from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.looking import STRANGERS_TEDS, as_problem
-from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.lazy import late
 from teds_provision.ncap.nodes.desk import Desk
+from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.looking import read_anew
-from teds_provision.ncap.nodes.roster import NodeDirectory
 from teds_provision.station.station import Station
 from teds_provision.steps.build import guard
 from teds_provision.steps.document import SheetPlan, plan_sheet, write_sheet

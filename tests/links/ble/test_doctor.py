@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.doctor import links
-from teds_provision.doctor.registry import Finding, System
+from teds_provision.doctor.checks import Finding, System
 from teds_provision.links.ble.port import BlePort
 
 from .radio import Radio, needs_dbus

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.doctor import links as doctor
-from teds_provision.doctor.registry import System
+from teds_provision.doctor.checks import System
 from teds_provision.errors import LinkFailure, NodeSilent, UsageFailure
 from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame
