@@ -187,6 +187,7 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
     can->rx_length = (uint16_t)length;
     can->rx_at = (uint16_t)(frame->length - head);
     can->rx_number = 1;
+    can->rx_frame = frame->length;
     can->rx_block = TEDS_CAN_BLOCK;
     can->rx_until = now + CR_NS;
     memcpy(can->rx, frame->data + head, can->rx_at);
@@ -206,6 +207,9 @@ static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_f
     }
     if (number == ((can->rx_number + 15u) & 15u) && can->rx_at > 8) {
         return; /* the same frame twice: an error in its last bit doubles a frame on CAN */
+    }
+    if (frame->length > can->rx_frame || (frame->length < can->rx_frame && frame->length - 1u < octets)) {
+        return; /* only the last may be shorter than the first frame, none longer: ignored (ISO 15765-2) */
     }
     octets = octets < frame->length - 1u ? octets : frame->length - 1u;
     if (number != can->rx_number || now >= can->rx_until || octets == 0) {

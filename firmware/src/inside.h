@@ -167,7 +167,8 @@ int teds_make_blank(teds_node *node);
 /* Write a whole new state: the stored TEDS for which `keep` says so, all staged ones where `staged`. */
 typedef bool (*teds_keep)(const void *what, uint16_t id);
 int teds_store_write(teds_node *node, const teds_state *state, teds_keep keep, const void *what, bool staged);
-void teds_store_poll(teds_node *node);
+/* Erase the old slot where nobody waits for anything; when it is due again. */
+uint64_t teds_store_poll(teds_node *node, uint64_t now);
 
 /* -- commit.c ------------------------------------------------------------------------------------------------------ */
 int teds_commit(teds_node *node);

@@ -565,7 +565,8 @@ uint64_t teds_node_poll(teds_node *node, uint64_t now)
 #endif
     due = teds_can_poll(node, now);
     next = due < next ? due : next;
-    teds_store_poll(node);
+    due = teds_store_poll(node, now);
+    next = due < next ? due : next;
     due = teds_sessions_due(node);
     return due < next ? due : next;
 }

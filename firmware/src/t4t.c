@@ -174,18 +174,18 @@ size_t teds_isodep_block(teds_node *node, teds_isodep *card, const uint8_t *bloc
     if (length == 0 || length > 256) {
         return 0;
     }
-    pcb = block[0];
-    if ((pcb & 0xE2u) == 0x02u) {
+    pcb = block[0]; /* our ATS offers neither CID nor NAD: a block with one is for another card (ISO/IEC 14443-4, 7.1) */
+    if ((pcb & 0xEEu) == 0x02u) {
         return information(node, card, block, length, out);
     }
-    if ((pcb & 0xF6u) == 0xB2u) { /* R(NAK): our last block again, or "I heard nothing" */
+    if ((pcb & 0xFEu) == 0xB2u) { /* R(NAK): our last block again, or "I heard nothing" */
         if ((pcb & 1u) == card->number && card->last != 0) {
             return kept(card, out);
         }
         out[0] = (uint8_t)(0xA2u | card->number);
         return 1;
     }
-    if ((pcb & 0xF6u) == 0xA2u) { /* R(ACK): the next part of a chain */
+    if ((pcb & 0xFEu) == 0xA2u) { /* R(ACK): the next part of a chain */
         if ((pcb & 1u) == card->number) {
             return card->last != 0 ? kept(card, out) : 0;
         }
@@ -195,7 +195,7 @@ size_t teds_isodep_block(teds_node *node, teds_isodep *card, const uint8_t *bloc
         card->number ^= 1;
         return next_part(card, out);
     }
-    if ((pcb & 0xF7u) == 0xC2u) { /* S(DESELECT) */
+    if (pcb == 0xC2u) { /* S(DESELECT) */
         out[0] = pcb;
         return 1;
     }

@@ -249,18 +249,29 @@ int teds_make_blank(teds_node *node)
     return 0;
 }
 
-void teds_store_poll(teds_node *node)
+uint64_t teds_store_poll(teds_node *node, uint64_t now)
 {
     bool sends = teds_can_sending(node);
+    uint64_t due = TEDS_NEVER;
+#if TEDS_NFC
+    if (now < node->nfc.busy_until) {
+        sends = true;
+        due = node->nfc.busy_until;
+    }
+#else
+    (void)now;
+#endif
 #if TEDS_BLE
     for (int8_t i = 0; i < TEDS_REPLIES; i++) {
         sends = sends || teds_ble_sends(node, i);
     }
 #endif
-    if (node->old_slot_due && !sends) {
-        node->old_slot_due = false; /* where it fails, the next Write or start erases it */
-        (void)teds_make_blank(node);
+    if (!node->old_slot_due || sends) {
+        return node->old_slot_due ? due : TEDS_NEVER;
     }
+    node->old_slot_due = false; /* where it fails, the next Write or start erases it */
+    (void)teds_make_blank(node);
+    return TEDS_NEVER;
 }
 
 /* The record at `at`: 1, and `at` is behind it; 0 at the end; -1 where flash cannot be read, which is not the end. */

@@ -12,6 +12,7 @@
 #define ANSWER 1u
 #define MORE 2u
 #define STATUS_OCTETS 6u
+#define BUSY_NS TEDS_SECOND /* a tag does not hear when its answer was read: so long after it flash is not erased */
 enum { SUCCESS = 0x00, PROTOCOL_ERROR = 0x01, GARBLED = 0x80 };
 
 typedef struct piece {
@@ -262,6 +263,7 @@ static void forget(teds_node *node)
     node->nfc.answered = false;
     node->nfc.selected = false;
     node->nfc.stage = TEDS_NFC_QUIET;
+    node->nfc.busy_until = 0;
     teds_wipe(node->nfc.request, sizeof node->nfc.request);
 }
 
@@ -286,6 +288,7 @@ void teds_nfc_came(teds_node *node, size_t length)
 {
     node->nfc.stage = TEDS_NFC_WRITTEN;
     node->nfc.tick = teds_now(node);
+    node->nfc.busy_until = node->nfc.tick + BUSY_NS;
     node->nfc.came = (uint16_t)length;
     node->nfc.shows_initial = false;
     put(node, 0);
@@ -315,6 +318,7 @@ void teds_nfc_poll(teds_node *node)
     if (node->nfc.stage == TEDS_NFC_WRITTEN) {
         node->nfc.stage = TEDS_NFC_QUIET;
         answer(node, node->nfc.came);
+        node->nfc.busy_until = teds_now(node) + BUSY_NS;
     } else if (node->nfc.shows_initial) {
         uint8_t identity[23];
         teds_node_identify(node, identity);

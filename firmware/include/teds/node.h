@@ -198,7 +198,7 @@ typedef struct teds_can {
     uint8_t heard[30];
     /* the one long request that may be coming in */
     int8_t rx_line;
-    uint8_t rx_number, rx_block;
+    uint8_t rx_number, rx_block, rx_frame; /* rx_frame: octets of its first frame, and so of all but the last */
     uint16_t rx_length, rx_at;
     uint64_t rx_until;
 #if TEDS_OPERATION
@@ -221,7 +221,7 @@ typedef struct teds_nfc {
     uint8_t stage, opened, file_open;
     int8_t reply; /* the stored reply that is read in pieces */
     uint16_t transaction, total, held, answered_transaction, length, came;
-    uint64_t tick;
+    uint64_t tick, busy_until; /* busy_until: its reader has something to read, or will ask on */
     uint8_t shown[23]; /* the Identify that the initial message holds */
     uint8_t request[TEDS_MAX_MESSAGE];
     uint8_t file[2 + TEDS_MAX_NDEF]; /* NLEN, message */

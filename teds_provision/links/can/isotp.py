@@ -128,6 +128,8 @@ class Pair:
         kind = data[0] >> 4
         if kind == _CONSECUTIVE and data == self._last:
             return True  # the same frame twice: an error in its last bit doubles a frame on CAN
+        if kind == _CONSECUTIVE and self.receiving and not self._has_its_length(data):
+            return True
         self._last = data if kind == _CONSECUTIVE else b""
         if kind == _SINGLE and self.waits_for_flow:
             self.stop_sending()  # a refusal in place of a flow control, or a new question: can-isotp would wait on
@@ -140,6 +142,15 @@ class Pair:
         )
         self.run()
         return True
+
+    def _has_its_length(self, consecutive: bytes) -> bool:
+        """Whether it is as long as its first frame, or the last and shorter; ISO 15765-2 ignores all others.
+
+        can-isotp takes any classic one.
+        """
+        octets, first = len(consecutive), self._logic.actual_rxdl or 0
+        left = self._logic.rx_frame_length - len(self._logic.rx_buffer)
+        return octets == first or (octets < first and octets - 1 >= left)
 
     def _take_single(self, data: bytes) -> bool:
         """Take a message of one frame without the state machine; False where that has to see it."""

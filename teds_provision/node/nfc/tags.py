@@ -132,16 +132,16 @@ class IsoDepTag:
 
     def answer(self, block: bytes) -> bytes | None:
         """Return the block that answers ``block``, None for silence."""
-        pcb = block[0]
-        if pcb & 0xE2 == 0x02:
+        pcb = block[0]  # with CID or NAD, which our ATS does not offer, it is for another card (ISO/IEC 14443-4, 7.1)
+        if pcb & 0xEE == 0x02:
             return self._information_block(pcb, block[1:])
-        if pcb & 0xF6 == 0xB2:  # R(NAK): our last block again, or "I heard nothing"
+        if pcb & 0xFE == 0xB2:  # R(NAK): our last block again, or "I heard nothing"
             return self._last if pcb & 1 == self._number and self._last else bytes((0xA2 | self._number,))
-        if pcb & 0xF6 == 0xA2:  # R(ACK): the next part of a chain
+        if pcb & 0xFE == 0xA2:  # R(ACK): the next part of a chain
             return self._acknowledged(pcb & 1)
-        if pcb & 0xF7 == 0xF2 and self._pending is not None:
+        if pcb == 0xF2 and self._pending is not None:
             return self._run(self._pending)
-        if pcb & 0xF7 == 0xC2:
+        if pcb == 0xC2:
             self.deselected = True
             return bytes((pcb,))
         return None

@@ -337,6 +337,38 @@ static void the_old_slot_is_erased_when_the_reply_has_left(void)
     memory_free(board);
 }
 
+/* A tag does not hear that its answer was read, and a chip that erases answers no reader: not while one may ask on. */
+static void the_old_slot_is_erased_when_the_reader_is_quiet(void)
+{
+    static const uint8_t select[] = "\xd1\x02\x1fTs\x1eurn:nfc:xsn:teds-provision:tim";
+    for (int way = 0; way < 2; way++) {
+        memory_board *board = fresh();
+        uint64_t due;
+        memory_nfc(board, 4, 15, 0);
+        (void)memory_start(board);
+        memory_at(board, now);
+        memory_nfc_field(board, true);
+        CHECK(memory_nfc_written(board, select, sizeof select - 1), "a reader writes");
+        board->node.old_slot_due = board->node.free_slot_dirty = true;
+        memory_cut(board, 0, false);
+        due = memory_poll(board);
+        CHECK(memory_steps(board) == 0 && due == now + 1000 * MS, "its answer is there, and is to be read");
+        if (way == 0) {
+            now += 999 * MS;
+            memory_at(board, now);
+            (void)memory_poll(board);
+            CHECK(memory_steps(board) == 0, "not yet");
+            now = due;
+            memory_at(board, now);
+        } else {
+            memory_nfc_field(board, false);
+        }
+        due = memory_poll(board);
+        CHECK(memory_steps(board) == 1 && due == UINT64_MAX, "erased: %ld steps", memory_steps(board));
+        memory_free(board);
+    }
+}
+
 static uint8_t address_of(const memory_board *board)
 {
     uint8_t identity[23];
@@ -460,6 +492,7 @@ int main(void)
     everyone_is_answered_in_time_though_the_last_answer_waits();
     more_long_answers_than_room_cut_the_oldest_short();
     the_old_slot_is_erased_when_the_reply_has_left();
+    the_old_slot_is_erased_when_the_reader_is_quiet();
     a_new_address_counts_though_its_reply_is_lost();
     after_bus_off_it_is_silent_for_longer_and_longer();
     nodes_that_meet_sort_themselves_out();

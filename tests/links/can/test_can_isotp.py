@@ -118,6 +118,28 @@ def test_a_length_in_32_bits_that_12_bits_hold_is_nobodys(length: int, fd: bool)
     assert (Reassembly.begin(STATION, Frame(0, data, fd)) is None) == (length <= 4095)
 
 
+@pytest.mark.parametrize("octets", [2, 3, 7, 8, 12, 64])
+@pytest.mark.parametrize("first", [8, 12, 64])
+def test_a_consecutive_frame_as_long_as_none_can_be_is_ignored(first: int, octets: int) -> None:
+    """Only the last may be shorter than the first frame, and none longer; the good one goes on."""
+    fd, body = first > 8, bytes(range(100)) * 2
+    sent: list[Frame] = []
+    pair = Pair(NODE, STATION, sent.append)
+
+    def take(data: bytes) -> None:
+        pair.take(Frame(physical_id(NODE, STATION), data, fd))
+
+    take(b"\x10" + bytes([len(body)]) + body[: first - 2])
+    at, number = first - 2, 1
+    while at < len(body):
+        could_be_the_last = octets < first and octets - 1 >= len(body) - at
+        if octets != first and not could_be_the_last:
+            take(bytes([0x20 | number & 15]) + b"\xee" * (octets - 1))
+        take(bytes([0x20 | number & 15]) + body[at : at + first - 1])
+        at, number = at + first - 1, number + 1
+    assert pair.received() == body
+
+
 def test_a_second_first_frame_begins_again() -> None:
     wire = Wire()
     head = Frame(physical_id(NODE, STATION), bytes.fromhex("100a010203040506"))
