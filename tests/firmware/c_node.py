@@ -41,7 +41,7 @@ class CNode:
         words: list[object] = ["--flash", self.folder / "flash.bin", "--uuid", self.uuid]
         words += [*(["--nfc", links.nfc] if nfc else []), *(["--can", links.can] if can else [])]
         self.process = self.desk.start(*words, program=(str(builds.host()),), fork=False, **more)
-        (ready,) = self.process.wait_for_lines(1)
+        ready = self.process.wait_for_lines(1)[0]  # an actuator tells its state soon after
         assert ready.get("ready") is True, ready
         return self
 

@@ -41,7 +41,7 @@ class CNode:
         self.process = self.desk.start(
             *words, *options, program=(str(self.program),), fork=False, cwd=cwd or self.desk.folder
         )
-        (self.ready,) = self.process.wait_for_lines(1)
+        self.ready = self.process.wait_for_lines(1)[0]
         assert self.ready["ready"] is True
         assert self.ready["uuid"] == self.uuid
         return self

@@ -227,7 +227,7 @@ def test_a_running_ncap_lets_the_node_go_and_measures_it_by_its_new_zero(hall: H
                 channel = asked.node(angle.node.uuid)["channels"][0]
                 return channel["last"]["value"] if channel["last"] and channel["last"]["age"] < 1 else None
 
-            until(lambda: last() is not None)
+            until(lambda: last() is not None, lambda: str(asked.node(angle.node.uuid)))
             angle.turn("angle", 60_000)
             until(lambda: (last() or 0) > 0.1)
             assert hall.ask("calibrate", "zero", "angle", 1)["written"]
