@@ -129,16 +129,13 @@ def sign(
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
         if number > LAST_SEQUENCE:
             raise PolicyRefused("The sequence of this node is used up.")
-        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)  # a TimeInstance: two u32
-        if not 0 <= seconds < 1 << 32:
-            raise TedsProvisionError("The clock of this machine says what cannot be.", hint="Set it; see: doctor")
         unsigned = unsigned_datasheet(
             keys,
             credentials.key.point,
             credentials.station_signature,
             digests(image.blocks),
             ca=security.ca_hint(station.name, fingerprint(credentials.ca)),
-            last_modified=seconds.to_bytes(4, "big") + nanoseconds.to_bytes(4, "big"),
+            last_modified=_now(),
             sequence=number,
             key_epoch=epoch,
         )
@@ -170,3 +167,11 @@ def _sequence_if_the_same(station: Station, keys: SignedNodeKey, image: Image, o
         and signature_good(found, octets, keys.uuid)
     )
     return found.sequence if same else None
+
+
+def _now() -> bytes:
+    """TimeInstance of now: u32 s, u32 ns, UTC; raises TedsProvisionError where no u32 holds it."""
+    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+    if not 0 <= seconds < 1 << 32:
+        raise TedsProvisionError("The clock of this machine says what cannot be.", hint="Set it; see: doctor")
+    return seconds.to_bytes(4, "big") + nanoseconds.to_bytes(4, "big")
