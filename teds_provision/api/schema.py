@@ -95,12 +95,13 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
 def read(shape: type[Shape], octets: bytes) -> Shape:
     """A body of that shape; nothing at all counts as ``{}``. A member that is null is as one that is not there.
 
-    Raises BadRequest for what is not JSON (RFC 8259: no NaN, no half of a surrogate pair), for two members of one name
-    (section 4: each reader takes another of them, so what was checked in front of us is not what we would do), and for
-    what the schema forbids.
+    Raises BadRequest for what is not JSON (RFC 8259: UTF-8 alone, no byte order mark, no NaN, no half of a surrogate
+    pair), for two members of one name (section 4: each reader takes another of them, so what was checked in front of us
+    is not what we would do), and for what the schema forbids.
     """
     try:
-        value = json.loads(octets, object_pairs_hook=_unique, parse_constant=_no_constant) if octets else {}
+        text = octets.decode()
+        value = json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant) if text else {}
         json.dumps(value, ensure_ascii=False).encode()
     except BadRequest:
         raise

@@ -49,6 +49,8 @@ else:
 
 MOST: Final = 1000  # lines that may wait for somebody to read them
 LEAVING: Final = 2.0  # seconds for them to leave at the end
+_MOMENTS: Final = frozenset({"time", "since", "started", "until", "tapped"})
+"""Members of events and of the status that are moments."""
 _NEEDED = ("starlette", "uvicorn", "websockets")
 _FILE = FileToRead(exists=True)
 
@@ -205,10 +207,27 @@ class DaemonLog:
     def _write(self, event: dict[str, Any]) -> None:
         with suppress(OSError, ValueError):
             if self._app.json:
-                sys.stdout.write(to_json(event) + "\n")
+                sys.stdout.write(to_json(_dated(event)) + "\n")
                 sys.stdout.flush()
             else:
                 self._app.note(_sentence(event))
+
+
+def _dated(told: Any) -> Any:
+    """What the API tells, its moments as everywhere on the command line: ISO 8601 in place of unix seconds."""
+    if isinstance(told, list):
+        return [_dated(one) for one in told]
+    if not isinstance(told, dict):
+        return told
+    return {key: _moment(one) if key in _MOMENTS and _is_number(one) else _dated(one) for key, one in told.items()}
+
+
+def _is_number(one: Any) -> bool:
+    return isinstance(one, int | float) and not isinstance(one, bool)
+
+
+def _moment(unix: float) -> str:
+    return f"{datetime.fromtimestamp(unix, UTC).replace(tzinfo=None).isoformat(timespec='milliseconds')}Z"
 
 
 def _sentence(event: dict[str, Any]) -> str:
@@ -242,7 +261,7 @@ def status(app: App) -> None:
     """Show what the running base station is doing."""
     with client.connect(home=app.home) as station:
         found = {**station.status(), "nodes": station.nodes()}
-    app.emit(found, lambda console: _status(console, found))
+    app.emit(_dated(found), lambda console: _status(console, found))
 
 
 def _status(console: Console, found: dict[str, Any]) -> None:

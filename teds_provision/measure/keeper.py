@@ -289,6 +289,7 @@ class NodeKeeper:
         plans = self._subscribe(bus, trusted, channels, address) if channels else Plans((), 0.0)
         periods = plans.periods()
         self._events.facts([trusted.facts(one, periods.get(one.number)) for one in (*channels, *actuators)])
+        self.streams.described()
         if actuators:
             self._driven = self._take_up(bus, trusted, actuators, address)
         notes = [plans.slowed] if plans.slowed else []

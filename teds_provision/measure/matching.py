@@ -128,12 +128,12 @@ class Of:
 
 def why_not_measured(station: Station, uuid: bytes) -> str:
     """Why a node cannot be measured whatever is asked for; "" where it can, if its datasheet holds in the session."""
-    if not station.keys.held(uuid):
-        return "no key of it is held here"
+    banned = station.policy.denied(uuid, None)
+    if banned is not None:  # which takes its keys away, too
+        return f"it was revoked: {banned.why}"
     if station.policy.tombstone(uuid) is not None:
         return "its key was given away"
-    banned = station.policy.denied(uuid, None)
-    return f"it was revoked: {banned.why}" if banned is not None else ""
+    return "" if station.keys.held(uuid) else "no key of it is held here"
 
 
 @dataclass(frozen=True)

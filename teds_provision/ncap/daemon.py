@@ -366,9 +366,12 @@ class Daemon:
         return made.as_json()
 
     def drop_virtual(self, uuid: str) -> None:
-        """End one, and its key with it; raises NotFound, Frozen while it is measured."""
-        if self.measuring.of(uuid) is not None:
-            raise Frozen(f"Node {uuid} is being measured.", hint="End the measurement first.")
-        self.virtuals.remove(uuid)
-        self.roster.note(uuid, "left", present=False)
+        """End one, and its key with it; raises NotFound, Frozen (it is measured), NodeBusy (it is worked on)."""
+        with self.turns.of(uuid, "it is removed"):
+            with self.station.lock("virtual"):  # nobody begins to measure it meanwhile
+                if self.measuring.of(uuid) is not None:
+                    raise Frozen(f"Node {uuid} is being measured.", hint="End the measurement first.")
+                one = self.virtuals.forget(uuid)
+            self.virtuals.end(one)
+            self.roster.note(uuid, "left", present=False)
         self.roster.refresh()

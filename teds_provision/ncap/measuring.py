@@ -64,6 +64,7 @@ class Running:
     state: str = "starting"
     why: str = ""
     reports: dict[str, dict[str, Any]] = field(default_factory=dict)
+    past: set[str] = field(default_factory=set)  # whose reports say nothing of now
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
 
@@ -236,6 +237,7 @@ class Measuring:
         with self._station.lock("measure"):  # of two requests at once for one node, or its group, one is refused
             for uuid in self._station.measurements.nodes_of(kept):
                 self._require_unmeasured(uuid)
+                self._require_plan(uuid, kept)  # it may have been removed meanwhile
             with self._station.durable("measure"):
                 kept = self._station.measurements.keep(kept)
                 self._station.audit(
@@ -403,11 +405,14 @@ class Measuring:
     def clock_error(self) -> float | None:
         """The worst bound of a node's clock, seconds; None where nothing is measured."""
         with self._guard:
-            found = [report.get("clock_error") for one in self._running.values() for report in one.reports.values()]
+            reports = [report for one in self._running.values() for report in one.reports.values()]
+        found = [report.get("clock_error") for report in reports if report["state"] == "running"]
         return max((one for one in found if one is not None), default=None)
 
     def _json(self, one: Running) -> dict[str, Any]:
         kept = one.kept
+        with self._guard:
+            left = [uuid for uuid in one.reports if uuid not in one.past] if one.newcomers is not None else []
         return {
             "id": kept.id,
             "group": kept.group,
@@ -426,7 +431,7 @@ class Measuring:
             "why": one.why,
             "nodes": [
                 one.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""})
-                for uuid in dict.fromkeys((*one.uuids, *(one.reports if one.newcomers is not None else ())))
+                for uuid in dict.fromkeys((*one.uuids, *left))
             ],
             "files": [str(file) for sink in (one.job.sinks if one.job is not None else ()) for file in sink.files],
         }
@@ -523,6 +528,7 @@ class Measuring:
         def joined(uuid: str) -> None:
             with self._guard:
                 one.uuids = (*one.uuids, uuid)
+                one.past.discard(uuid)
             self._roster.note(uuid, measurement=one.kept.id)
             if unverified:  # signed later, it is measured on by the other of the two that unverified() begins
                 self._adopted.add(bytes.fromhex(uuid))
@@ -534,7 +540,13 @@ class Measuring:
             if there:
                 self._roster.note(uuid, "idle", measurement=None, report=None)
 
+        def past(uuid: str) -> None:
+            with self._guard:
+                one.past.add(uuid)
+
         def waiting(uuid: str, why: str) -> None:
+            with self._guard:
+                one.past.discard(uuid)
             one.reports[uuid] = {"uuid": uuid, "state": "waiting", "why": why}
             self._live.event("measurement", state="waiting", id=one.kept.id, uuid=uuid, why=why)
 
@@ -554,6 +566,7 @@ class Measuring:
                 joined=joined,
                 left=left,
                 waiting=waiting,
+                past=past,
                 budget=BUDGET if live else None,
                 rows=any(sink.wants_rows for sink in live),
             )
@@ -631,13 +644,17 @@ class Measuring:
             facts |= {"present": True, "seen": time.time(), "problem": None}
             if before.get("state") != "running":
                 facts |= {"heard": None, "looked": time.time()}  # in a session: what it said outside one is past
-        elif said.state in ("lost", "refused", "waiting") and said.why:
+        elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, one):
             facts["problem"] = as_problem(TedsProvisionError(said.why))
         if changed:
             self._roster.refresh([said.uuid])
         self._roster.note(said.uuid, said.state if changed else None, **facts)
         if changed and one.job is not None and not one.stop.is_set() and one.newcomers is None:
             self._say(one, *_state_of(one, one.job))
+
+    def _is_of(self, uuid: str, one: Running) -> bool:
+        """Whether a node is this measurement's, or nobody's: what one that it has left says of it is past."""
+        return self.of(uuid) in (None, one.kept.id)
 
     def _tell_who_comes(self, one: Running, said: NodeReport, before: str | None) -> None:
         """An event for each node that begins to be measured, is not any more, or waits, and why."""

@@ -75,7 +75,8 @@ class _Member:
 class Newcomers:
     """Who is in, who waits, and why; :meth:`work` is called again and again by the measurement's thread.
 
-    ``joined`` and ``left`` are told each node (UUID in hex), ``waiting`` each that cannot join, and why.
+    ``joined`` and ``left`` are told each node (UUID in hex), ``waiting`` each that cannot join, and why; ``past`` each
+    that is meant no more, or waited and has gone: what was told of it is of no use to anybody.
     ``elsewhere``: whether another measurement has a node; ``listed``: whether the whitelist alone is measured.
     ``budget`` is how many messages a second may go to topics, None where none do; ``rows``: arrays go to them too.
     """
@@ -94,6 +95,7 @@ class Newcomers:
         joined: Callable[[str], None],
         left: Callable[[str], None],
         waiting: Callable[[str, str], None],
+        past: Callable[[str], None],
         budget: float | None,
         rows: bool,
     ) -> None:
@@ -101,6 +103,7 @@ class Newcomers:
         self._match, self._elsewhere, self._listed, self._budget = match, elsewhere, listed, budget
         self._rows = rows
         self._told_joined, self._told_left, self._told_waiting = joined, left, waiting
+        self._told_past = past
         self.news, self._anew = threading.Event(), threading.Event()
         self._guard = threading.Lock()
         self._members: dict[str, _Member] = {}
@@ -109,6 +112,7 @@ class Newcomers:
         self._waits: dict[str, _Waits] = {}
         self._lost: dict[str, _Lost] = {}
         self._others: set[str] = set()  # who is meant, and was another measurement's when it answered
+        self._left: set[str] = set()  # who is not in, and of whom something was told
         self._places: dict[str, Sighting] = {}  # where each was measured, or was to be
         self._version: object = None
         self._welcomed, self._followed = -WELCOMING, -FOLLOWING
@@ -247,6 +251,8 @@ class Newcomers:
             why = self._why_not(uuid)
             if why and member.keeper is not None:
                 member.keeper.stop(why)
+        for uuid in [uuid for uuid in self._left if self._why_not(uuid)]:
+            self._is_past(uuid)
         mended = [
             uuid for uuid, waits in self._waits.items() if waits.room is None
         ]  # it may be, what it was refused for
@@ -297,12 +303,14 @@ class Newcomers:
             return
         self._lost.pop(uuid, None)
         self._waits.pop(uuid, None)
+        self._left.discard(uuid)
         self._told_joined(uuid)
         member.keeper = measurement.join(octets)
 
     def _wait(self, uuid: str, why: str, room: float | None, seconds: float = AGAIN) -> None:
         self._release(uuid)
         if uuid not in self._waits:
+            self._left.add(uuid)
             self._told_waiting(uuid, why)
         self._waits[uuid] = _Waits(time.monotonic() + seconds, room)
 
@@ -326,6 +334,8 @@ class Newcomers:
             self.saw(uuid)
         elif error is not None and last is not None:
             self._lost[uuid] = _Lost(last, now, now + FIRST_ASK)
+        if self._why_not(uuid):
+            self._is_past(uuid)
 
     def _release(self, uuid: str) -> None:
         with self._guard:
@@ -336,7 +346,12 @@ class Newcomers:
         for bus in self._buses.all():
             bus.share.leave(bytes.fromhex(uuid))
         self._turns.give(uuid)
+        self._left.add(uuid)
         self._told_left(uuid)
+
+    def _is_past(self, uuid: str) -> None:
+        self._left.discard(uuid)
+        self._told_past(uuid)
 
     def _try_again(self, now: float) -> None:
         with self._guard:
@@ -351,6 +366,8 @@ class Newcomers:
                 del self._waits[uuid]
                 if self._roster.seen(uuid).present:
                     self.saw(uuid)
+                else:
+                    self._is_past(uuid)
         for uuid, lost in list(self._lost.items()):
             if uuid in self._members or now - lost.since > ASKED:
                 del self._lost[uuid]

@@ -26,7 +26,7 @@ _BROKER: Final = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}\Z")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._ -]{0,80}\Z")
 _USER: Final = re.compile(r"([a-z]+://)[^\s/@]*@")
 _QUERY: Final = re.compile(r"([a-z]+://[^\s?]*)\?\S*")
-_FOLDERS: Final = re.compile(r"(?<![^\s'\"(=])/(?!api/v1/)(?:[^/\s'\"]+/)+")
+_FOLDERS: Final = re.compile(r"(?<![^\s'\"(=:])/(?!api/v1/)(?:[^/\s'\"]+/)+")
 
 
 class DaemonSinks:

@@ -22,6 +22,8 @@ _LIKE_A_UUID = re.compile(r"(0x)?[0-9a-fA-F]{4,}\Z")
 LONGEST = 64
 ALL = "all"
 """Means every node that comes (``ncap run --measure all``): no group is called so."""
+_NO_PATHS: Final = (".", "..")
+"""Groups are paths of the API, where a browser takes these two away."""
 _SHOWN: Final = 10
 _CREATE: Final = "teds-provision group create NAME UUID …"
 
@@ -55,10 +57,11 @@ class Groups:
 
     def create(self, name: str, uuids: Sequence[bytes]) -> Group:
         """Make a group, or give the one that is there back where it has the same members; raises UsageFailure."""
-        if not name.strip() or not name.isprintable() or len(name) > LONGEST or _LIKE_A_UUID.match(name) or name == ALL:
+        forbidden = name in (ALL, *_NO_PATHS) or _LIKE_A_UUID.match(name)
+        if forbidden or not name.strip() or not name.isprintable() or len(name) > LONGEST:
             raise UsageFailure(
                 f"{name!r} cannot be the name of a group.",
-                hint="Use up to 64 characters, not hex digits alone; all means every node.",
+                hint="Use up to 64 characters, not hex digits or dots alone; all means every node.",
             )
         present = self._store.group(name)
         if present is not None and set(present.uuids) != set(uuids):

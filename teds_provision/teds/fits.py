@@ -174,11 +174,16 @@ def _fit_of(requirement: Requirement, channel: Channel, now: datetime | None) ->
         elif term.what == "uncertainty" and now is not None and channel.overdue(now):
             short.append(f"its calibration was due on {channel.due:%Y-%m-%d}")
     if short:
-        return Fit(channel.number, channel.name, "failed", "; ".join(short + unknown) + ".")
+        return Fit(channel.number, channel.name, "failed", _sentence(short + unknown))
     if unknown:
-        return Fit(channel.number, channel.name, "skipped", "; ".join(unknown) + ".")
+        return Fit(channel.number, channel.name, "skipped", _sentence(unknown))
     shown = (f"{term.what} {_shown(term, _has(term, channel), channel)}" for term in requirement.terms)
     return Fit(channel.number, channel.name, "passed", ", ".join(dict.fromkeys(shown)) + ".")
+
+
+def _sentence(parts: Iterable[str]) -> str:
+    """Half sentences, and whole ones, as one."""
+    return f"{'; '.join(part.removesuffix('.') for part in parts)}."
 
 
 def _has(term: Term, channel: Channel) -> float:

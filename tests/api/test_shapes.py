@@ -81,6 +81,14 @@ def test_equal_keys_are_refused_at_every_depth(text: str) -> None:
         read(bodies.Detection, text.encode())
 
 
+@pytest.mark.parametrize("form", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-le", "latin-1"])
+def test_a_body_is_utf_8_without_a_byte_order_mark(form: str) -> None:
+    text = '{"name": "pr\u00fcfstand", "uuids": []}'
+    assert read(bodies.NewGroup, text.encode()).name == "pr\u00fcfstand"
+    with pytest.raises(BadRequest, match="not valid JSON"):
+        read(bodies.NewGroup, text.encode(form))
+
+
 def test_a_member_that_is_null_is_as_one_that_is_not_there() -> None:
     assert read(bodies.NewVirtual, b'{"profile": "gripper", "name": null}') == bodies.NewVirtual(profile="gripper")
     with pytest.raises(BadRequest, match="'mode' must be"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +39,36 @@ def test_a_group_whose_datasheets_suffice_together_is_measured(hall: Hall, tmp_p
     lines = hall.measure(*uuids, "--rate", 10, "--duration", 1, "--require", file)
     assert of(lines, hall.nodes["a"].uuid)
     assert {fit["result"] for fit in lines[-1]["fits"] if fit["channel"] is not None} == {"passed"}
+
+
+LATE = """
+import runpy, sys, time
+from teds_provision.measure.runner import Measurement
+told = Measurement._describe
+Measurement._describe = lambda self, facts: (time.sleep(1), told(self, facts))[1]
+sys.argv[0] = "teds-provision"
+runpy.run_module("teds_provision", run_name="__main__")
+"""
+
+
+def test_no_value_is_handed_on_before_it_is_known_what_it_means(hall: Hall, tmp_path: Path) -> None:
+    """On a busy machine data came before the sinks knew the channels: a part without units, a topic without a mark."""
+    file, uuids = tmp_path / "run.csv", {"a": hall.nodes["a"].uuid, "u": hall.nodes["u"].uuid}
+    late = {"program": (sys.executable, "-c", LATE), "fork": False}
+    words = ("--rate", 100, "--duration", 2, "--unsigned", "--to", file)
+    lines = hall.measure(*uuids.values(), *words, "--to", file.with_suffix(".jsonl"), **late)
+    parts = [Path(one).read_text().splitlines() for one in lines[-1]["files"] if one.endswith(".csv")]
+    facts = [json.loads(line.partition(": ")[2]) for part in parts for line in part if line.startswith("# channel: ")]
+    assert facts
+    for one in facts:
+        assert one["unsigned"] if one["uuid"] == uuids["u"] else one["fingerprint"], one
+    rows = [row for part in parts for row in csv.DictReader(line for line in part if not line.startswith("#"))]
+    assert {row["note"] for row in rows if row["uuid"] == uuids["u"]} == {"unsigned datasheet"}
+    for name, uuid in uuids.items():
+        indices = [int(row["index"]) for row in rows if row["uuid"] == uuid]
+        assert indices == sorted(set(indices)), f"what was held back of {name} comes in its order"
+        assert all(line.get("unsigned", False) is (name == "u") for line in of(lines, uuid))
+        assert of(lines, uuid)[0]["name"] == "angle"
 
 
 def test_a_requirement_that_one_of_them_lacks_stops_all_before_anything_is_claimed(hall: Hall, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 import signal
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -155,6 +156,12 @@ def verified(service: Service, uuid: str) -> dict[str, Any]:
                 uuid,
             )
         )
+
+
+def unix(line: dict[str, Any]) -> float:
+    """When a line of the daemon was written, in unix seconds."""
+    assert line["time"].endswith("Z"), line
+    return datetime.fromisoformat(line["time"]).timestamp()
 
 
 def verdict(node: dict[str, Any]) -> str | None:

@@ -151,6 +151,8 @@ def test_unverified_ones_are_measured_calibrated_and_everything_says_so(desk: De
         after = until(lambda: flowing(asked.node(node.uuid)))
         assert after["channels"][0]["topic"] == "/bench/joint/angle"
         assert not after["unverified"]
+        assert after["problem"] is None
+        until(lambda: {one["id"]: len(one["nodes"]) for one in asked.measurements()} == {"unverified": 0, "adopted": 1})
     assert told(service, node) == [("unverified", "joined"), ("unverified", "left"), ("adopted", "joined")]
     service.end()
     texts = {file.name.split("-")[0]: file.read_text() for file in record.glob("*.csv")}
@@ -178,6 +180,9 @@ def test_one_that_is_adopted_by_a_command_beside_goes_on_as_what_is_trusted(desk
         service.station.ask("provision", node.uuid, "--adopt", "--yes", *desk.links.over("can"))
         until(lambda: asked.node(node.uuid)["measurement"] in ("run", "adopted"), seconds=AGAIN)
         until(lambda: flowing(asked.node(node.uuid)))
+        of_unverified = lambda: next(one for one in asked.measurements() if one["id"] == "unverified")  # noqa: E731
+        until(lambda: of_unverified()["nodes"] == [], of_unverified)
+        until(lambda: asked.node(node.uuid)["problem"] is None)
     left = [one for one in events(service, "measurement", node.uuid) if one["state"] == "left"]
     assert left[0]["id"] == "unverified"
     service.end()

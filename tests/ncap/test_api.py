@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Barrier
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 
@@ -333,7 +334,11 @@ def test_names_are_given_kept_and_taken_back(asked: Client, hand: str) -> None:
     assert asked.node(hand)["channels"][1]["topic"] == "/left/opening"
     refused(asked, 422, "usage", "PUT", "/names", {**row, "channel": 3})
     refused(asked, 422, "usage", "PUT", "/names", {**row, "name": "1/2"})
+    assert "Channels in its datasheet: 1, 2, 3" in refused(
+        asked, 404, "not-found", "PUT", "/names", {**row, "channel": 77, "name": "left/other"}
+    )
     asked.request("PUT", "/names", {**row, "name": None})
+    asked.request("PUT", "/names", {"uuid": hand, "channel": 77, "name": None})
     assert asked.node(hand)["channels"][1]["topic"] == "/bench/hand/opening"
 
 
@@ -352,6 +357,13 @@ def test_groups_are_made_changed_and_deleted(asked: Client, hand: str) -> None:
     assert asked.node(hand)["groups"] == ["both"]
     refused(asked, 422, "usage", "POST", "/groups", {"name": "abcd", "uuids": []})
     refused(asked, 422, "usage", "POST", "/groups", {"name": "all", "uuids": [hand]})
+    for name in (".", ".."):  # a browser takes these two out of a path, so its page could never delete such a group
+        refused(asked, 422, "usage", "POST", "/groups", {"name": name, "uuids": [hand]})
+    for name in ("a/b", "/a", "a/", "a//b", "a/../b", "./a", "...", "%2e", "a?b#c", " a", "\u00e9\u4e2d"):
+        asked.request("POST", "/groups", {"name": name, "uuids": [hand]})
+        path = f"/groups/{quote(name, safe='')}"
+        asked.request("PUT", path, {"uuids": []})
+        assert [one["name"] for one in asked.request("DELETE", path)["groups"]] == ["both"]
     refused(asked, 404, "not-found", "PUT", "/groups/none", {"uuids": []})
     assert asked.request("DELETE", "/groups/both")["groups"] == []
     refused(asked, 404, "not-found", "DELETE", "/groups/both")
@@ -368,13 +380,42 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
     assert (verdict(node), node["virtual"], len(node["channels"])) == ("authentic", True, 3)
     assert {one["name"] for one in asked.request("GET", "/virtual")["virtual"]} == {"hand", "copy"}
     asked.request("DELETE", f"/virtual/{made['uuid']}")
-    until(lambda: asked.node(made["uuid"])["present"] is False)
+    gone = until(lambda: (node := asked.node(made["uuid"]))["present"] is False and node)
+    assert (gone["name"], gone["retired"], gone["whitelisted"]) == (None, "decommissioned", False)
+    refused(asked, 422, "refused", "POST", "/measurements", {"uuids": [made["uuid"]]})
+    asked.request("DELETE", f"/virtual/{virtual(service, 'load-cell', 'copy')}")
     refused(asked, 404, "not-found", "DELETE", f"/virtual/{made['uuid']}")
     refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "source": "exec:true"})
     taken = refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "noise"})
     assert f"Node {hand} already has the name 'hand'." in taken
     refused(asked, 422, "bad-request", "POST", "/virtual", {"source": "noise"})
     refused(asked, 404, "not-found", "POST", "/virtual", {"profile": "no-such-type", "source": "noise"})
+
+
+def test_a_virtual_transducer_is_either_measured_or_removed(service: Service, asked: Client, hand: str) -> None:
+    """Between the look whether it is measured and its end, a measurement of it began that could never run."""
+    callers, together = [service.client() for _ in range(2)], Barrier(2)
+
+    def ask(caller: Client, method: str, path: str, body: Any) -> int:
+        together.wait()
+        try:
+            caller.request(method, path, body)
+        except ApiError as error:
+            return error.status
+        return 200
+
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(3):
+            uuid = virtual(service, "load-cell", "short")
+            begun = pool.submit(ask, callers[0], "POST", "/measurements", {"uuids": [uuid]})
+            ended = pool.submit(ask, callers[1], "DELETE", f"/virtual/{uuid}", None)
+            there = [one["uuids"] for one in (begun.result(), asked.measurements())[1]]
+            assert (begun.result(), ended.result(), there) in ((200, 409, [[uuid]]), (422, 200, []))
+            for one in asked.measurements():
+                asked.end_measurement(one["id"])
+            if ended.result() == 409:
+                until(lambda uuid=uuid: asked.node(uuid)["measurement"] is None)
+                asked.request("DELETE", f"/virtual/{uuid}")
 
 
 def test_the_mode_that_holds_already_forgets_nobody(asked: Client, hand: str) -> None:

@@ -21,12 +21,14 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from teds_provision.errors import StoreFailure
+from teds_provision.ncap.nodes.directory import for_reader
+from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import answer_error
 from teds_provision.ncap.web.guard import CALLER, Caller, Guard, Message, Receive, Refusal, Scope, Send
 from teds_provision.ncap.web.tokens import Tokens
 from tests.e2e.desk import PASSPHRASE, Desk
 from tests.ncap.service import Answer, Service, virtual
-from tests.pace import PATIENCE
+from tests.pace import PATIENCE, until
 
 pytestmark = pytest.mark.link
 JSON = {"Content-Type": "application/json"}
@@ -196,6 +198,32 @@ def test_a_read_only_token_learns_no_folder_from_an_error() -> None:
     assert "/home/me/bench/" in told(read_only=False)["message"]
     assert told(read_only=True)["message"] == "The store store.sqlite3 cannot be used: the disk is full."
     assert told(read_only=True)["hint"] == "See /api/v1/x."
+
+
+def test_a_read_only_token_learns_no_folder_from_a_node_or_a_source() -> None:
+    message = "The store /home/me/bench/store.sqlite3 cannot be used: the disk is full."
+    node = {"name": "a/b", "topic": "/bench/hand", "problem": {"message": message}, "measuring": {"why": message}}
+    told = "The store store.sqlite3 cannot be used: the disk is full."
+    assert for_reader(node) == node | {"problem": {"message": told}, "measuring": {"why": told}}
+    assert for_reader(node | {"problem": None, "measuring": None})["problem"] is None
+    assert for_readers(["file:/home/me/day.csv", "unix:/run/me/feed"]) == ["file:day.csv", "unix:feed"]
+
+
+def test_a_token_that_may_only_read_is_shown_what_went_wrong_without_its_folder(desk: Desk) -> None:
+    service = Service(desk, desk.station()).start()
+    feed = desk.folder / "feed.csv"
+    feed.write_text("t,value\n0,1\n")
+    with service.client() as asked:
+        asked.request("POST", "/virtual", {"profile": "load-cell", "name": "one", "source": f"file:{feed}"})
+        [uuid] = [one["uuid"] for one in asked.request("GET", "/virtual")["virtual"]]
+        until(lambda: uuid in [one["uuid"] for one in asked.nodes()])
+    reader = {"Authorization": f"Bearer {service.token('reader', '--read-only')}"}
+    for path in ("/virtual", "/nodes", f"/nodes/{uuid}", "/status", "/measurements", "/log", "/profiles", "/names"):
+        answer = service.raw("GET", f"/api/v1{path}", reader)
+        assert answer.status == 200, path
+        assert str(desk.folder) not in answer.text, path
+    assert '"file:feed.csv"' in service.raw("GET", "/api/v1/virtual", reader).text
+    service.end()
 
 
 def test_a_token_that_is_removed_is_refused_at_once(service: Service) -> None:

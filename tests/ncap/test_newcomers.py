@@ -17,7 +17,7 @@ from teds_provision.client import ApiError
 from teds_provision.links.ports import free_port
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk, Node
-from tests.ncap.service import Service, virtual
+from tests.ncap.service import Service, unix, virtual
 from tests.pace import best_of, until
 from tests.places import free_bus, ros_domain
 
@@ -169,9 +169,9 @@ def test_a_node_that_is_carried_to_another_bus_of_the_station_goes_on_there_at_o
         lab.flows(right)
         with lab.service.client() as asked:
             assert str(asked.node(right.uuid)["link"]).startswith(f"can:{bus or lab.desk.links.can}")
-        went, came = (one["time"] for one in lab.told(right.uuid)[-2:])
-        present = [one["time"] for one in lab.lines() if one.get("state") == "came" and one["uuid"] == right.uuid]
-        return float(max(went, came) - present[-1])
+        went, came = map(unix, lab.told(right.uuid)[-2:])
+        present = [unix(one) for one in lab.lines() if one.get("state") == "came" and one["uuid"] == right.uuid]
+        return max(went, came) - present[-1]
 
     best_of(4, 2.5, carried)
     best_of(4, 2.5, carried)
@@ -279,6 +279,7 @@ def test_whom_a_person_revokes_leaves_and_the_others_stay(lab: Lab) -> None:
     assert (lab.states(left), lab.states(right)) == (["joined"], ["joined"])
     with lab.service.client() as asked:
         assert third.uuid not in asked.measurements()[0]["uuids"]
+        until(lambda: third.uuid not in [one["uuid"] for one in asked.measurements()[0]["nodes"]])
     lab.service.end()
     third.kill()
     lab.nodes.remove(third)
@@ -444,8 +445,8 @@ def test_a_node_that_this_very_process_provisions_is_measured_at_once(desk: Desk
     def provisioned() -> float:
         uuid = virtual(service)
         until(lambda: "joined" in [one["state"] for one in lines_of(service) if one.get("uuid") == uuid])
-        mine = {one["state"]: one["time"] for one in reversed(lines_of(service)) if one.get("uuid") == uuid}
-        return float(mine["joined"] - mine["came"])
+        mine = {one["state"]: unix(one) for one in reversed(lines_of(service)) if one.get("uuid") == uuid}
+        return mine["joined"] - mine["came"]
 
     best_of(3, 3.0, provisioned)
     service.end()

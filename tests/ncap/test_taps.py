@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import threading
 from typing import Any
@@ -9,12 +10,14 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError
+from teds_provision.ncap.nodes.desk import Errand
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk
 from tests.ncap.service import Service, verdict
 from tests.pace import until
 
 pytestmark = pytest.mark.link
+CURVE = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
 
 
 def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> None:
@@ -71,6 +74,51 @@ def test_a_request_that_could_not_begin_is_none_that_runs(desk: Desk) -> None:
         temporary.mkdir()
         assert asked.request(*begin, {"profile": ANGLE})["state"] == "waiting"
     service.end()
+
+
+def test_a_request_whose_work_the_system_refuses_has_failed(desk: Desk) -> None:
+    """It was "running" until the next start, and every further request for the node was refused."""
+    temporary = desk.folder / "tmp"
+    temporary.mkdir()
+    service = Service(desk, desk.station()).start(
+        "--nfc", desk.links.nfc, environment=clean_environment(TMPDIR=str(temporary))
+    )
+    node = desk.node("angle")
+    order = {"profile": ANGLE, "calibration": CURVE, "calibration_name": "angle.csv"}
+    with service.client() as asked:
+        path = f"/nodes/{node.uuid}/provision"
+        assert asked.request("POST", path, order)["state"] == "waiting"
+        for folder in temporary.iterdir():  # a cleaner of old temporary files came by
+            shutil.rmtree(folder)
+        node.start()
+        run = until(lambda: (found := asked.request("GET", path))["state"] in ("failed", "done") and found)
+        assert run["state"] == "failed"
+        node.stop()
+        until(lambda: not asked.node(node.uuid)["present"])
+        assert asked.request("POST", path, order)["state"] == "waiting"
+        node.start()
+        assert (
+            until(lambda: (found := asked.request("GET", path))["state"] in ("failed", "done") and found)["verdict"]
+            == "authentic"
+        )
+    service.end()
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(OSError(errno.EIO, "Input/output error"), "store"), (ZeroDivisionError(), "bug")]
+)
+def test_whoever_waits_for_an_errand_learns_of_any_failure(error: Exception, code: str) -> None:
+    node: Any = None
+
+    def work(_node: Any) -> None:
+        raise error
+
+    errand = Errand("ab" * 10, "provision", work, 0.0)
+    with pytest.raises(type(error)):
+        errand.run(node)
+    assert errand.done.is_set()
+    assert errand.error is not None
+    assert errand.error.code == code
 
 
 def test_the_next_board_that_is_tapped_is_provisioned_whichever_it_is(desk: Desk) -> None:

@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import LinkFailure
+from teds_provision.measure.blocks import NodeReport
+from teds_provision.ncap.measuring import Measuring, Running
 from teds_provision.ncap.nodes import watching
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
@@ -183,3 +185,24 @@ def test_a_reader_that_is_not_there_keeps_no_command_waiting(reader: Watch, monk
         assert reader.borrow(reader)
         reader.give_back(reader)
     assert time.monotonic() - began < watching.LENDING / 2
+
+
+def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(watch: Watch) -> None:
+    """Each reports once a second: an adopted node was measured, and shown with "Its datasheet is signed now"."""
+    nothing: Any = None
+    uuid, roster = "ab" * 10, watch._roster
+    measuring = Measuring(nothing, roster, watch._live, Turns(), nothing, nothing, nothing)
+    newcomers: Any = object()
+    left, has = (
+        Running(SimpleNamespace(id=name), uuids, newcomers)  # type: ignore[arg-type]
+        for name, uuids in (("unverified", ()), ("adopted", (uuid,)))
+    )
+    measuring._running = {"unverified": left, "adopted": has}
+    measuring._report(has, NodeReport(uuid, "running"))
+    for _ in range(2):
+        measuring._report(left, NodeReport(uuid, "refused", "Its datasheet is signed now"))
+        assert roster.seen(uuid).problem is None
+    measuring._report(has, NodeReport(uuid, "lost", "No message of the node came for 2.1 s"))
+    problem = roster.seen(uuid).problem
+    assert problem is not None
+    assert problem["message"] == "No message of the node came for 2.1 s"

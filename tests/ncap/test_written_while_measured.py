@@ -17,6 +17,7 @@ import pytest
 from teds_provision import client
 from teds_provision.errors import PolicyRefused
 from tests.e2e.desk import ANGLE, Desk
+from tests.ncap.service import unix
 from tests.ncap.test_survives import Lab
 from tests.pace import best_of, until
 
@@ -99,7 +100,7 @@ def test_write_and_address_have_the_node_let_go_too(lab: Lab) -> None:
         lab.flows()
         assert lab.state()["address"] == other
         left, joined = told(lab)[-2:]
-        return float(joined["time"] - left["time"])
+        return unix(joined) - unix(left)
 
     best_of(3, 4.0, moved)  # not when its old address was given up, 10 s later
     lab.service.end()

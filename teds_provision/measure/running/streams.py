@@ -80,15 +80,40 @@ class NodeStreams:
         self.mapping = threading.Lock()
         self.running: dict[int, HeardStream] = {}
         self.totals: dict[int, StreamTotals] = {}
-        self._host, self._deliver = host, deliver
+        self._host, self._hand_on = host, deliver
+        self._held: list[Block] | None = None  # what comes before its channels were described
+        self._gate = threading.Lock()
         self._run = 0  # the session's last
         self._monotone: dict[int, Monotone] = {}
 
     def new_session(self) -> None:
-        """Nothing is known of the node's clock: it may have started anew. Runs begin at 1 again."""
+        """Nothing is known of the node's clock: it may have started anew. Runs begin at 1 again.
+
+        Values are held back until :meth:`described`.
+        """
         self._run = 0
+        with self._gate:
+            self._held = []
         with self.mapping:
             self.clock = ClockMap()
+
+    def described(self) -> None:
+        """Every sink knows the channels: what was held back is handed on, and all that comes.
+
+        On a busy machine values come before the thread that subscribed gets to tell whose they are. They were recorded
+        without unit and calibration then, and published without the mark of a datasheet that nobody signed.
+        """
+        with self._gate:
+            held, self._held = self._held or [], None
+            for block in held:
+                self._hand_on(block)
+
+    def _deliver(self, block: Block) -> None:
+        with self._gate:
+            if self._held is None:
+                self._hand_on(block)
+            else:
+                self._held.append(block)
 
     def tell_time(self, trusted: Trusted) -> Clock:
         """One Clock: sends and waits without the map's lock, which the hearing thread needs."""

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar, cast
 
-from teds_provision.errors import Frozen, NodeBusy, NoNode, TedsProvisionError
+from teds_provision.errors import Bug, Frozen, NodeBusy, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.links import Port
 from teds_provision.links.ports import Contact, Notice
 from teds_provision.ncap.nodes.directory import NodeDirectory
@@ -82,6 +82,14 @@ Result = TypeVar("Result")
 FOR_A_TAP: Final = 45.0  # seconds that a request waits for a tap
 ON_A_BUS: Final = 10.0
 
+
+def untold(error: Exception) -> TedsProvisionError:
+    """What a thread tells of an exception that is none of ours: the disk's, or a bug."""
+    if isinstance(error, OSError):
+        return StoreFailure(f"The system refused: {error.strerror or type(error).__name__}.", hint="See the log.")
+    return Bug(f"Unexpected {type(error).__name__}.", hint="This is a bug: see the daemon's log.")
+
+
 PortOf = Callable[[str], Port | None]
 
 
@@ -106,6 +114,9 @@ class Errand(Generic[Result]):
             self.error = lost.cause
         except TedsProvisionError as error:
             self.error = error
+        except Exception as error:
+            self.error = untold(error)  # else whoever waits takes it for done
+            raise
         finally:
             self.done.set()
 

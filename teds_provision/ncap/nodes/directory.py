@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from teds_provision.api.operations import MOST_NODES
 from teds_provision.ncap.live import Live
+from teds_provision.ncap.sinks import for_readers
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.inventory import with_verdicts
@@ -65,7 +66,7 @@ class NodeDirectory:
         self._own_names: dict[str, str] = {}  # as the datasheet of each says
         self.changes = 0  # grows with each change of a node's name or datasheet
         self._strangers: dict[str, set[str]] = {}
-        self._texts: dict[str, tuple[tuple[int, int], str]] = {}
+        self._texts: dict[str, dict[bool, tuple[tuple[int, int], str]]] = {}  # and whether for who may only read
 
     # -- the store ---------------------------------------------------------------------------------------------------
 
@@ -202,24 +203,27 @@ class NodeDirectory:
         """The first ``most`` of them; those that are there come first."""
         return [self.node(uuid) for uuid in self.uuids()[:most]]
 
-    def nodes_text(self, most: int = MOST_NODES, offset: int = 0) -> str:
-        """The answer of GET /nodes as JSON; what did not change since is not put together again."""
+    def nodes_text(self, most: int = MOST_NODES, offset: int = 0, *, reader: bool = False) -> str:
+        """The answer of GET /nodes as JSON; what did not change since is not put together again.
+
+        ``reader``: who asks may only read.
+        """
         uuids = self.uuids()
-        shown = ",".join(map(self._text, uuids[offset : offset + most]))
+        shown = ",".join(self._text(uuid, reader) for uuid in uuids[offset : offset + most])
         return f'{{"nodes":[{shown}],"total":{len(uuids)}}}'
 
-    def _text(self, uuid: str) -> str:
+    def _text(self, uuid: str, reader: bool) -> str:
         with self._lock:
             seen = self._seen.get(uuid)
             key = (self.changes, seen.version if seen is not None else 0)
-            known = self._texts.get(uuid)
+            known = self._texts.get(uuid, {}).get(reader)
         if known is not None and known[0] == key:
             return known[1]
-        node = self.node(uuid)
+        node = for_reader(self.node(uuid)) if reader else self.node(uuid)
         text = json.dumps(node, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
         if all(one["last"] is None and one["actuator"] is None for one in node["channels"]):  # else it ages
             with self._lock:
-                self._texts[uuid] = key, text
+                self._texts.setdefault(uuid, {})[reader] = key, text
         return text
 
     def touch(self) -> None:
@@ -294,6 +298,11 @@ class NodeDirectory:
         age = max(0.0, time.time() - last.time)
         value = last.value if last.value is None or math.isfinite(last.value) else None
         return {"value": value, "raw": last.raw, "valid": value is not None, "time": last.time, "age": round(age, 3)}
+
+
+def for_reader(node: dict[str, Any]) -> dict[str, Any]:
+    """A node as a token that may only read is shown it: what went wrong names no file of this machine."""
+    return node | {name: for_readers(node[name]) for name in ("problem", "measuring")}
 
 
 def channel_facts(one: Channel) -> dict[str, Any]:

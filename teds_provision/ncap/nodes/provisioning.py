@@ -6,6 +6,7 @@ lies on the reader. A node on a wired bus is provisioned there where it takes th
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import threading
 import time
@@ -26,7 +27,7 @@ from teds_provision.errors import (
 )
 from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.desk import Desk, Errand
+from teds_provision.ncap.nodes.desk import Desk, Errand, untold
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.looking import STRANGERS_TEDS, as_problem
 from teds_provision.ncap.nodes.virtual import Virtuals
@@ -45,6 +46,7 @@ from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.progress import Silent, StepResult
 from teds_provision.teds.formats import placed
 
+_log = logging.getLogger(__name__)
 WAITING: Final = 300.0  # seconds for a tap
 NEXT: Final = "next"
 _SUFFIXES: Final = (".csv", ".json", ".toml", ".txt")
@@ -209,6 +211,10 @@ class Provisioning:
             self._wait_for_a_tap(run, work, clean)
         except TedsProvisionError as error:
             self._fail(run, as_problem(error))
+            clean()
+        except Exception as error:  # noqa: BLE001 - a thread that ends without a word leaves a run that never ends
+            _log.exception("Provisioning node %s failed.", run.uuid)
+            self._fail(run, as_problem(untold(error)))
             clean()
 
     def _work(self, run: Run, node: Conversation, order: BuildOrder) -> None:

@@ -25,6 +25,7 @@ from typing import Any, Final
 
 from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.files import write_whole
+from teds_provision.handover.life import DECOMMISSIONED
 from teds_provision.links.ports import free_port
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.settings import own_source, with_source
@@ -209,17 +210,25 @@ class Virtuals:
         path = self._virtual_of(uuid).folder / "datasheet"
         return path.read_text(encoding="utf-8") if path.exists() else None
 
-    def remove(self, uuid: str) -> None:
-        """End it, and its key with it; raises NotFound."""
-        one = self._virtual_of(uuid)
+    def forget(self, uuid: str) -> Virtual:
+        """It is none of the station's any more, and still runs until :meth:`end`; raises NotFound."""
+        one, octets, station = self._virtual_of(uuid), bytes.fromhex(uuid), self._station
+        with station.durable("virtual"):
+            station.pins.remove(octets)
+            station.keys.remove(octets)  # the node's own copy goes with its folder: nothing could be opened with it
+            station.nodes.drop_draft(octets)
+            if station.nodes.get(octets) is not None:  # its name is free again
+                station.nodes.remember(octets, name=None, groups=(), retired=DECOMMISSIONED)
+            station.audit("virtual", octets, "removed")
         with self._guard:
             self._all.pop(uuid, None)
+        return one
+
+    def end(self, one: Virtual) -> None:
+        """End the process of one that was forgotten, and its key with it."""
         _end(one.process)
-        with self._station.durable("virtual"):
-            self._station.pins.remove(bytes.fromhex(uuid))
-            self._station.audit("virtual", bytes.fromhex(uuid), "removed")
         shutil.rmtree(one.folder, ignore_errors=True)
-        self._live.event("virtual", state="removed", uuid=uuid)
+        self._live.event("virtual", state="removed", uuid=one.uuid)
 
     def _virtual_of(self, uuid: str) -> Virtual:
         with self._guard:

@@ -27,6 +27,7 @@ from teds_provision.api.operations import (
 from teds_provision.errors import NotFound, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.measuring import LONGEST_LOAN, Loan
+from teds_provision.ncap.nodes.directory import for_reader
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import body_of, changing, moving, reading
 from teds_provision.ncap.web.guard import CALLER, Caller
@@ -240,13 +241,16 @@ class Resources:
         """GET /nodes: ``limit`` of them from ``offset`` on, and ``total``."""
         limit = _integer(request, "limit", MOST_NODES, MOST_NODES)
         offset = _integer(request, "offset", 0, FURTHEST, least=0)
-        text = await asyncio.to_thread(self._daemon.roster.nodes_text, limit, offset)
+        caller: Caller = request.scope[CALLER]
+        text = await asyncio.to_thread(self._daemon.roster.nodes_text, limit, offset, reader=caller.read_only)
         return Response(text, media_type="application/json")
 
     async def node(self, request: Request) -> Response:
         """GET /nodes/UUID."""
         uuid = await self._node_of(request)
-        return JSONResponse(await asyncio.to_thread(self._daemon.roster.node, uuid))
+        node = await asyncio.to_thread(self._daemon.roster.node, uuid)
+        caller: Caller = request.scope[CALLER]
+        return JSONResponse(for_reader(node) if caller.read_only else node)
 
     async def past(self, request: Request) -> Response:
         """GET /nodes/UUID/past: the last hour of a channel."""
@@ -281,7 +285,7 @@ class Resources:
         uuid = word if word == "next" else await self._uuid_of_a_label(word)
         runs = self._daemon.provisioning
         if body is None:
-            return JSONResponse(await asyncio.to_thread(runs.of, uuid))
+            return _shown(request, await asyncio.to_thread(runs.of, uuid))
         if body.cancel:
             return JSONResponse(await changing(runs.cancel, uuid))
 
@@ -362,7 +366,7 @@ class Resources:
     async def virtual(self, request: Request) -> Response:
         """GET, POST /virtual."""
         if request.method == "GET":
-            return JSONResponse({"virtual": self._daemon.virtuals.all()})
+            return _shown(request, {"virtual": self._daemon.virtuals.all()})
         body = await body_of(request, bodies.NewVirtual)
         source = body.source or "noise"
         caller: Caller = request.scope[CALLER]
