@@ -424,9 +424,12 @@ static void after_bus_off_it_is_silent_for_longer_and_longer(void)
         CHECK(out(board, &identifier, data) == 8 && identifier == (0x1CFF0000u | OWN), "and has announced itself");
     }
     now += 60000 * MS;
+    memory_at(board, now);
     teds_node_bus_off(&board->node);
     teds_can_start(&board->node, now);
-    now += 1000 * MS;
+    now += 999 * MS;
+    CHECK(!identified(board), "and again silent");
+    now += MS;
     CHECK(identified(board), "a minute on the bus, and it begins with a second again");
     memory_free(board);
 }
@@ -479,6 +482,319 @@ static void a_classic_frame_has_eight_octets_at_most(void)
     memory_free(board);
 }
 
+static const char FOR_NOBODY[] = "\x02\x01\x00";
+
+/* Frames of whom the profile does not know, and of other nodes. */
+static void what_is_not_for_this_node_is_left_alone(void)
+{
+    static const uint32_t identifiers[] = {0x18DA2100u, 0x18DA21F0u, 0x18DA21F8u, 0x18DA22F1u, 0x18EF22F1u,
+                                           0x18EF21F1u, 0x18FF00F1u, 0x18DBFEF1u, 0x1CFF2101u, 0x00000021u};
+    memory_board *board = fresh();
+    for (size_t i = 0; i < sizeof identifiers / sizeof identifiers[0]; i++) {
+        in(board, identifiers[i], "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+        in(board, identifiers[i], "\x07\x2a\x00\x00\x80\x07\x00", 7, false);
+        CHECK(silent(board), "%08x", (unsigned)identifiers[i]);
+    }
+    in(board, 0x18DBFFF1u, "\x06\x2a\x00\x00\x80\x07\x00", 7, false);
+    in(board, 0x18DBFFF1u, "\x10\x08\x2a\x00\x00\x80\x07\x00", 8, false);
+    now += 50 * MS;
+    CHECK(silent(board), "nothing but Identify is asked of everyone");
+    CHECK(identified(board), "it is there");
+    memory_free(board);
+}
+
+static void no_frame_of_a_message_is_shorter_but_the_last(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    in(board, TO_NODE, "\x10\x14\x05\x00\x00\x01\x02\x00", 8, false);
+    (void)out(board, &identifier, data);
+    in(board, TO_NODE, "\x21\x0d\x80\x00\x00", 5, false);
+    in(board, TO_NODE, "\x21\x0d\x80\x00\x00\x00\x00\x01", 8, false);
+    in(board, TO_NODE, "\x22\x01\x02\x03\x04\x05\x06", 7, false);
+    in(board, TO_NODE, "\x22\x01\x02\x03\x04\x05\x06\x07", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x05\x00\x00\x01\x04", 6) == 0, "a Read: 4");
+    in(board, TO_NODE, "\x10\x0a\x06\x00\x00\x01\x02\x00\x05\x80\x00\x00", 12, true);
+    CHECK(silent(board), "would fit one frame of FD");
+    memory_free(board);
+}
+
+static void one_station_does_not_cut_into_another_s_question(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    in(board, TO_NODE, "\x10\x14\x05\x00\x00\x01\x02", 7, false);
+    CHECK(silent(board), "a first frame has 8 octets");
+    asks_for_much(board);
+    (void)out(board, &identifier, data);
+    in(board, TO_NODE + 1, "\x21\x05\x80\x00\x00\x00\x00\xcc", 8, false);
+    CHECK(silent(board), "another's frame is not of this question");
+    rest_of_question(board);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && (identifier >> 8 & 0xFF) == 0xF1, "its answer");
+    in(board, TO_NODE, "\x1f\xff\x77\x00\x00\x01\x03\x00", 8, true);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x77\x00\x00\x01\x0a", 6) == 0,
+          "while it answers, a question that is too long is refused, and classic as the answer is");
+    memory_free(board);
+    board = fresh();
+    asks_for_much(board);
+    (void)out(board, &identifier, data);
+    in(board, TO_NODE, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && data[2] == 0x2a, "a new question ends the one before");
+    rest_of_question(board);
+    in(board, TO_NODE, "\x30\x00\x00", 3, false);
+    while (out(board, &identifier, data) == 8) {
+        CHECK(data[0] >> 4 == 2, "the rest of Identify and nothing else");
+    }
+    asks_for_much(board);
+    (void)out(board, &identifier, data);
+    now += 1001 * MS;
+    in(board, TO_NODE + 1, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "what never ended makes room");
+    memory_free(board);
+}
+
+static void any_flow_control_is_borne(void)
+{
+    static const struct {
+        const char *frame;
+        uint8_t length, wait; /* ms until the second frame; 0: it goes on waiting, 255: given up */
+    } rows[] = {
+        {"\x30\x00", 2, 0},        {"\x35\x00\x00", 3, 0}, {"\x32\x00\x00", 3, 255}, {"\x30\x00\xfa", 3, 127},
+        {"\x30\x00\x80", 3, 127}, {"\x30\x00\xff", 3, 127}, {"\x30\x00\x03", 3, 3},   {"\x30\x00\x7f", 3, 127},
+    };
+    for (size_t i = 0; i < sizeof rows / sizeof rows[0]; i++) {
+        memory_board *board = fresh();
+        uint32_t identifier;
+        uint8_t data[64];
+        asks_for_much(board);
+        (void)out(board, &identifier, data);
+        rest_of_question(board);
+        (void)out(board, &identifier, data);
+        in(board, TO_NODE, rows[i].frame, rows[i].length, false);
+        if (rows[i].wait == 0 || rows[i].wait == 255) {
+            CHECK(silent(board), "row %u", (unsigned)i);
+            in(board, TO_NODE, "\x30\x00\x00", 3, false);
+            CHECK(silent(board) == (rows[i].wait == 255), "row %u: then a good one", (unsigned)i);
+        } else {
+            CHECK(out(board, &identifier, data) == 8, "row %u: the first", (unsigned)i);
+            now += rows[i].wait * MS - 1;
+            CHECK(silent(board), "row %u: too soon", (unsigned)i);
+            now += 1;
+            CHECK(out(board, &identifier, data) == 8, "row %u: the second", (unsigned)i);
+        }
+        memory_free(board);
+    }
+}
+
+/* Four stations' answers are under way, and there is room for no fifth line; of lines at rest the oldest gives way. */
+static void a_fifth_station_is_heard_when_a_line_is_at_rest(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    for (uint8_t i = 0; i < 4; i++) {
+        in(board, 0x18DBFFF1u + i, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    }
+    now += 50 * MS;
+    for (uint8_t i = 0; i < 4; i++) {
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "answer %u begins", i);
+    }
+    in(board, 0x18DBFFF5u, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
+    in(board, 0x18DA21F5u, "\x07\x2c\x00\x00\x80\x07\x00\x00", 8, false);
+    now += 50 * MS;
+    CHECK(silent(board), "no line for a fifth");
+    in(board, 0x18DBFFF1u, "\x07\x2d\x00\x00\x80\x07\x00\x00", 8, false);
+    in(board, 0x18DA21F1u, "\x30\x00\x0a", 3, false);
+    now += 60 * MS;
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x21, "an answer that is taken up goes on");
+    now += 1100 * MS;
+    (void)memory_poll(board);
+    for (uint8_t i = 0; i < 7; i++) {
+        now += 10 * MS;
+        in(board, 0x18DA21F1u + i, "\x07\x2e\x00\x00\x80\x03\x00\x00", 8, false);
+        while (out(board, &identifier, data) == 8 && (identifier >> 8 & 0xFF) != 0xF1u + i) {
+        }
+        CHECK((identifier >> 8 & 0xFF) == 0xF1u + i, "station %u, one after another", i);
+    }
+    memory_free(board);
+}
+
+/* Everyone's question beside a station's own: its answer comes first. */
+static void everyone_waits_for_a_station_s_own_answer(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    asks_for_much(board);
+    (void)out(board, &identifier, data);
+    rest_of_question(board);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && data[2] == 0x05, "its answer begins");
+    in(board, 0x18DBFFF1u, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    now += 60 * MS;
+    CHECK(silent(board), "everyone's waits");
+    in(board, TO_NODE, "\x30\x00\x00", 3, false);
+    for (int frames = 0; frames < 35; frames++) {
+        CHECK(out(board, &identifier, data) == 8 && data[0] >> 4 == 2, "the rest of its answer");
+    }
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && data[2] == 0x2a, "then everyone's");
+    memory_free(board);
+}
+
+/* 128.10, and its station asks on before the reply was fetched: the node has moved, and is at the old address no more. */
+static void who_asks_on_after_a_move_asks_nobody(void)
+{
+    memory_board *board = fresh();
+    in(board, TO_NODE, "\x00\x08\x2a\x00\x00\x80\x0a\x00\x01\x55\xcc\xcc", 12, true);
+    in(board, TO_NODE, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(silent(board), "nobody");
+    CHECK(address_of(board) == 0x55, "it is at %02x", address_of(board));
+    memory_free(board);
+}
+
+static void a_move_waits_for_its_own_reply(void)
+{
+    static const uint8_t command[7] = {0, 0, 128, 10, 0, 1, 0x55};
+    static uint8_t reply[TEDS_MAX_MESSAGE];
+    memory_board *board = fresh();
+    CHECK(memory_handle(board, 1, TEDS_AT_NFC, true, command, 7, reply) == 3, "128.10 at the reader");
+    memory_reply_left(board, 0xF1);
+    memory_lost(board, 0xF2);
+    CHECK(address_of(board) == OWN, "others' replies and links are not its own");
+    memory_reply_left(board, 1);
+    CHECK(address_of(board) == 0x55, "its reply has left");
+    memory_free(board);
+}
+
+static void a_chip_without_randomness_answers_everyone_at_once(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    memory_chip_fails(board, 1);
+    in(board, 0x18DBFFF1u, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "at once");
+    memory_free(board);
+}
+
+static void an_announce_that_is_none_moves_nobody(void)
+{
+    static const struct {
+        const char *octets;
+        uint8_t length;
+    } rows[] = {
+        {"\x01\x00\x00\x00\x00\x01\x00", 7},
+        {"\x02\x00\x00\x00\x00\x01\x00\x00", 8},
+        {"\x01\x03\x00\x00\x00\x01\x00\x00", 8},
+    };
+    memory_board *board = fresh();
+    uint8_t own[8] = {1, 0};
+    teds_put32(own + 2, teds_crc32(0, (const uint8_t *)"\x01\x02\x03\x04\x05\x06\x07\x08\x09\x0a", 10));
+    in(board, 0x1CFF0000u | OWN, (const char *)own, 8, false); /* its own, given back, or its twin */
+    for (size_t i = 0; i < sizeof rows / sizeof rows[0]; i++) {
+        in(board, 0x1CFF0000u | OWN, rows[i].octets, rows[i].length, false);
+    }
+    now += 100 * MS;
+    CHECK(silent(board) && address_of(board) == OWN, "it stays, and says nothing");
+    for (uint32_t address = 1; address <= 239; address++) {
+        in(board, 0x18DAF100u | address, FOR_NOBODY, 3, false);
+    }
+    in(board, 0x1CFF0000u | OWN, "\x01\x00\x00\x00\x00\x01\x00\x00", 8, false);
+    CHECK(address_of(board) == OWN, "where every address is taken it stays");
+    memory_free(board);
+}
+
+static void a_board_that_cannot_be_is_told_at_the_start(void)
+{
+    memory_board *board = fresh();
+    const teds_port good = board->port;
+    const struct {
+        uint8_t unit;
+        uint32_t slot, identity;
+        bool antenna;
+        uint16_t ndef;
+        int said;
+    } rows[] = {
+        {8, good.slot_octets, 192, true, 0, 0},         {0, good.slot_octets, 256, false, 0, TEDS_E_USAGE},
+        {33, good.slot_octets, 256, false, 0, TEDS_E_USAGE}, {12, good.slot_octets, 256, false, 0, TEDS_E_USAGE},
+        {8, TEDS_STAGING + 255, 256, false, 0, TEDS_E_USAGE}, {8, good.slot_octets, 191, false, 0, TEDS_E_USAGE},
+        {8, good.slot_octets, 256, true, 159, TEDS_E_USAGE}, {8, good.slot_octets, 256, true, 160, 0},
+        {8, good.slot_octets, 256, false, 159, 0},
+    };
+    for (size_t i = 0; i < sizeof rows / sizeof rows[0]; i++) {
+        board->port.unit = rows[i].unit;
+        board->port.slot_octets = rows[i].slot;
+        board->port.identity_octets = rows[i].identity;
+        board->config.nfc.present = rows[i].antenna;
+        board->config.nfc.max_ndef = rows[i].ndef;
+        CHECK(memory_start(board) == rows[i].said, "row %u", (unsigned)i);
+    }
+    memory_free(board);
+}
+
+static void a_key_that_cannot_be_made_ahead_is_made_when_it_is_due(void)
+{
+    memory_board *board = fresh();
+    memory_chip_fails(board, 1);
+    CHECK(!teds_idle_work(&board->node), "nothing was done");
+    memory_chip_fails(board, 0);
+    CHECK(teds_idle_work(&board->node), "made");
+    CHECK(!teds_idle_work(&board->node), "one is enough");
+    CHECK(teds_node_missed(&board->node) == 0, "no data message was missed");
+    memory_free(board);
+}
+
+/* What the chip's stack tells of connections that are none. */
+static void a_connection_that_is_none_does_nothing(void)
+{
+    static const uint8_t begins[10] = {0, 5, 0, 8, 0, 0, 0, 0, 128, 7}, goes_on[10] = {0, 6, 0, 8, 0, 4, 0, 0, 0, 0};
+    memory_board *board = fresh();
+    uint8_t data[512];
+    memory_ble_connected(board, TEDS_BLE_CONNECTIONS, 247);
+    memory_ble_connected(board, 255, 247);
+    memory_ble_mtu(board, 1, 247);
+    memory_ble_disconnected(board, 1);
+    memory_ble_hears(board, 1, true);
+    memory_ble_written(board, 1, begins, sizeof begins);
+    memory_ble_driven(board, 1, begins, sizeof begins);
+    CHECK(!memory_ble_drops(board, 1) && memory_ble_notify(board, 1, data) == 0, "not there");
+    memory_ble_connected(board, 0, 10);
+    memory_ble_mtu(board, 0, 5);
+    memory_ble_written(board, 0, begins, sizeof begins);
+    memory_ble_written(board, 0, goes_on, sizeof goes_on);
+    CHECK(memory_ble_notify(board, 0, data) == 0, "a piece of another command drops what is held");
+    memory_ble_driven(board, 0, begins, 0);
+    memory_ble_driven(board, 0, goes_on + 1, 2);
+    memory_at(board, now);
+    CHECK(!memory_ble_advertises(board), "nobody tapped it");
+    teds_ble_tapped(&board->node);
+    now += 59999 * MS;
+    memory_at(board, now);
+    CHECK(memory_ble_advertises(board) && memory_ble_drops(board, 0), "for a minute; a stranger for 10 s");
+    now += MS;
+    memory_at(board, now);
+    CHECK(!memory_ble_advertises(board), "a minute is over");
+    memory_free(board);
+}
+
+/* What a tag is told that no reader says. */
+static void a_tag_bears_what_no_reader_says(void)
+{
+    memory_board *board = fresh();
+    uint8_t data[256], much[300] = {2};
+    size_t length;
+    memory_nfc(board, 4, 15, 9999);
+    (void)memory_start(board);
+    CHECK(memory_nfc_frame(board, (const uint8_t *)"\xe0", 1, data) == 5, "a RATS without its parameter");
+    CHECK(memory_nfc_frame(board, much, 0, data) == 0 && memory_nfc_frame(board, much, 257, data) == 0, "no block");
+    CHECK(!memory_nfc_written(board, much, 0), "an empty message");
+    CHECK(!memory_nfc_written(board, data, TEDS_MAX_NDEF + 1), "one that is too long");
+    (void)teds_nfc_message(&board->node, &length);
+    CHECK(length > 0, "it shows the initial message still");
+    memory_free(board);
+}
+
 int main(void)
 {
     a_long_answer_waits_for_flow_control();
@@ -497,5 +813,19 @@ int main(void)
     after_bus_off_it_is_silent_for_longer_and_longer();
     nodes_that_meet_sort_themselves_out();
     a_classic_frame_has_eight_octets_at_most();
+    what_is_not_for_this_node_is_left_alone();
+    no_frame_of_a_message_is_shorter_but_the_last();
+    one_station_does_not_cut_into_another_s_question();
+    any_flow_control_is_borne();
+    a_fifth_station_is_heard_when_a_line_is_at_rest();
+    everyone_waits_for_a_station_s_own_answer();
+    who_asks_on_after_a_move_asks_nobody();
+    a_move_waits_for_its_own_reply();
+    a_chip_without_randomness_answers_everyone_at_once();
+    an_announce_that_is_none_moves_nobody();
+    a_board_that_cannot_be_is_told_at_the_start();
+    a_key_that_cannot_be_made_ahead_is_made_when_it_is_due();
+    a_connection_that_is_none_does_nothing();
+    a_tag_bears_what_no_reader_says();
     return ENDED("isotp");
 }
