@@ -92,6 +92,18 @@ def test_a_reset_pad_that_is_stuck_erases_nothing(desk: Desk) -> None:
     until(lambda: station.ask("identify", *over)["state"] == "factory")
 
 
+def test_chips_of_two_lots_from_one_place_of_their_wafers_are_two_nodes(desk: Desk) -> None:
+    """Their numbers have twelve octets, a UUID ten."""
+    station: Station = desk.station()
+    uuids = []
+    for chip in (5, 5 + 0x100):
+        board = powered(desk, LOAD, chip, TEDS_FLASH=f"{chip}.bin")
+        uuids.append(station.ask("identify", *desk.links.over("can"))["uuid"])
+        board.process.kill()
+        board.end()
+    assert uuids[0] != uuids[1]
+
+
 def test_a_gripper_moves_and_lets_go_when_its_station_is_gone(desk: Desk) -> None:
     station: Station = desk.station()
     board = powered(desk, GRIPPER, 2)

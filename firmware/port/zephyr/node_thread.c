@@ -90,10 +90,13 @@ static bool bus_work(void)
 #endif
 }
 
-/* Ten octets of the chip's own number: the same after every erase, which a number drawn at random would not be. */
-static int own_uuid(uint8_t out[10])
+/* Of the chip's own number, so the same after every erase, which one drawn at random would not be. Of all of it: twelve
+ * octets of an STM32 are place on the wafer, wafer and lot, and no ten of them tell chips of two lots apart.
+ */
+static int own_uuid(const teds_port *port, uint8_t out[10])
 {
-    uint8_t id[16];
+    uint8_t id[16], digest[32];
+    teds_sha256 state;
     ssize_t length;
     bool zero = true;
     for (size_t i = 0; i < 10; i++) {
@@ -102,12 +105,14 @@ static int own_uuid(uint8_t out[10])
     if (!zero) {
         return 0;
     }
-    memset(id, 0, sizeof id);
     length = hwinfo_get_device_id(id, sizeof id);
     if (length < 8) {
         return TEDS_E_USAGE;
     }
-    memcpy(out, id + (length > 10 ? (size_t)length - 10 : 0), 10);
+    port->sha256_start(port->user, &state);
+    port->sha256_update(port->user, &state, id, (size_t)length);
+    port->sha256_finish(port->user, &state, digest);
+    memcpy(out, digest, 10);
     return 0;
 }
 
@@ -126,7 +131,7 @@ static int begin(const teds_zephyr_board *board)
         failed = TEDS_E_CRYPTO;
     }
     if (failed == 0) {
-        failed = own_uuid(board->config->uuid);
+        failed = own_uuid(port, board->config->uuid);
     }
     if (failed == 0) {
         failed = teds_node_init(&node, board->config, port);
