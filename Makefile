@@ -160,7 +160,7 @@ api: $(VENV)/.dev
 test-other:
 	@$(MAKE) --no-print-directory unit VENV=.venv-$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 
-# The figures of the house: circles, late imports, complexity, full folders, lines.
+# The figures of the house: circles, late imports, modules, helpers used once, shared names, complexity, lines.
 house: $(VENV)/.dev
 	$(BIN)/python scripts/house.py
 

@@ -132,6 +132,51 @@ def drawers() -> list[tuple[int, str]]:
     return sorted(((number, folder) for folder, number in count.items()), reverse=True)
 
 
+def functions(found: dict[str, Module]) -> int:
+    """Functions and methods, those inside others counted."""
+    return sum(
+        isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for module in found.values()
+        for node in ast.walk(module.tree)
+    )
+
+
+def used_once(found: dict[str, Module]) -> list[str]:
+    """Private functions of at most six lines that are called in one place of their file: ``file:line name``.
+
+    Not those that are given as a value, and not those that a class demands or overrides: a name is all that they have.
+    """
+    result = []
+    for module in found.values():
+        text = module.path.read_text(encoding="utf-8")
+        called = Counter(_called(node) for node in ast.walk(module.tree) if isinstance(node, ast.Call))
+        for node in ast.walk(module.tree):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
+            private = node.name.startswith("_") and not node.name.startswith("__")
+            if private and node.end_lineno is not None and node.end_lineno - first < 6 and called[node.name] == 1:
+                named = len(re.findall(rf"\b{node.name}\b", text))
+                if named == 2 and "abstractmethod" not in {ast.unparse(one) for one in node.decorator_list}:
+                    result.append(f"{module.path.relative_to(PACKAGE)}:{first} {node.name}")
+    return sorted(result)
+
+
+def _called(node: ast.Call) -> str:
+    return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+
+
+def shared_names(found: dict[str, Module]) -> list[str]:
+    """Names of classes in several files; an answer of the API is the half of the class beside it, and not counted."""
+    homes: dict[str, list[str]] = {}
+    for module in found.values():
+        for node in module.tree.body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(str(module.path.relative_to(PACKAGE)))
+    apart = {name: [file for file in files if not file.startswith("api/")] for name, files in homes.items()}
+    return [f"{name}: {', '.join(files)}" for name, files in sorted(apart.items()) if len(files) > 1]
+
+
 def lines(found: dict[str, Module]) -> list[tuple[int, str]]:
     """Lines of each room, the longest first."""
     count: Counter[str] = Counter()
@@ -168,6 +213,13 @@ def report() -> Iterator[str]:
     yield from (f"    {place}" for place in late[:12])
     yield f"functions of complexity C or worse      {len(knots):6}"
     yield from (f"    {knot}" for knot in knots[:25])
+    once, count, folders = used_once(found), functions(found), len({one.path.parent for one in found.values()})
+    yield f"modules                                 {len(found):6}   in {folders} folders"
+    yield f"functions                               {count:6}"
+    yield f"of these private, short, called once    {len(once):6}   {len(once) / count:.1%}"
+    shared = shared_names(found)
+    yield f"names of classes in several rooms       {len(shared):6}"
+    yield from (f"    {one}" for one in shared)
     yield f"files in the fullest folder             {drawers()[0][0]:6}   aim 15 at most"
     yield from (f"    {number:3} {folder}" for number, folder in drawers() if number > 15)
     yield f"provision of a factory node             {entered()}"
