@@ -90,6 +90,10 @@ class MemoryNode:
         self._hook = _HOOK(ask)  # kept, too
         self._library.memory_hook_up(self._board, self._hook)
 
+    def without(self, what: str) -> None:
+        """A board that has none of this: a word of memory.h."""
+        self._library.memory_without(self._board, ctypes.c_char(what.encode()))
+
     def close(self) -> None:
         """Give its memory back; once, whoever else closes it."""
         board, self._board = self._board, ctypes.c_void_p()

@@ -30,6 +30,8 @@ _SENSOR, _ACTUATOR, _EVENT = 0, 1, 2
         ([(1, 3, 2)], False),
         ([(1, _SENSOR, 0)], False),
         ([(1, _EVENT, 9)], False),
+        ([(number, _SENSOR, 1) for number in range(1, 9)], True),
+        ([(number, _SENSOR, 1) for number in range(1, 10)], False),
     ],
 )
 def test_a_channel_table_that_cannot_be_served_is_told_at_the_start(

@@ -298,6 +298,24 @@ void memory_hook_up(memory_board *board, memory_hook hook)
     port->power = ask_power;
 }
 
+void memory_without(memory_board *board, char what)
+{
+    teds_port *port = &board->port;
+    switch (what) {
+    case 's': port->sample = NULL; break;
+    case 'b': port->bears = NULL; break;
+    case 'a': port->set = NULL; break;
+    case 'g': port->set_point = NULL; break;
+    case 'f': port->safe = NULL; break;
+    case 't': port->self_test = NULL; break;
+    case 'T': port->testing = NULL; break;
+    case 'F': port->fault = NULL; break;
+    case 'p': port->power = NULL; break;
+    case 'm': port->arm = NULL; break;
+    default: port->kick = NULL; break;
+    }
+}
+
 memory_board *memory_new(const uint8_t uuid[10], uint8_t unit, uint8_t erased, memory_random random)
 {
     memory_board *board = calloc(1, sizeof *board);

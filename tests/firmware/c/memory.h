@@ -26,7 +26,7 @@ typedef struct memory_board {
     bool torn, dead, misused;
     uint64_t now;
     memory_random random;
-    teds_channel channels[TEDS_CHANNELS];
+    teds_channel channels[TEDS_CHANNELS + 1]; /* one more than a node takes */
     uint8_t values[TEDS_CHANNELS][8];
     teds_fixed fixed[8];
     bool fails;
@@ -50,6 +50,8 @@ void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t m
 void memory_no_channels(memory_board *board);
 void memory_halt(memory_board *board, uint8_t number, uint8_t halt);
 void memory_hook_up(memory_board *board, memory_hook hook);
+/* A board that has none of this: a word of memory_hook. After hook_up. */
+void memory_without(memory_board *board, char what);
 void memory_slow(memory_board *board, bool slow);
 /* This call of the chip's random source or cryptography from now on fails, it alone; 0: none. How many there were. */
 void memory_chip_fails(memory_board *board, long call);
