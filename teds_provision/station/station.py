@@ -40,6 +40,7 @@ from teds_provision.station.plant import Plant
 from teds_provision.station.policy import Policy
 from teds_provision.station.seals import Seals
 from teds_provision.store import AuditLog, Batch, Handover, KeyRecord, NodeTurn, Store, StoreLock
+from teds_provision.store.behind import Behind
 from teds_provision.store.database import has_store
 from teds_provision.store.dump import dump
 from teds_provision.store.records import Direction
@@ -91,6 +92,14 @@ class Handovers:
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
 
 
+@dataclass
+class _DurableRun:
+    """A run of steps: who takes some of them behind its back, and the number of its ``last`` commit not waited for."""
+
+    behind: Behind
+    last: int = 0
+
+
 class Station:
     """A base station (NCAP) on this machine."""
 
@@ -100,7 +109,7 @@ class Station:
         self._vault: Vault | None = None
         self._turn, self._held = threading.RLock(), 0
         self._opening = threading.RLock()
-        self._run = threading.local()
+        self._runs = threading.local()
         self.notice: Callable[[str], object] = lambda text: None
         """Told in one sentence whom this station waits for."""
         self.released: Callable[[bytes, str], AbstractContextManager[object]] = lambda uuid, command: nullcontext()
@@ -183,6 +192,7 @@ class Station:
 
     def _opened(self) -> Vault:
         if self._vault is None:
+            self._store.in_order()
             with self._opening:  # of several threads one asks for the passphrase
                 if self._vault is None:
                     keystore = self.identity.keystore
@@ -245,6 +255,7 @@ class Station:
 
         May stand inside another one of the same thread.
         """
+        self._store.in_order()
         with self._turn:
             if self._held:
                 yield
@@ -264,21 +275,51 @@ class Station:
         :meth:`run` it may reach the disk together with the step after it. Only for what nobody is promised before
         that: a loss of power in between is then as one an instant earlier.
         """
-        later = more_follows and getattr(self._run, "going", False)
-        with self.lock(command), self._store.transaction(later=later):
-            if later:
-                self._run.last = self._store.later + 1  # this one, when it is committed
+        run: _DurableRun | None = getattr(self._runs, "now", None) if more_follows else None
+        with self.lock(command), self._store.transaction(later=run is not None):
+            if run is not None:
+                run.last = self._store.later + 1  # this one, when it is committed
             yield
 
     @contextmanager
     def run(self) -> Iterator[None]:
         """Several steps by one thread, of which the last is durable: so are all of them when the block has ended."""
-        self._run.going, self._run.last = True, 0
+        self._runs.now = run = _DurableRun(self._store.behind())
         try:
-            yield
+            try:
+                yield
+            finally:
+                self._runs.now = None
+                run.behind.close()
         finally:
-            self._run.going = False
-            self._store.settle(self._run.last)  # not what other threads have written since: they see to it themselves
+            self._store.settle(run.last)  # not what other threads have written since: they see to it themselves
+
+    def behind(self, step: Callable[[], object]) -> None:
+        """Take a durable step while the node is talked to: in a :meth:`run` by its own thread, elsewhere at once.
+
+        Whatever is asked of the store afterwards waits for it, and raises what it raised; the run ends with it. So the
+        order of durable writes stays that of the program, and only messages to the node may overtake the step: it is
+        for what none of those that may follow depends on. Not inside a durable step.
+        """
+        run: _DurableRun | None = getattr(self._runs, "now", None)
+        if run is None:
+            step()
+            return
+
+        def taken() -> None:
+            self._runs.now = run  # in the thread that takes it
+            try:
+                step()
+            finally:
+                self._runs.now = None
+
+        run.behind.take(taken)
+
+    def settle(self) -> None:
+        """Wait until all that this thread's run has written is on the disk; outside a run it is."""
+        run: _DurableRun | None = getattr(self._runs, "now", None)
+        if run is not None:
+            self._store.settle(run.last)
 
     def turn(self, uuid: bytes) -> NodeTurn:
         """Have one node to oneself: two commands of this station do not work on the same node at once."""

@@ -385,22 +385,27 @@ def _agree_anew(
             f"The node offered key epoch {agreed.epoch} and says {identity.epoch} in its session.",
             hint="Its firmware counts epochs wrongly: node check names the rule.",
         )
-    with station.durable("agree", more_follows=True):
-        station.keys.promote(uuid, key_id)
-        station.plant.tell("agreed", uuid, fingerprint=fingerprint(agreed.node), epoch=agreed.epoch, key_id=key_id)
-        station.nodes.met_at(uuid, node.contact.bus)
-        station.nodes.remember(
-            uuid,
-            epoch=agreed.epoch,
-            point=agreed.node,
-            sequence=identity.sequence,
-            state=int(identity.state),
-            can_address=identity.can_address,
-            last_seen=utc_now(),
-        )
-        station.keys.rotated(uuid)
-        station.pins.settled(uuid)
-        station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
+    place = node.contact.bus
+
+    def record() -> None:
+        with station.durable("agree", more_follows=True):
+            station.keys.promote(uuid, key_id)
+            station.plant.tell("agreed", uuid, fingerprint=fingerprint(agreed.node), epoch=agreed.epoch, key_id=key_id)
+            station.nodes.met_at(uuid, place)
+            station.nodes.remember(
+                uuid,
+                epoch=agreed.epoch,
+                point=agreed.node,
+                sequence=identity.sequence,
+                state=int(identity.state),
+                can_address=identity.can_address,
+                last_seen=utc_now(),
+            )
+            station.keys.rotated(uuid)
+            station.pins.settled(uuid)
+            station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
+
+    station.behind(record)  # the pending key opens a session as well: nothing that is read next depends on it
     return Agreed(agreed.epoch, key_id, fresh=True)
 
 

@@ -363,6 +363,7 @@ class _Run:
                 earlier=() if earlier is None else (earlier,),
                 keep_draft=True,
                 profile=proposal.profile,
+                write_follows=True,
             )
             step.result = NOTHING if signed.reused else DONE
             step.detail = f"sequence {signed.sequence}"
@@ -390,7 +391,9 @@ class _Run:
             if verified.verdict != "authentic":
                 step.result = SKIPPED
                 return Borne({})
-            borne = bears(self.node, written.on_node, shown_units(self.station, self.node.uuid))
+            units = shown_units(self.station, self.node.uuid)
+            self.station.behind(self.station.settle)  # the verdict is on the disk when the run ends and tells it
+            borne = bears(self.node, written.on_node, units)
             step.result = DONE if borne.asked else SKIPPED
             good = sum(bool(one) for one in borne.channels.values())
             step.detail = f"{good} of {len(borne.channels)} channels bear it" if borne.asked else "it does not measure"

@@ -75,9 +75,23 @@ def keep(
     ``c`` is that of the session in which the reading began, where the one that is open now may be a later one. ``more``
     are checks that were made at the node. Gives the verdict on this very reading, whether it was kept or not.
     """
+    c = (c or node.c) if node.sealed else None
+    return keep_read(station, image, c, by=by, known=known, more=more, profile=profile)
+
+
+def keep_read(
+    station: Station,
+    image: Image,
+    c: bytes | None,
+    *,
+    by: str,
+    known: Known | None,
+    more: Sequence[Check] = (),
+    profile: str | None = None,
+) -> NodeVerdict:
+    """As :func:`keep`, of what was read in the session of this ``c``, None for what was read in none."""
     said, signers = what_octets_say(image, known)
     octets = [*said, *more]
-    c = (c or node.c) if node.sealed else None
     row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
     judged = _judged(station, row, keyed=is_keyed(station, image.uuid))
     worth = c is not None and judged.verified.verdict != "not authentic"  # else what it had stays known

@@ -101,6 +101,7 @@ def sign(
     keep_draft: bool = False,
     profile: str | None = None,
     unit: tuple[str, int] | None = None,
+    write_follows: bool = False,
 ) -> Signed:
     """Sign ``image`` for key epoch ``epoch``.
 
@@ -109,7 +110,8 @@ def sign(
     signer, it is given back. ``sequence`` forces one (steps over more than 65536). ``keep_draft``: the signed image is
     kept, with its ``profile``, until it is written. The new sequence is durable in the store before the signature is
     given to anyone: one that was lost with its process was never seen, and its number may be used again. ``unit``: the
-    job and the unit that an office signs for, which its pages say too.
+    job and the unit that an office signs for, which its pages say too. ``write_follows``: in a run nobody is given it
+    but the node, by :func:`~teds_provision.steps.write.write`, which waits for the disk before the signature leaves.
     """
     for block, teds in image.unsigned_blocks().items():
         if not can_be_stored(block) or not passes_own_check(block, teds):
@@ -123,7 +125,7 @@ def sign(
                 return Signed(image.with_block(SECURITY, octets), number, reused=True)
     station.plant.require_role("sign", "signs no datasheet", "Have it signed by one that has: sign --by OFFICE")
     credentials = station.credentials(keys.uuid)  # may ask for the passphrase: not while the store is held
-    with station.durable("sign"):
+    with station.durable("sign", more_follows=write_follows):
         known = station.nodes.get(keys.uuid)
         # The store knows of signatures that never reached the node, the node of those by other stations.
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
@@ -147,6 +149,8 @@ def sign(
         of_unit = {} if unit is None else dict(zip(("job", "unit"), unit, strict=True))
         station.plant.tell("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest, **of_unit)
         station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
+    if write_follows:
+        station.behind(station.settle)
     return Signed(made, number, reused=False)
 
 

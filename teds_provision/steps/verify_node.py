@@ -112,15 +112,15 @@ def verify_node(
     command that asks, ``c`` that of the session in which the reading began.
     """
     identity = (node.proven or read_identity(node)) if node.sealed else None
-    known = known_of(station, node.uuid, identity)
     possessed, vouch = possession(lambda: prove(node, point)), vouched(node, point, why)
+    known = known_of(station, node.uuid, identity)
     if vouch.result == "failed":
         with station.reading():
             verified = Verified(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
         station.audit("verify", node.uuid, verified.verdict, why=why)
         return NodeVerdict(verified, "plain", utc_now(), by)
     more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
-    with station.durable("verify"):
+    with station.durable("verify", more_follows=True):
         judged = reading.keep(station, node, image, by=by, known=known, c=c, more=more)
         row = station.nodes.reading(node.uuid)
         if identity is not None or (row is not None and not row.in_session):

@@ -22,7 +22,7 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
 from teds_provision.station.station import Station
 from teds_provision.steps.read import Survey, read_block, read_identity, read_image
-from teds_provision.steps.reading import is_known, keep
+from teds_provision.steps.reading import is_known, keep, keep_read
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.verify import known_of
 from teds_provision.store import NodeRecord
@@ -137,22 +137,28 @@ def _conclude(
 ) -> None:
     """Record what was read back, and whether it is what was written; raises NotAuthentic where it is not."""
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
-    with station.durable("write", more_follows=True):
-        profile = facts.get("profile")
-        named = profile if isinstance(profile, str) else None
-        keep(station, node, back, by="write", known=known_of(station, image.uuid, node.proven), c=c, profile=named)
-        if differing:
-            channel, access_code = differing[0]
-            station.audit("write", image.uuid, "read-back differs", block=[channel, access_code])
-        else:
-            known = station.nodes.remember(image.uuid, **facts)
-            _tell_written(station, image, known, sequence)
-            # A draft that is on the node now is none any more; a newer trial stays
-            draft = station.nodes.draft(image.uuid)
-            if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
-                station.nodes.drop_draft(image.uuid)
-            station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
+
+    identity, profile = node.proven, facts.get("profile")
+    named = profile if isinstance(profile, str) else None
+    c = (c or node.c) if node.sealed else None
+
+    def record() -> None:  # asks the node nothing: the next message may be on its way
+        with station.durable("write", more_follows=True):
+            keep_read(station, back, c, by="write", known=known_of(station, image.uuid, identity), profile=named)
+            if differing:
+                station.audit("write", image.uuid, "read-back differs", block=list(differing[0]))
+            else:
+                known = station.nodes.remember(image.uuid, **facts)
+                _tell_written(station, image, known, sequence)
+                # A draft that is on the node now is none any more; a newer trial stays
+                draft = station.nodes.draft(image.uuid)
+                if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
+                    station.nodes.drop_draft(image.uuid)
+                station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
+
+    station.behind(record)  # whoever verifies next has the node prove its key meanwhile
     if differing:
+        channel, access_code = differing[0]
         raise NotAuthentic(
             f"The node gives back another TEDS {access_code} of channel {channel} than was written.",
             hint="Try again; if it stays, the board's flash is broken.",
@@ -205,7 +211,7 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
     skip = _blocks_there(station, image, has)
     for _ in range(_STARTS - 1):
         try:
-            return _stage_and_commit(node, image, skip, progress)
+            return _stage_and_commit(station, node, image, skip, progress)
         except NodeRefused as refusal:
             if refusal.reason != Reason.DIGEST_MISMATCH or not skip:
                 raise
@@ -219,13 +225,15 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
         if _is_there(node, image):
             return 0
     try:
-        return _stage_and_commit(node, image, skip, progress)
+        return _stage_and_commit(station, node, image, skip, progress)
     except SessionLost as lost:
         raise lost.cause from lost
 
 
-def _stage_and_commit(node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
-    octets = _stage(node, image, skip, progress)
+def _stage_and_commit(
+    station: Station, node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None
+) -> int:
+    octets = _stage(station, node, image, skip, progress)
     node.send(update_teds(*SECURITY), "the commit")
     return octets
 
@@ -244,18 +252,22 @@ def _is_there(node: Conversation, image: Image) -> bool:
     return read_block(node, SECURITY) == image.security
 
 
-def _stage(node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
+def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
     """Write every block but those of ``skip`` into the node's staging; returns the octets written.
 
-    Where frames are lost the pieces shrink: a short one comes through where a long one never would.
+    The Security TEDS is the last (profile.md, "Writing to flash"): a node that cannot rewind may count on it, and the
+    others go while the sequence is on its way to the disk, which the signature waits for. Where frames are lost the
+    pieces shrink: a short one comes through where a long one never would.
     """
     piece = node.identity.max_message - WRITE_OVERHEAD
-    blocks = [block for block in image if block not in skip]
+    blocks = [block for block in sorted(image, key=lambda block: block == SECURITY) if block not in skip]
     total = sum(len(image.blocks[block]) for block in blocks)
     done, losses = 0, 0
     for channel, access_code in blocks:
         teds = image.blocks[channel, access_code]
         offset = 0
+        if (channel, access_code) == SECURITY:
+            station.settle()
         while offset < len(teds):
             part = teds[offset : offset + piece]
             try:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from teds_provision.errors import BadData, StoreFailure, StoreLocked, TedsProvisionError
 from teds_provision.lazy import late
+from teds_provision.store.behind import Behind
 
 if TYPE_CHECKING:
     import sqlite3
@@ -120,6 +121,8 @@ class Connection:
         self.later = 0
         """How many commits did not wait for the disk."""
         self._settled = 0
+        self.behind: dict[int, Behind] = {}
+        """By thread: the run that has a step taken behind its back, for which its next statement waits."""
         self.notice: Callable[[str], object] | None = None
         """Told, in a sentence, what a change of the store waits for."""
         self._frozen: StoreFailure | None = None
@@ -127,6 +130,8 @@ class Connection:
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run one statement and return all its rows; raises StoreFailure."""
+        if self.behind:
+            self.in_order()
         with self._lock:
             try:  # not by _run(): every step makes dozens of statements
                 return self._connection.execute(statement, values).fetchall()
@@ -134,6 +139,12 @@ class Connection:
                 if not self._is_to_wait(error):
                     raise self._failure(error) from error
             return self._wait_for(lambda: self._connection.execute(statement, values).fetchall())
+
+    def in_order(self) -> None:
+        """Wait until what this thread had done behind its back is done; raises what that raised."""
+        behind = self.behind.get(threading.get_ident())
+        if behind is not None:
+            behind.wait()
 
     def add(self, statement: str, values: Sequence[Any] = ()) -> None:
         """Run an INSERT of one new row: the transaction around it is sure to write to the disk; raises StoreFailure."""
@@ -150,6 +161,8 @@ class Connection:
             self._connection.executemany(statement, rows)
 
     def _run(self, run: Callable[[], _Given]) -> _Given:
+        if self.behind:
+            self.in_order()
         with self._lock:
             try:
                 return run()
@@ -197,6 +210,7 @@ class Connection:
         For many questions at one moment, with no waiting in between: whether another process has changed something is
         asked once. Changes inside it are made, and seen, as ever.
         """
+        self.in_order()
         with self._lock:
             mine = self._reader is None
             if mine:
@@ -228,6 +242,7 @@ class Connection:
 
         Raises StoreFailure.
         """
+        self.in_order()
         with self._lock:
             if (self.later if through is None else through) <= self._settled:
                 return
@@ -243,6 +258,8 @@ class Connection:
 
     def enter(self, block: Transaction) -> None:
         """Begin a block; for :class:`Transaction` alone."""
+        if self.behind:
+            self.in_order()
         self._lock.acquire()
         try:
             if self._frozen is not None:

@@ -194,6 +194,8 @@ class Database(Connection):
 
         For what every step asks again of the node at hand. Raises what :meth:`read` raises.
         """
+        if self.behind:
+            self.in_order()
         with self._lock:
             state = (self.state(), self._connection.total_changes)
             if state != self._remembered_at or len(self._remembered) >= _REMEMBERED:

@@ -11,11 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkFailure, StoreFailure
+from teds_provision.protocol.messages.frames import Command
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
 from teds_provision.store import NodeRecord
+from teds_provision.store.audit import ACTOR
+from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from tests.bench import Board, MemoryLink, make_station, talk
 
@@ -63,13 +66,6 @@ def watched(tmp_path: Path) -> Iterator[Watched]:
     watched.station.close()
 
 
-def test_a_whole_provisioning_is_eight_commits_at_most_and_waits_for_three(watched: Watched) -> None:
-    """The pending key before Confirm, the sequence before the signature leaves, and the verdict with all before it."""
-    _, commits = watched.run(Board())
-    assert commits <= 8
-    assert watched.waited == 3
-
-
 @pytest.fixture
 def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The files that this process waited for by itself, beside what SQLite does."""
@@ -78,6 +74,50 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         "os.fdatasync", lambda descriptor: names.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
     )
     return names
+
+
+def test_a_whole_provisioning_is_eight_commits_at_most_and_waits_for_the_disk_three_times(
+    watched: Watched, synced: list[str]
+) -> None:
+    """The pending key before Confirm, the sequence before the signature leaves, and the verdict with all before it."""
+    _, commits = watched.run(Board())
+    assert commits <= 8
+    assert watched.waited == 1
+    assert synced == ["store.sqlite3-wal"] * 2
+
+
+def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_before_the_signature(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The signature is in the TEDS that is written last; the others may go while the disk is waited for."""
+    told: list[str] = []
+    plain, send = os.fdatasync, Conversation.send
+    slowly = threading.Event()
+
+    def synced(descriptor: int) -> None:
+        slowly.wait(0.2)  # nobody sets it: a slow disk
+        plain(descriptor)
+        told.append("on the disk")
+
+    def sent(node: Conversation, command: Command, doing: str, *, within: float | None = None) -> bytes:
+        told.append(doing)
+        return send(node, command, doing, within=within)
+
+    def stated(statement: str) -> None:
+        if statement == "COMMIT" and told[-1:] != ["commit"]:
+            told.append("commit")
+
+    monkeypatch.setattr("os.fdatasync", synced)
+    monkeypatch.setattr(Conversation, "send", sent)
+    watched.station._store._database._connection.set_trace_callback(stated)
+    with talk(Board()) as node:
+        provision(watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=Silent())
+        told.append("told")
+    of_teds = [doing for doing in told if doing.startswith(("TEDS", "on the disk", "the commit"))]
+    assert of_teds[-4:-1] == ["on the disk", "TEDS 128 of channel 0", "the commit"]
+    assert "TEDS 1 of channel 0" in of_teds[:-4]
+    assert told[told.index("the key confirmation") - 1] == "commit"
+    assert told[-4:-1] == ["to measure with channel 1", "on the disk", "told"]
 
 
 def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, synced: list[str]) -> None:
@@ -194,3 +234,59 @@ def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watch
         if any(step.startswith("SCAN") and step not in one_row for step in plan)
     }
     assert {one for one in whole if not one.endswith("FROM audit ORDER BY seq DESC LIMIT 1")} == set()
+
+
+def test_what_a_run_asks_of_the_store_comes_after_the_steps_that_it_takes_behind_its_back(watched: Watched) -> None:
+    station, free = watched.station, threading.Event()
+
+    def slow() -> None:
+        free.wait(0.2)  # nobody sets it
+        with station.durable("agree", more_follows=True):
+            station.nodes.remember(bytes(10), name="left")
+
+    with station.run():
+        station.behind(slow)
+        assert station.nodes.get(bytes(10)) == NodeRecord(bytes(10), name="left")
+        station.behind(slow)
+        with station.durable("sign"):  # takes the locks that the step takes too
+            station.nodes.remember(bytes(10), name="right")
+    record = station.nodes.get(bytes(10))
+    assert record is not None
+    assert record.name == "right"
+    assert "durable steps" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_step_that_fails_behind_a_run_fails_the_run(watched: Watched) -> None:
+    """At what it asks of the store next, or at its end; never in silence."""
+    station, went_on = watched.station, []
+
+    def full() -> None:
+        raise StoreFailure("The disk is full.")
+
+    def ask() -> None:
+        with station.run():
+            station.behind(full)
+            station.nodes.get(bytes(10))
+            went_on.append("after a question")
+
+    def end() -> None:
+        with station.run():
+            station.behind(full)
+            went_on.append("at the end")
+
+    for run in (ask, end):
+        with pytest.raises(StoreFailure, match="full"):
+            run()
+    with pytest.raises(StoreFailure, match="full"):
+        station.behind(full)
+    assert went_on == ["at the end"]
+
+
+def test_what_is_done_behind_a_run_is_done_by_the_same_person(watched: Watched) -> None:
+    before = ACTOR.set("token lab")
+    try:
+        with watched.station.run():
+            watched.station.behind(lambda: watched.station.audit("agree", None, "done"))
+    finally:
+        ACTOR.reset(before)
+    assert [entry.who for entry in watched.station.audit_log.entries()][-1] == "token lab"
