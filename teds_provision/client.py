@@ -14,6 +14,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import selectors
 import socket
 import ssl
 from collections.abc import Iterator, Sequence
@@ -65,6 +66,19 @@ _EXIT: Final = {
     "bad-request": 2,
 }  # fmt: skip
 _EXIT_BY_STATUS: Final = {401: 6, 403: 6, 404: 3, 409: 6, 413: 8, 415: 8, 421: 6, 422: 6, 423: 6, 429: 6, 503: 5}
+
+
+def _is_over(connection: http.client.HTTPConnection) -> bool:
+    """Whether the base station has ended a connection that was kept open: after half a minute, or with its process.
+
+    Nothing is to come on it between two requests; what can be read is its end. A change that is sent on it would fail,
+    and could not be sent again, as nobody knows whether it was done.
+    """
+    if connection.sock is None:
+        return False
+    with selectors.DefaultSelector() as selector:
+        selector.register(connection.sock, selectors.EVENT_READ)
+        return bool(selector.select(0))
 
 
 def default_home() -> Path:
@@ -146,6 +160,8 @@ class Client:
         return self._exchange(method, path, body, headers)
 
     def _exchange(self, method: str, path: str, body: str | None, headers: dict[str, str]) -> tuple[int, str, bytes]:
+        if self._connection is not None and _is_over(self._connection):
+            self.close()
         if self._connection is None:
             self._connection = self._open()
         self._connection.request(method, API + path, body, headers)

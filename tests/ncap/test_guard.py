@@ -233,6 +233,22 @@ def test_a_token_that_is_removed_is_refused_at_once(service: Service) -> None:
     assert service.raw("GET", "/api/v1/status", bearer).status == 401
 
 
+def test_tokens_that_cannot_be_read_let_nobody_in_and_say_so(service: Service) -> None:
+    bearer = {"Authorization": f"Bearer {service.token('file')}"}
+    file = service.station.home / "ncap-tokens.json"
+    whole = file.read_bytes()
+    try:
+        file.write_bytes(b"{")
+        for method, path in (("GET", "/api/v1/status"), ("PUT", "/api/v1/detection")):
+            answer = service.raw(method, path, bearer)
+            assert (answer.status, answer.code) == (503, "store"), path
+            assert "no token is accepted" in answer.text
+            assert str(service.station.home) not in answer.text
+    finally:
+        file.write_bytes(whole)
+    assert service.raw("GET", "/api/v1/status", bearer).status == 200
+
+
 def test_tokens_that_are_made_at_once_are_all_kept(tmp_path: Path) -> None:
     """`ncap token add` beside a daemon that lets a browser in: each writes the whole file."""
     homes = [Tokens(tmp_path) for _ in range(4)]
@@ -395,7 +411,7 @@ def test_another_host_needs_tls_and_a_name(desk: Desk, tmp_path: Path) -> None:
     assert "together" in station.refuses("ncap", "run", "--http", "127.0.0.1:0", *tls[:2], code=2)["message"]
     token = station.ask("ncap", "token", "add", "tls")["token"]
     running = station.start("--json", "ncap", "run", "--http", "127.0.0.1:0", *tls)
-    [ready] = running.wait_for_lines(1)
+    [ready, *_] = running.wait_for_lines(1)
     assert ready["url"].startswith("https://127.0.0.1:")
     port = ready["url"].rpartition(":")[2]
     import ssl

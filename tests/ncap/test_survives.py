@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from teds_provision import client
 from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
 from teds_provision.store import Store
@@ -111,9 +112,20 @@ def test_one_daemon_in_a_home_and_without_one_nobody_answers(lab: Lab) -> None:
     lab.service.start().end()
 
 
+def test_a_client_that_is_kept_open_changes_something_after_a_restart_of_the_daemon(lab: Lab) -> None:
+    """The first change after half a minute of silence failed as well: the daemon ends connections that say nothing."""
+    service = lab.service.start()
+    with client.connect(home=service.station.home) as asked:
+        assert asked.status()["detection"] == "whitelist"
+        service.end()
+        service.start()
+        assert asked.set_detection("transparent") == "transparent"
+    service.end()
+
+
 def test_without_http_the_socket_alone_is_served(lab: Lab) -> None:
     running = lab.service.process = lab.service.station.start("--json", "ncap", "run")
-    [ready] = running.wait_for_lines(1)
+    [ready, *_] = running.wait_for_lines(1)
     assert (ready["url"], ready["api"]) == (None, f"unix:{lab.service.station.home / 'ncap.sock'}")
     assert lab.service.station.ask("ncap", "status")["url"] is None
     assert "--http" in lab.service.station.refuses("ncap", "open", code=2)["hint"]

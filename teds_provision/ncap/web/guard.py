@@ -18,6 +18,8 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final, Literal
 from urllib.parse import parse_qs
 
+from teds_provision.errors import StoreFailure
+from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.store.audit import ACTOR, by_token
 
@@ -134,7 +136,8 @@ class Guard:
             ACTOR.set(scope[CALLER].actor)
             _require_form(scope, headers, scope[CALLER])
             await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, with_headers)
-        except Refusal as refusal:
+        except (Refusal, StoreFailure) as error:
+            refusal = error if isinstance(error, Refusal) else _unreadable(error)
             if not begun:
                 await _refuse(scope, with_headers, refusal, as_page=_wants_html(scope))
 
@@ -190,6 +193,12 @@ class Guard:
                 await asyncio.sleep(_SLOWED)
             finally:
                 self._slowed -= 1
+
+
+def _unreadable(failure: StoreFailure) -> Refusal:
+    """The file of the tokens cannot be read: nobody is let in, and whoever asks is told no folder."""
+    told = for_readers({"message": failure.message, "hint": failure.hint})
+    return Refusal(503, failure.code, told["message"], told["hint"])
 
 
 def _headers(scope: Scope) -> dict[str, str]:
