@@ -20,7 +20,10 @@ class Merge:
         self.older = how in (Relation.OLDER, Relation.SAME)
         self.back: Counter[str] = Counter()
         self.kept: Counter[str] = Counter()
-        self.epochs = _epochs(live)
+        epochs = {record.uuid: record.epoch for record in live.nodes()}
+        for key in live.all_keys():
+            epochs[key.uuid] = max(epochs.get(key.uuid, 0), key.epoch)
+        self.epochs = epochs
         self.held = {key.uuid for key in live.all_keys()}
         self.barred = {gone.uuid for gone in live.revocations()} | {gone.uuid for gone in live.tombstones()}
 
@@ -190,14 +193,6 @@ class Merge:
         }
         self.live.put_marks(wanted)
         self.back["marks"] += len(wanted)
-
-
-def _epochs(store: Store) -> dict[bytes, int]:
-    """The highest epoch known of every node."""
-    epochs = {record.uuid: record.epoch for record in store.nodes()}
-    for key in store.all_keys():
-        epochs[key.uuid] = max(epochs.get(key.uuid, 0), key.epoch)
-    return epochs
 
 
 def _more(live: Iterable[RevocationRecord | Tombstone], copy: Iterable[RevocationRecord | Tombstone]) -> int:

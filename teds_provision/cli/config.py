@@ -251,13 +251,8 @@ def _edit(app: App, command: str, name: str, value: Any) -> bool:
 def _edited(text: str, table: list[str], key: str, value: Any) -> str:
     """The text with one key of one table set, or (None) without its line; a comment behind the value stays."""
     lines = text.splitlines()
-    start, end, here = (0, len(lines), not table) if not table else (len(lines), len(lines), False)
-    for number, line in enumerate(lines):
-        header = re.match(r"\s*\[([^\[\]]+)\]", line)
-        if header is not None and here:
-            end, here = number, False
-        elif header is not None and [w.strip().strip("'\"").replace("_", "-") for w in header[1].split(".")] == table:
-            start, end, here = number + 1, len(lines), True
+    there = _lines_of(lines, table)
+    start, end = there or (len(lines), len(lines))
     for number in range(start, end):
         found = re.match(rf"(\s*(['\"]?){key.replace('-', '[-_]')}\2\s*=\s*)(.*)", lines[number])
         if found is None:
@@ -269,13 +264,26 @@ def _edited(text: str, table: list[str], key: str, value: Any) -> str:
         return "\n".join([*lines, ""])
     if value is None:
         return text
-    if table and start == len(lines) and not here:
+    if there is None:
         lines += [*([""] if lines else []), f"[{'.'.join(table)}]", f"{key} = {_toml(value)}"]
         return "\n".join([*lines, ""])
     said = [n for n in range(start, end) if lines[n].strip() and not lines[n].lstrip().startswith("#")]
     first = next((n for n in range(start, end) if not lines[n].startswith("#")), end) if not table else start
     lines.insert(said[-1] + 1 if said else first, f"{key} = {_toml(value)}")
     return "\n".join([*lines, ""])
+
+
+def _lines_of(lines: list[str], table: list[str]) -> tuple[int, int] | None:
+    """Between which lines the keys of a table (the last of its name) stand, None where there is none of that name."""
+    found = None if table else (0, len(lines))
+    inside = not table
+    for number, line in enumerate(lines):
+        header = re.match(r"\s*\[([^\[\]]+)\]", line)
+        if header is not None and inside and found is not None:
+            found, inside = (found[0], number), False
+        elif header is not None and [w.strip().strip("'\"").replace("_", "-") for w in header[1].split(".")] == table:
+            found, inside = (number + 1, len(lines)), True
+    return found
 
 
 def _comment(rest: str) -> str:

@@ -190,7 +190,11 @@ class Newcomers:
         if measurement is None or not measurement.ready.is_set():
             return
         if measurement is not self._measurement:
-            self._begin_with(measurement)
+            # It began, or began anew after its sinks had failed: nobody is in it.
+            for uuid in list(self._members):
+                self._release(uuid)
+            self._measurement = measurement
+            self._version, self._followed = None, -FOLLOWING
         now = time.monotonic()
         self._follow_the_store(now)
         for uuid in list(self._members):
@@ -226,13 +230,6 @@ class Newcomers:
             if not self.news.wait(quiet):
                 break
         self.news.clear()
-
-    def _begin_with(self, measurement: Measurement) -> None:
-        """The measurement began, or began anew after its sinks had failed: nobody is in it."""
-        for uuid in list(self._members):
-            self._release(uuid)
-        self._measurement = measurement
-        self._version, self._followed = None, -FOLLOWING
 
     def _follow_the_store(self, now: float) -> None:
         """What another process changed (a name, a group, a ban, a key) changes who is meant."""

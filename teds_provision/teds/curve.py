@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate
-from teds_provision.teds.calibration.model import Calibration, CalibrationInput
+from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN, spans_a_turn
 from teds_provision.teds.codec.model import Units
@@ -173,7 +173,11 @@ def curve_of(
     axes = []
     for number, part in enumerate(calibration.inputs):
         source = channel if number == main else channels.get(part.channel)
-        edges = _edges(part, also, number, len(calibration.inputs))
+        edges = (
+            part.boundaries
+            if also is None or len(also.inputs) != len(calibration.inputs)
+            else tuple(sorted({*part.boundaries, *also.inputs[number].boundaries}))
+        )
         axes.append(_axis(edges, source, each, channel.actuator and number == main, calibration.unit))
     return Curve(calibration, channel, tuple(axes), main)
 
@@ -183,13 +187,6 @@ def _samples(calibration: Calibration) -> int:
     count = len(calibration.inputs)
     terms = math.prod(part.degree + 1 for part in calibration.inputs)
     return SAMPLES if count == 1 else max(3, int(min(GRID, TERMS / terms) ** (1 / count)))
-
-
-def _edges(part: CalibrationInput, also: Calibration | None, number: int, count: int) -> tuple[float, ...]:
-    """Boundaries of an input, with those of the calibration that it is compared with."""
-    if also is None or len(also.inputs) != count:
-        return part.boundaries
-    return tuple(sorted({*part.boundaries, *also.inputs[number].boundaries}))
 
 
 def _straight(calibration: Calibration) -> bool:

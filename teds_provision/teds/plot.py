@@ -61,7 +61,9 @@ def plot_blocks(
         raise BadData(f"There is no calibration of {which} that can be drawn.")
     if len(panels) > MAXIMUM_PANELS:
         raise UsageFailure(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
-    write_whole(path, _picture(panels, kind, _node(blocks)), mode=SHARED)
+    sheet = Sheet.of_blocks(blocks)
+    title = "  ".join(part for part in (sheet.meta.name, sheet.uuid.hex()) if part)
+    write_whole(path, _picture(panels, kind, title), mode=SHARED)
     return tuple(panel.curve.channel.number for panel in panels)
 
 
@@ -91,12 +93,6 @@ def _panels(
         title = f"channel {number}: {name}" if name else f"channel {number}"
         panels.append(_Panel(title, curve_of(calibration, own, others, dense=True), points))
     return panels
-
-
-def _node(blocks: Mapping[BlockId, bytes]) -> str:
-    """The node's name and UUID, as far as its Meta-TEDS and name say them."""
-    sheet = Sheet.of_blocks(blocks)
-    return "  ".join(part for part in (sheet.meta.name, sheet.uuid.hex()) if part)
 
 
 def _picture(panels: list[_Panel], kind: str, title: str) -> bytes:

@@ -276,18 +276,9 @@ _UPPER: Final = str.maketrans("⁻¹²³", "-123")
 
 def _compound(text: str) -> WrittenUnit | None:
     """Products and quotients of units of our own table, from left to right; None where it is anything else."""
-    upper, slash, lower = text.partition("/(")
-    if slash and (not lower.endswith(")") or "/" in lower):  # one denominator in brackets, and nothing after it
+    factors = _factors(text)
+    if factors is None:
         return None
-    factors: list[tuple[re.Match[str], int]] = []
-    for part, side in ((upper, 1), (lower[:-1], -1)) if slash else ((upper, 1),):
-        at = 0
-        while at < len(part):
-            match = _FACTOR.match(part, at)
-            if match is None or (at == 0 and match["sign"]):
-                return None
-            factors.append((match, -side if match["sign"] == "/" else side))
-            at = match.end()
     out, scale = dict.fromkeys(UNIT_PARTS, Fraction(0)), 1.0
     for match, side in factors:
         name = match["name"]
@@ -304,6 +295,23 @@ def _compound(text: str) -> WrittenUnit | None:
             scale *= named[1] ** float(power)
     _representable(text, out)
     return WrittenUnit(text, from_exponents(PRODUCT, out), scale)
+
+
+def _factors(text: str) -> list[tuple[re.Match[str], int]] | None:
+    """Each factor of a product with the side that it stands on (1 above, -1 below); None where it is no product."""
+    upper, slash, lower = text.partition("/(")
+    if slash and (not lower.endswith(")") or "/" in lower):  # one denominator in brackets, and nothing after it
+        return None
+    factors: list[tuple[re.Match[str], int]] = []
+    for part, side in ((upper, 1), (lower[:-1], -1)) if slash else ((upper, 1),):
+        at = 0
+        while at < len(part):
+            match = _FACTOR.match(part, at)
+            if match is None or (at == 0 and match["sign"]):
+                return None
+            factors.append((match, -side if match["sign"] == "/" else side))
+            at = match.end()
+    return factors
 
 
 @cache

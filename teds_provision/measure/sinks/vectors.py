@@ -132,7 +132,11 @@ def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
 
 def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[ChannelFacts]]]:
     """Axes of each whole vector whose axes are of one unit, by that unit."""
-    groups = {one.vector: [sensors[n] for n in one.vector] for one in sensors.values() if _is_whole(one, sensors)}
+    groups = {
+        one.vector: [sensors[n] for n in one.vector]
+        for one in sensors.values()
+        if len(one.vector) == len(AXES) and all(number in sensors for number in one.vector)
+    }
     by_unit: dict[object, list[list[ChannelFacts]]] = {}
     for axes in groups.values():
         if len({one.units for one in axes}) == 1:
@@ -144,10 +148,6 @@ def is_range(facts: ChannelFacts) -> bool:
     """Whether a channel is a range finder: by its unit and what the profile or its name calls it."""
     words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
     return facts.kind == "sensor" and facts.units == _LENGTH and any(one in words for one in _RANGE_WORDS)
-
-
-def _is_whole(one: ChannelFacts, sensors: Mapping[int, ChannelFacts]) -> bool:
-    return len(one.vector) == len(AXES) and all(number in sensors for number in one.vector)
 
 
 def _paths(field_name: str, axes: list[ChannelFacts]) -> tuple[tuple[str, int], ...]:

@@ -125,17 +125,14 @@ class NodeDirectory:
             for name, value in facts.items():
                 setattr(seen, name, value)
             if state == "left":
-                self._forget_strangers()
+                gone = [other for other, one in self._seen.items() if not one.present and other not in self._rows]
+                for stranger in gone[:-MOST_GONE]:
+                    for kept in (self._seen, self._channels, self._own_names, self._texts):
+                        kept.pop(stranger, None)
         if state is not None:
             told = {key: value for key, value in facts.items() if key in ("problem", "place", "busy")}
             told |= {} if verdict is None else {"verdict": verdict}
             self._live.event("node", uuid=uuid, state=state, **told)
-
-    def _forget_strangers(self) -> None:
-        gone = [uuid for uuid, seen in self._seen.items() if not seen.present and uuid not in self._rows]
-        for uuid in gone[:-MOST_GONE]:
-            for kept in (self._seen, self._channels, self._own_names, self._texts):
-                kept.pop(uuid, None)
 
     def seen(self, uuid: str) -> Seen:
         """What the links say of a node."""

@@ -121,15 +121,14 @@ class Board:
         self.channels: Mapping[int, ChannelHardware] = {n: _facts(channel) for n, channel in kinds.items()}
         self.converters = {number: Converter(sheet, channel) for number, channel in kinds.items()}
         self._test_seconds = _self_test_seconds(sheet.meta.self_test_time)
-        self._seen: dict[int, RawReading | None] = dict.fromkeys(self._event_sensors())
+        self._seen: dict[int, RawReading | None] = dict.fromkeys(
+            [n for n, facts in self.channels.items() if facts.kind is ChannelKind.EVENT_SENSOR]
+        )
         self._testing: dict[int, int] = {}
         self._safe_state = {n: self._lowest(n) for n, facts in self.channels.items() if facts.actuator}
         self._bounds = {number: self._raw_limits(number) for number in self._safe_state}
         self._set_points = dict(self._safe_state)
         self.source = sources.make_source(source, self.places, tell)
-
-    def _event_sensors(self) -> list[int]:
-        return [n for n, facts in self.channels.items() if facts.kind is ChannelKind.EVENT_SENSOR]
 
     @property
     def places(self) -> list[Place]:

@@ -254,15 +254,11 @@ def _reply_layout(ok: bool, payload: bytes, request: Message | None) -> tuple[st
         return "reason:u8", "Refusal", request is None
     if request is not None and request.group is not None and request.function is not None:
         spec = COMMANDS.get((request.group, request.function), Spec(request.name, reply="octets:octets"))
-        return (*_layout_asked_for(ok, payload, request, spec), False)
+        # A failure carries a reply of that form, or nothing.
+        form = spec.reply if spec.answer is None or request.arguments else spec.answer
+        layout = (form or "") if ok or len(payload) in {4, 12} else "octets:octets"
+        return layout, f"Reply to {spec.name}" if ok else f"Failure of {spec.name}", False
     return (*_layout_guessed(ok, payload), True)
-
-
-def _layout_asked_for(ok: bool, payload: bytes, request: Message, spec: Spec) -> tuple[str, str]:
-    """Layout and name of the reply to a command that is known; a failure carries a reply of that form, or nothing."""
-    form = spec.reply if spec.answer is None or request.arguments else spec.answer
-    layout = (form or "") if ok or len(payload) in {4, 12} else "octets:octets"
-    return layout, f"Reply to {spec.name}" if ok else f"Failure of {spec.name}"
 
 
 def _layout_guessed(ok: bool, payload: bytes) -> tuple[str, str]:

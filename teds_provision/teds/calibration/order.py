@@ -71,7 +71,9 @@ def calibration_of(order: CalibrationOrder, channel: ChannelProfile) -> Calibrat
             raise
         raise order.wrong("", error.message) from error
     known = [value for value in (_uncertainty(order, unit), _misfit(curve)) if value]
-    low, high = _limits(order)
+    low, high = order.number("low-limit"), order.number("high-limit")
+    if low is not None and high is not None and low >= high:
+        raise order.wrong("low-limit", "it must be below the high limit.")
     by = order.get("by")
     return replace(
         curve,
@@ -86,13 +88,6 @@ def calibration_of(order: CalibrationOrder, channel: ChannelProfile) -> Calibrat
         monotone=channel.calibration.monotone,
         raw_range=channel.calibration.raw_range,
     )
-
-
-def _limits(order: CalibrationOrder) -> tuple[float | None, float | None]:
-    low, high = order.number("low-limit"), order.number("high-limit")
-    if low is not None and high is not None and low >= high:
-        raise order.wrong("low-limit", "it must be below the high limit.")
-    return low, high
 
 
 def _misfit(curve: Calibration) -> float | None:
@@ -129,16 +124,14 @@ def _fitted(order: CalibrationOrder, channel: ChannelProfile, method: Method | N
     points = _points(order)
     return fit(
         points,
-        method or _asked(channel) or ("linear" if len(points) == 2 else "table"),
+        method
+        or next((method for method in METHODS if method == channel.calibration.method), None)
+        or ("linear" if len(points) == 2 else "table"),
         channel=channel.number,
         degree=channel.calibration.degree if degree is None else degree,
         actuator=channel.type == 1,
         tolerance=order.number("tolerance") or 0.0,
     )
-
-
-def _asked(channel: ChannelProfile) -> Method | None:
-    return next((method for method in METHODS if method == channel.calibration.method), None)
 
 
 def _points(order: CalibrationOrder) -> list[tuple[float, float]]:

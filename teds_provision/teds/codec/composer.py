@@ -225,15 +225,15 @@ def _tail(decoded: Decoded) -> bytes:
     if not decoded.text:
         return b""
     last = decoded.fields[-1] if decoded.fields else None
-    start = 4 * decoded.framed if last is None else last.offset + _header(decoded, last) + len(last.raw)
+    start = (
+        4 * decoded.framed
+        if last is None
+        else last.offset + (2 if last.name == "TEDSID" else 1 + tuple_width(decoded)) + len(last.raw)
+    )
     end = len(decoded.octets) - 2 * decoded.framed
     if any(finding.code == "frame-trailing" for finding in decoded.findings):
         end = int.from_bytes(decoded.octets[:4], "big") + 2
     return decoded.octets[start:end]
-
-
-def _header(decoded: Decoded, field: Field) -> int:
-    return 2 if field.name == "TEDSID" else 1 + tuple_width(decoded)
 
 
 # A decoded TEDS in the words of the other edition, with a finding for everything that the other cannot say.

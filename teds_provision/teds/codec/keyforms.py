@@ -40,7 +40,9 @@ def read_key(value: bytes | str) -> ReadKey:
 
 def _unwrap(octets: bytes, stripped: bytes) -> tuple[Form, bytes]:
     if stripped.startswith(b"-----BEGIN"):
-        inner = _base64(_pem_body(stripped))
+        inner = _base64(
+            b"".join(line.strip() for line in stripped.splitlines() if b"-----" not in line and b":" not in line)
+        )
         return ("pem", inner) if inner is not None else ("raw", octets)
     if stripped and len(stripped) % 2 == 0 and _HEX_DIGITS.issuperset(stripped):
         return "hex", bytes.fromhex(stripped.decode("ascii"))
@@ -48,10 +50,6 @@ def _unwrap(octets: bytes, stripped: bytes) -> tuple[Form, bytes]:
     if text is not None:
         return "base64", text
     return ("der", octets) if _is_der(octets) else ("raw", octets)
-
-
-def _pem_body(pem: bytes) -> bytes:
-    return b"".join(line.strip() for line in pem.splitlines() if b"-----" not in line and b":" not in line)
 
 
 def _base64(text: bytes) -> bytes | None:

@@ -37,7 +37,10 @@ def check(table: Table, fields: tuple[Field, ...], find: Find, octets: bytes, fr
     elif code == AccessCode.SECURITY:
         _security(fields, find, octets, framed)
     elif code == AccessCode.SECURITY_2024:
-        _level(fields, find)
+        for field in fields:
+            if field.name == "Level" and isinstance(field.value, str) and field.value not in LEVELS:
+                message = f"Level is {str(field.value)!r}; A to E and N are known."
+                find("warning", "enumeration", message, field.offset, "Level", "A to E, N", field.value)
     if not table.verified:
         find("note", "unverified", f"The field numbers of {table.name} are not checked against the standard.", None)
 
@@ -133,7 +136,10 @@ _LOOK: Final[dict[type, Callable[[Field, FieldSpec | None, Find], None]]] = {
 
 
 def _limits(fields: tuple[Field, ...], find: Find) -> None:
-    _uncertainty(fields, find)
+    for field in fields:
+        if field.name == "OError" and isinstance(field.value, float) and field.value < 0:
+            message = "The uncertainty OError is negative."
+            find("warning", "negative", message, field.offset, "OError", ">= 0", field.value)
     by_name = {field.name: field for field in fields}
     low, high = by_name.get("LowLimit"), by_name.get("HiLimit")
     if low is None or high is None or not isinstance(low.value, float) or not isinstance(high.value, float):
@@ -141,13 +147,6 @@ def _limits(fields: tuple[Field, ...], find: Find) -> None:
     if low.value > high.value:
         message = f"LowLimit {low.value:g} lies above HiLimit {high.value:g}."
         find("error", "limits", message, low.offset, "LowLimit", f"<= {high.value:g}", f"{low.value:g}")
-
-
-def _uncertainty(fields: tuple[Field, ...], find: Find) -> None:
-    for field in fields:
-        if field.name == "OError" and isinstance(field.value, float) and field.value < 0:
-            message = "The uncertainty OError is negative."
-            find("warning", "negative", message, field.offset, "OError", ">= 0", field.value)
 
 
 def _sample_form(field: Field, find: Find) -> None:
@@ -162,13 +161,6 @@ def _sample_form(field: Field, find: Find) -> None:
     elif isinstance(bits, int) and model in (0, 3, 5, 6) and bits > 8 * octets:
         message = f"Sample claims {bits} significant bits in {octets} octets."
         find("warning", "sample", message, field.offset, "SigBits", f"<= {8 * octets}", bits)
-
-
-def _level(fields: tuple[Field, ...], find: Find) -> None:
-    for field in fields:
-        if field.name == "Level" and isinstance(field.value, str) and field.value not in LEVELS:
-            message = f"Level is {str(field.value)!r}; A to E and N are known."
-            find("warning", "enumeration", message, field.offset, "Level", "A to E, N", field.value)
 
 
 def _sampling(field: Field, find: Find) -> None:
