@@ -213,7 +213,7 @@ firmware-soak: $(VENV)/.dev
 	SECONDS_OF_SOAK=$${SECONDS_OF_SOAK:-600} $(BIN)/python -m pytest tests/firmware/test_soak.py -m soak -s -rs
 
 # Lines and branches of firmware/src that its tests reach, by gcov: the C tests, those in one process and the host port.
-# Three minutes; not the faulty nodes, which are copies. Goes on where a test fails, as coverage does.
+# Three minutes; not the faulty nodes, which are copies. Goes on where a test fails; fails below 95 % of the branches.
 COUNTED := LEVEL=-O0 --coverage,HOST_LEVEL=-O0 --coverage
 firmware-coverage: vectors-c $(VENV)/.dev
 	@sh scripts/install-test-packages

@@ -12,8 +12,12 @@ import sys
 import tempfile
 from collections import defaultdict
 from pathlib import Path
+from typing import Final
 
 from tests.firmware.builds import FIRMWARE
+
+LEAST: Final = 0.95
+"""Of the branches; what is left is what cannot happen by construction, and is guarded all the same."""
 
 Counts = dict[tuple[int, int], bool]
 
@@ -48,23 +52,36 @@ def take(said: dict[str, list[dict[str, object]]], found: dict[str, Counts]) -> 
                 counts[number, place] = counts.get((number, place), False) or branch["count"] != 0
 
 
+def reached(counts: list[Counts], branches: bool) -> tuple[int, int]:
+    """How many were reached, of how many."""
+    every = [seen for each in counts for (_, place), seen in each.items() if (place >= 0) is branches]
+    return sum(every), len(every)
+
+
 def share(counts: list[Counts], branches: bool) -> str:
     """Of so many, so many per cent."""
-    reached = [seen for each in counts for (_, place), seen in each.items() if (place >= 0) is branches]
-    return f"{sum(reached) / max(1, len(reached)):7.1%} of {len(reached):5,}"
+    seen, every = reached(counts, branches)
+    return f"{seen / max(1, every):7.1%} of {every:5,}"
 
 
-def main(arguments: list[str]) -> None:
-    """Print a line for each file, what it did not reach, and the sum."""
+def main(arguments: list[str]) -> int:
+    """Print a line for each file, what it did not reach, and the sum; 1 where that is less than :data:`LEAST`."""
     found = counted(Path(arguments[0]))
     missing = {path.name for path in (FIRMWARE / "src").glob("*.c")} - set(found)
     assert not missing, f"nothing was counted of {', '.join(sorted(missing))}"
     for name, counts in sorted(found.items()):
         lines = sorted(number for (number, place), seen in counts.items() if place == -1 and not seen)
-        print(f"{name:<20}lines {share([counts], False)}   branches {share([counts], True)}   {lines}")
+        branches = sorted({number for (number, place), seen in counts.items() if place >= 0 and not seen})
+        print(f"{name:<20}lines {share([counts], False)}   branches {share([counts], True)}")
+        print(f"{'':<20}not reached {lines}   not each way {branches}")
     every = list(found.values())
     print(f"{'together':<20}lines {share(every, False)}   branches {share(every, True)}")
+    seen, of = reached(every, True)
+    if seen < LEAST * of:
+        print(f"Less than {LEAST:.0%} of the branches: a new one wants a test that takes it.", file=sys.stderr)
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

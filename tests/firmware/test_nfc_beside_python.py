@@ -235,6 +235,33 @@ def reader_frame(dice: random.Random, number: int, length: int) -> bytes:
     return dice.choice((b"\xc2", b"\xf2\x01", bytes((dice.choice((0x00, 0x40, 0xD0, 0xFF)),)) + dice.randbytes(2)))
 
 
+def test_what_a_deselected_tag_and_one_that_was_asked_nothing_say() -> None:
+    node = MemoryNode(lambda kind, size: NODE.secret() if kind == "i" else bytes(size), lambda: 0.0, uuid=UUID)
+    node.has_nfc()
+    assert node.start() == 0
+    rats = bytes.fromhex("e080")
+    card = IsoDepTag(rats, NdefApplication(Type4Memory(1000), lambda seconds: True))
+    assert node.nfc_frame(rats) == ATS
+    for block in ("c2", "ca", "a2", "a3", "b2", "b3", "0200a4040007d276000085010100", "a3", "12a4", "a2", "a3", "c2"):
+        assert node.nfc_frame(bytes.fromhex(block)) == card.answer(bytes.fromhex(block)), block
+    node.close()
+
+
+@pytest.mark.parametrize("selection", [b"", b"\0", b"\x05abc", b"\x03abc", b"\x03abcd", b"\xff"], ids=bytes.hex)
+def test_a_selection_that_does_not_add_up(taps: Callable[[int, int], Taps], selection: bytes) -> None:
+    """Alone, twice, and behind a request."""
+    reader = taps(1, 499)
+    odd = NdefRecord(WELL_KNOWN, b"Ts", selection)
+    reader.write(message.encode([odd]))
+    reader.write(message.encode([odd, tnep.select(tnep.SERVICE)]))
+    reader.write(message.encode([tnep.select(tnep.SERVICE), odd]))
+    piece = tnep.payload_record(Piece(1, 6, 0, IDENTIFY).encode())
+    reader.write(message.encode([piece, odd]))
+    reader.write(message.encode([NdefRecord(WELL_KNOWN, b"WLCINF", b"")]))
+    reader.write(message.encode([piece, piece]))
+    reader.write(message.encode([piece]))
+
+
 @pytest.mark.parametrize("fsdi", [0, 2, 8])
 def test_both_tags_answer_a_readers_frames_alike(fsdi: int) -> None:
     """ISO-DEP and the APDUs alone: what the message says is the C node's in both."""
