@@ -167,7 +167,7 @@ def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_r
     """
     station = app.station()
     draft = plant.owner.draft_first(station, name, timedelta(days=days))
-    past = list(plant.past.past(station))
+    past = list(plant.backlog.backlog(station))
     said = "\n".join([*plant.owner.changes(None, draft), _past(past)])
     if dry_run:
         app.emit({**_to_json(draft), "roster": None, "events": len(past), "plan": True}, f"Plan:\n{said}")
@@ -179,13 +179,13 @@ def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_r
         signed = plant.owner.signed(station, draft)
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
-        events = plant.owner.join(station, signed, url=None, told=list(plant.past.past(station)))
+        events = plant.owner.join(station, signed, url=None, told=list(plant.backlog.backlog(station)))
     text = f"Registry {signed.registry} of {name} was created. Next: registry connect --files DIR"
     app.emit({**_to_json(signed), "roster": signed.octets.decode(), "events": events}, text)
 
 
 def _past(past: Sequence[Any]) -> str:
-    counts = plant.past.count(list(past))
+    counts = plant.backlog.count(list(past))
     listed = ", ".join(f"{count} {act}" for act, count in sorted(counts.items())) or "nothing"
     return f"  it will tell the plant what this store knows: {listed}"
 
@@ -406,7 +406,7 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
         raise PolicyRefused(
             f"This station belongs to the registry {joined.registry} already.", hint="First: registry disconnect"
         )
-    past = [] if same else list(plant.past.past(station))
+    past = [] if same else list(plant.backlog.backlog(station))
     said = "\n".join([
         f"{found.name}, registry {found.registry}, roster {found.version} until {_time(found.expires)}",
         f"  CA {keys.fingerprint(station.ca)}",

@@ -147,7 +147,7 @@ class _Story:
                 post = self._post(station)
                 found = plant.membership.found_roster(station, post, None)
                 post.close()
-                plant.owner.join(station, found, url=None, told=list(plant.past.past(station)))
+                plant.owner.join(station, found, url=None, told=list(plant.backlog.backlog(station)))
                 step.detail = f"{name}, roster {found.version}"
 
     def _stolen(self) -> None:

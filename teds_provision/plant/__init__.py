@@ -7,6 +7,7 @@ from teds_provision.lazy import lazy
 if TYPE_CHECKING:
     from teds_provision.plant import (
         asking,
+        backlog,
         evidence,
         files,
         folding,
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
         office,
         owner,
         parcels,
-        past,
         post,
         postgres,
         reaching,

@@ -14,8 +14,8 @@ from typing import Any
 from uuid import uuid4
 
 from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.plant.backlog import Told, backlog
 from teds_provision.plant.folding import now, put_roster, require_roster
-from teds_provision.plant.past import Told, past
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.plant.document import MemberRequest, payload
@@ -89,7 +89,7 @@ def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[To
 def create(station: Station, name: str, days: timedelta = USUAL) -> tuple[Roster, int]:
     """Make a registry with this station as its first member; returns roster 1 and how many events the past made."""
     roster = signed(station, draft_first(station, name, days))
-    return roster, join(station, roster, url=None, told=list(past(station)))
+    return roster, join(station, roster, url=None, told=list(backlog(station)))
 
 
 # -- the next version --------------------------------------------------------------------------------------------------

@@ -126,7 +126,7 @@ def test_a_store_of_today_joins_its_owner_retires_it_and_its_datasheets_stay(pla
     image = made_by(west, Board())
     plants.change(plant.owner.add(plants.north, request_of(west), frozenset({"line", "sign"})))
     assert plants.north.plant.roster is not None
-    told = list(plant.past.past(west))
+    told = list(plant.backlog.backlog(west))
     assert {"pinned", "agreed", "signed"} <= {act for act, _, _ in told}
     plant.owner.join(west, plants.north.plant.roster, url=None, told=told)
     plants.stations.append(west)

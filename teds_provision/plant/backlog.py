@@ -24,7 +24,7 @@ from teds_provision.teds.image import Image
 Told = tuple[str, bytes | None, dict[str, Any]]
 
 
-def past(station: Station) -> Iterator[Told]:
+def backlog(station: Station) -> Iterator[Told]:
     """What this station would have told had it been a member: act, node, members; nothing is written."""
     for entry in station.pins.each():
         if is_whole(entry.fingerprint) and entry.assurance != "registry":
