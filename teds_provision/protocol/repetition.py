@@ -11,7 +11,9 @@ from collections.abc import Callable
 REPLY_SECONDS, REPEAT_SECONDS, TRIES = 5.0, 15.0, 3
 """A station waits 5 s for a reply, and repeats its request at most twice, within 15 s."""
 KEEP_SECONDS = 20.0
+"""Longer than the 15 s in which a station repeats, so that no repetition finds its reply gone and is run again."""
 _IDEMPOTENT = {(128, 7), (128, 8), (128, 11), (1, 1), (1, 2)}
+"""Identify, Prove, List, Query, Read change nothing: they are always run anew, and answer what is true now."""
 
 
 class Repetition:

@@ -37,6 +37,7 @@ else:  # numpy
 FORMATS: Final = {"json": "application/json", "xml": "application/xml", "hex": "text/plain; charset=utf-8"}
 _POINTS: Final = 200
 _MOST_TURNS: Final = 100
+"""A calibration may state any angle: a curve between two points that are further apart is drawn without its turns."""
 MeasuredSheet = Callable[[str], Image | None]
 
 

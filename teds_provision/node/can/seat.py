@@ -18,6 +18,7 @@ from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 
 _MOST_WAITING: Final = 4
+"""Requests of one station in the queue: a well-behaved one waits for each reply, so that more are of no use to it."""
 
 
 BUS: Final = "can"

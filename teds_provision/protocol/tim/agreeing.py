@@ -24,6 +24,7 @@ from teds_provision.protocol.session import NodeSession, OneTime
 from teds_provision.protocol.tim.permission import Origin
 
 PENDING_SECONDS: Final = 60.0
+"""A key that was requested and not confirmed is forgotten (profile.md, "Key agreement"): there is room for one."""
 
 
 @dataclass

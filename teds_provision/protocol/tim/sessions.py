@@ -26,7 +26,9 @@ from teds_provision.protocol.session import (
 )
 
 HALF_OPEN_SECONDS: Final = 60.0
+"""An Open that no good Sealed frame followed gives its place up (profile.md, "Sessions")."""
 IDLE_SECONDS: Final = 600.0
+"""A session without a good frame for so long has lost its station: a node has room for few of them."""
 
 
 @dataclass
