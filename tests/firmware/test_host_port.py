@@ -196,3 +196,21 @@ def test_a_node_in_c_and_one_in_python_lie_on_one_bus(desk: Desk, station: Stati
         where = [*links[:-1], f"{links[-1]}&node={default_can_address(bytes.fromhex(uuid))}"]
         done = station.ask("provision", "--profile", ANGLE, "--yes", *where)
         assert (done["uuid"], done["verdict"]) == (uuid, "authentic")
+
+
+@pytest.mark.realtime
+def test_a_node_in_c_and_one_in_python_are_measured_at_once(desk: Desk, station: Station, node: CNode) -> None:
+    """One run, started by one trigger frame: both clocks mark it, and neither loses a value."""
+    node.start()
+    other = desk.node(type_=ANGLE).start(nfc=False, can=True)
+    links = desk.links.over("can")
+    for uuid in (node.uuid, other.uuid):
+        where = [*links[:-1], f"{links[-1]}&node={default_can_address(bytes.fromhex(uuid))}"]
+        assert station.ask("provision", "--profile", ANGLE, "--yes", *where)["verdict"] == "authentic"
+    file = desk.folder / "run.csv"
+    request = ["--rate", "200", "--duration", "3", "--trigger", "--test-pattern", "--to", file]
+    said = station.run("measure", node.uuid, other.uuid, *request, *links)
+    assert said.code == 0, said
+    counted = re.findall(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", said.out + said.err)
+    assert sum(int(values) for values, *_ in counted) >= 2 * 500
+    assert {tuple(map(int, rest)) for _, _, *rest in counted} == {(0, 0, 0)}
