@@ -234,6 +234,12 @@ class VaultChanged(VaultFailure):
     code = "vault-changed"
 
 
+class NoPassphrase(VaultFailure):
+    """A passphrase or PIN is needed, and nobody can be asked for it."""
+
+    code = "no-passphrase"
+
+
 class WrongPassphrase(VaultFailure):
     """The passphrase or PIN does not open the vault."""
 

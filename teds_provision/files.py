@@ -60,7 +60,7 @@ def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[t
     if not path.name:  # "" and "/"
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if replace and path.exists() and not (path.is_file() or path.is_dir()):  # a rename would end a device: /dev/null
-        raise OSError(errno.EINVAL, "it is a device, a pipe or a socket, which is not replaced by a file", str(path))
+        raise OSError(errno.EINVAL, "it is a device, pipe or socket and cannot be replaced by a file", str(path))
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
     _sweep(path)
     descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
@@ -139,7 +139,7 @@ def require_new(path: Path) -> None:
     if path.exists() or path.is_symlink():
         raise _taken(path)
     if not path.parent.is_dir():
-        raise NotFound(f"There is no folder {path.parent}.", hint="Make it, or name another place.")
+        raise NotFound(f"There is no folder {path.parent}.", hint="Create it, or choose another path.")
 
 
 def read_limited(
@@ -158,7 +158,7 @@ def read_limited(
     with _failing_as(path, failure):
         octets = _read(_opened(path, 0 if follow else os.O_NOFOLLOW), max_octets + 1)
     if len(octets) > max_octets:
-        raise BadData(f"{path} is larger than {max_octets} octets: that is no {what}.")
+        raise BadData(f"{path} is larger than {max_octets} octets, which is too large for a {what}.")
     return octets
 
 
@@ -216,7 +216,7 @@ def _failing_as(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]
     except IsADirectoryError:
         raise NotFound(f"{path} is a folder, not a file.") from None
     except ValueError as error:  # a zero octet in the name
-        raise NotFound(f"{str(path)!r} is no name of a file.") from error
+        raise NotFound(f"{str(path)!r} is not a valid file name.") from error
     except OSError as error:
         raise failure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
 
@@ -377,12 +377,12 @@ def _remove_if_left(left: Path) -> None:
 
 
 def _taken(path: Path) -> UsageFailure:
-    return UsageFailure(f"{path} exists already and is not overwritten.", hint="Choose another name.")
+    return UsageFailure(f"{path} already exists and is not overwritten.", hint="Choose another name.")
 
 
 def _cannot_write(path: Path, error: OSError, failure: type[TedsProvisionError]) -> TedsProvisionError:
     if failure is StoreFailure and isinstance(error, FileNotFoundError | NotADirectoryError):  # of a name from a user
-        return NotFound(f"There is no folder {path.parent}.", hint="Make it, or name another place.")
+        return NotFound(f"There is no folder {path.parent}.", hint="Create it, or choose another path.")
     if isinstance(error, IsADirectoryError):
         return UsageFailure(f"{path} is a folder, not a file.", hint="Name a file in it.")
-    return failure(f"{path} cannot be written: {error.strerror}.", hint="Mend that and run the same command again.")
+    return failure(f"{path} cannot be written: {error.strerror}.", hint="Fix that and run the same command again.")

@@ -87,7 +87,7 @@ def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, f
             raise BadData(f"{file}:{error.lineno}: this is not JSON: {error.msg}.") from error
         raise BadData(f"{_upper(what)} is not JSON: line {error.lineno}: {error.msg}.") from error
     except UnicodeDecodeError as error:
-        raise BadData(f"{_upper(what)} is no text: it is binary, or not UTF-8.") from error
+        raise BadData(f"{_upper(what)} is not text: it is binary, or not UTF-8.") from error
     except ValueError as error:
         raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} cannot be read: {error}.") from error
     if opened > LIMITS.json_depth:  # fewer brackets than levels nest no deeper

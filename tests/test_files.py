@@ -83,7 +83,7 @@ def test_a_device_is_never_replaced(tmp_path: Path, link: bool) -> None:
     os.mkfifo(pipe)
     named = tmp_path / "named"
     named.symlink_to(pipe)
-    with pytest.raises(UsageFailure, match="is a device, a pipe or a socket"):
+    with pytest.raises(UsageFailure, match="is a device, pipe or socket"):
         write_whole(named if link else pipe, b"new", failure=UsageFailure)
     assert pipe.is_fifo()
     assert named.is_symlink()
@@ -145,7 +145,7 @@ def test_what_a_killed_writer_left_goes_and_nothing_else_does(tmp_path: Path) ->
 def test_what_is_not_there_or_too_large_or_a_folder(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"12345")
     assert read_limited(tmp_path / "a", 5, "key") == b"12345"
-    with pytest.raises(BadData, match="larger than 4 octets: that is no key"):
+    with pytest.raises(BadData, match="larger than 4 octets, which is too large for a key"):
         read_limited(tmp_path / "a", 4, "key")
     for name in ("none", "nu\0l", "."):
         with pytest.raises(NotFound):

@@ -68,7 +68,7 @@ def backup(
             warnings += _note(station, notice, sha256=digest, to=to, nodes=nodes, keys=keys)
     except OSError as error:
         raise VaultFailure(
-            f"{path} cannot be written: {error.strerror}.", hint="Mend that and run the same command again."
+            f"{path} cannot be written: {error.strerror}.", hint="Fix that and run the same command again."
         ) from error
     return BackedUp(octets, digest, nodes, keys, to, tuple(warnings))
 
@@ -100,8 +100,8 @@ def _read_back(station: Station, draft: Path, key: bytes) -> tuple[int, int, int
             return found["nodes"], found["keys"], sum(1 for _ in content.unopened(station.vault))
     except TedsProvisionError as error:
         raise StoreFailure(
-            f"The backup was written and does not open again: {error.message}",
-            hint=f"Nothing was kept. Check the disk (at most {MAX_OCTETS >> 30} GiB are read), then run it again.",
+            f"The backup was written but cannot be opened: {error.message}",
+            hint=f"It was deleted. Check the disk (at most {MAX_OCTETS >> 30} GiB are read), then run it again.",
         ) from error
 
 

@@ -80,7 +80,7 @@ class ChunkReader:
         parts = []
         while size > 0:
             if self._place == len(self._plain) and not self._next():
-                raise BadData("The content of the backup ends too early.")
+                raise BadData("The content of the backup is incomplete.")
             part = self._plain[self._place : self._place + size]
             self._place += len(part)
             size -= len(part)
@@ -95,13 +95,13 @@ class ChunkReader:
         while (octet := self.read(1)) != b"\n":
             line += octet
             if len(line) > limit:
-                raise BadData("The content of the backup has no head.")
+                raise BadData("The content of the backup has no header.")
         return bytes(line)
 
     def require_end(self) -> None:
         """Raise BadData unless everything was given out."""
         if self._place != len(self._plain) or self._next():
-            raise BadData("The backup goes on after its end.")
+            raise BadData("The backup has data after its end.")
 
     def _next(self) -> bool:
         """Open the next chunk; False after the last."""
@@ -110,13 +110,13 @@ class ChunkReader:
         self._ahead += self._source.read(_FULL + len(END) + 1 - len(self._ahead))
         last = len(self._ahead) <= _FULL + len(END)
         if last and not self._ahead.endswith(END):
-            raise BadData("The backup was cut off: its end is missing.", hint="Take another copy.")
+            raise BadData("The backup was cut off: its end is missing.", hint="Use another copy.")
         sealed = self._ahead[: -len(END)] if last else self._ahead[:_FULL]
         self._ahead = b"" if last else self._ahead[_FULL:]
         try:
             self._plain = self._cipher.decrypt(_nonce(self._index, last=last), sealed, self._context)
         except (InvalidTag, ValueError):
-            raise NotAuthentic("The backup was damaged or changed.", hint="Take another copy.") from None
+            raise NotAuthentic("The backup was damaged or changed.", hint="Use another copy.") from None
         self._place, self._done = 0, last
         self._index += 1
         return bool(self._plain)

@@ -29,7 +29,7 @@ def check_digest(document: dict[str, Any]) -> None:
     """Raise NotAuthentic where a file's ``sha256`` is not over the rest of it: so damage is told from a wrong key."""
     rest = {name: value for name, value in document.items() if name != "sha256"}
     if document.get("sha256") != digest_of(rest):
-        raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
+        raise NotAuthentic("The backup was damaged or changed: its digest does not match.", hint="Use another copy.")
 
 
 def context_of(clear: dict[str, Any], form: str) -> bytes:
@@ -71,7 +71,7 @@ class BackupHead:
         """The head that a line says; raises BadData: another format, a text that is missing, no point of P-256."""
         members = load_object(line, "The head of the backup")
         if members.get("format") != form or not all(isinstance(members.get(name), str) for name in _TEXTS):
-            raise BadData("The head of the backup is not of this version.")
+            raise BadData("The header of the backup is from another version.")
         try:
             point = bytes.fromhex(members["point"])
         except ValueError:

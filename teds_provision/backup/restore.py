@@ -36,7 +36,7 @@ from teds_provision.vault.passphrase import PRODUCT, Costs
 class Restored:
     """What was done (or would be): ``rebuilt``, ``merged`` or ``nothing``; how much came back, and what stayed.
 
-    ``rotations_due`` counts the nodes whose key has to be rotated by tap, or by a person's word, before anything else.
+    ``rotations_due`` counts the nodes whose key must be rotated by tap, or by a person's word, before anything else.
     """
 
     action: str
@@ -101,8 +101,8 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
             if (present := open_present(home, content)) is not None:  # the person was told of a home without one
                 present.close()
                 raise VaultChanged(
-                    f"Another command has made the station in {home} meanwhile; this one changed nothing.",
-                    hint="Run it again: it brings back what is lacking.",
+                    f"Another command has created the station in {home} in the meantime; this one changed nothing.",
+                    hint="Run it again: it restores what is missing.",
                 )
             vault, why = bring_vault(home, content, known, wanted, costs)
             kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
@@ -156,7 +156,7 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
         )
     if content.in_token and not into_token:
         raise PolicyRefused(
-            "The station's key is in a token and cannot be put elsewhere.",
+            "The station's key is in a token and cannot be stored elsewhere.",
             hint="Restore with --keystore pkcs11:URI of that token.",
         )
     if into_token and not content.in_token:

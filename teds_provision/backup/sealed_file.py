@@ -88,7 +88,7 @@ class SealedFile:
         if line.lstrip()[:1] != b"{":
             raise BadData("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
         if self.octets > MAX_OCTETS:
-            raise BadData(f"The file is larger than {MAX_OCTETS} octets; no backup is.")
+            raise BadData(f"The file is larger than {MAX_OCTETS} octets; backups are smaller.")
         self._line = line
         if not line.startswith(b'{"format":"teds-backup/2"'):
             if b"teds-backup/1" in line or b'"protected"' in line:
@@ -97,7 +97,7 @@ class SealedFile:
         if not line.endswith(b"\n") or not isinstance(
             (head := load_object(line, "The head of the backup")).get("key"), dict
         ):
-            raise BadData("The backup was cut off in its head, or it is damaged.", hint="Take another copy.")
+            raise BadData("The backup is truncated in its header, or damaged.", hint="Use another copy.")
         self._head = head
         self.is_for_key = "protected" in head["key"]
 
@@ -139,7 +139,7 @@ class SealedFile:
 def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Content:
     head = BackupHead.read(chunks.read_line(MAX_HEAD_OCTETS), FORMAT)
     if (head.store, head.station, head.created) != (clear["store"], clear["station"], clear["created"]):
-        raise NotAuthentic("The backup says outside that it is of another station than it is inside.")
+        raise NotAuthentic("The backup's header names a different station than its content.")
     copy = load_rows(chunks)
     try:
         signed = _LABEL + bound + chunks.digest.digest()

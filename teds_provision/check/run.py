@@ -28,7 +28,7 @@ _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
 _NEEDS_KEY = "The node has no key. Ask with --factory to give it one."
 
 
-_GONE = "The node does not answer any more."
+_GONE = "The node no longer answers."
 _TORN_TRIES = 3
 """So often a rule is tried whose replies come torn; on a bus each try has repetitions of its own below it."""
 

@@ -144,16 +144,16 @@ def read_file(path: Path) -> bytes:
     metavar="IMAGE",
     help="Write the signed image to this file; with --by, the request.",
 )
-@click.option("--by", metavar="OFFICE", help="Have this station of the plant sign; the node must be at hand.")
-@click.option("--job", metavar="ID", help="With --by: the job that the board is of.")
+@click.option("--by", metavar="OFFICE", help="Have this station of the plant sign; the node must be reachable.")
+@click.option("--job", metavar="ID", help="With --by: the job that the board belongs to.")
 @click.option(
-    "--calibration", type=FileToRead(), metavar="FILE", help="With --by: the calibration that it was built from."
+    "--calibration", type=FileToRead(), metavar="FILE", help="With --by: the calibration that it was built with."
 )
 @click.option(
     "--files",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="With --by: the folder that carries to the office, in place of the registry.",
+    help="With --by: transfer folder to the office, instead of the registry.",
 )
 @click.option("--read-node", is_flag=True, help="Use the node's own epoch, sequence and TEDS instead of the store's.")
 @click.option(

@@ -47,7 +47,7 @@ _NEGATIVE: dict[str, Any] = {"ignore_unknown_options": True}  # -0.5 is a value,
     )
 )
 def calibrate() -> None:
-    """Set a sensor's zero where it is mounted, and take calibration points from it."""
+    """Zero a mounted sensor, and take calibration points from it."""
 
 
 @command(
@@ -57,7 +57,7 @@ def calibrate() -> None:
 )
 @click.argument("node", metavar="UUID")
 @click.argument("channel", type=ChannelNumber())
-@click.option("--value", type=float, metavar="V", help="What the channel is to read now (default: 0).")
+@click.option("--value", type=float, metavar="V", help="What the channel should read now (default: 0).")
 @click.option("--unit", metavar="U", help="Unit of V (default: the SI unit of the datasheet).")
 @click.option(
     "--accept-calibration", metavar='"WHY"', help="Accept a result that the guard refuses; the reason is logged."
@@ -77,11 +77,11 @@ def zero(
     dry_run: bool,
     links: LinkSettings,
 ) -> None:
-    """Have a channel read 0 now, or --value V, in one step.
+    """Make a channel read 0, or --value V, where it stands now.
 
-    It is read, and its datasheet signed, written and verified with another zero offset. The curve and the date of its
-    calibration stay, and the date of the zero stands beside it. Nothing is written where the sensor is restless, or the
-    guard refuses the result (exit 6). An ncap that measures the node lets it go meanwhile.
+    Reads the channel, then signs, writes and verifies the datasheet with the new zero offset. The curve and the date of
+    the calibration stay; the zero offset gets a date of its own. Nothing is written if the reading is unstable or the
+    guard refuses the result (exit 6). A running ncap releases the node in the meantime.
     """
     if value is not None and not math.isfinite(value):
         raise UsageFailure("--value is not a finite number.")
@@ -137,7 +137,7 @@ def _zero_lines(done: Zeroed, *, dry_run: bool) -> str:
     changes = "".join(f"\n  {text}" for text in done.changes)
     if dry_run:
         return f"Plan: {read} ({seen}); it would read {channel.show(done.after)}, {offset}.{changes}"
-    said = f"{read} ({seen}) and reads {channel.show(done.after)} now: {offset}."
+    said = f"{read} ({seen}) and now reads {channel.show(done.after)}: {offset}."
     return f"{said}{changes}\nWritten and verified, sequence {done.sequence}."
 
 
@@ -147,7 +147,9 @@ def _zero_lines(done: Zeroed, *, dry_run: bool) -> str:
 )
 @click.argument("node", metavar="UUID")
 @click.argument("channel", type=ChannelNumber())
-@click.option("--reference", type=float, required=True, metavar="V", help="What the sensor really stands at.")
+@click.option(
+    "--reference", type=float, required=True, metavar="V", help="True value at this moment, from your reference."
+)
 @click.option("--unit", metavar="U", help="Unit of V (default: the SI unit of the datasheet).")
 @click.option(
     "--to",
@@ -155,7 +157,7 @@ def _zero_lines(done: Zeroed, *, dry_run: bool) -> str:
     type=click.Path(path_type=Path, dir_okay=False),
     required=True,
     metavar="FILE.csv",
-    help="Calibration file that gets the point; it is made where it is not there.",
+    help="Calibration file to add the point to; created if missing.",
 )
 @link_options
 @pass_app
@@ -164,8 +166,8 @@ def capture(
 ) -> None:
     """Take one calibration point from the running sensor.
 
-    The mean of 32 raw values over half a second is written beside the reference, with their spread and count. The file
-    is one for --calibration; calibrate fit shows what a fit of it is worth. Others may measure the sensor meanwhile.
+    Records the mean of 32 raw values, taken over half a second, with the reference, the spread and the count. Pass the
+    file to --calibration; calibrate fit shows how good the fit is. The sensor may be in use while you capture.
     """
     if not math.isfinite(reference):
         raise UsageFailure("--reference is not a finite number.")
@@ -205,21 +207,21 @@ def capture(
 @click.argument("file", type=FileToRead(), metavar="FILE.csv")
 @click.option("--method", type=click.Choice(METHODS), help="How to fit (default: as the file says, else table).")
 @click.option("--degree", type=WholeNumber(1, 12), metavar="N", help="Degree of a polynomial (default: 3).")
-@click.option("--profile", "-p", metavar="P", help="Also hold it against this transducer type and the guard.")
+@click.option("--profile", "-p", metavar="P", help="Also check it against this transducer type and the guard.")
 @pass_app
 def fit(app: App, file: Path, method: str | None, degree: int | None, profile: str | None) -> None:
-    """Show how well a calibration meets its points.
+    """Show how well a calibration fits its points.
 
-    Nothing is written to a node. A table goes through every point; what each inner point is missed by without it stands
-    beside the residuals.
+    Writes nothing to a node. A table passes through every point, so the error at each inner point of a fit without that
+    point is shown as well.
     """
     text = read_text(file, LIMITS.text_file, "calibration")
     warnings: tuple[str, ...] = ()
     if profile is not None:
         if method is not None or degree is not None:
             raise UsageFailure(
-                "--profile says the method itself.",
-                hint="Leave --method and --degree out, or write them into the file.",
+                "The profile already sets the method.",
+                hint="Omit --method and --degree, or write them into the file.",
             )
         prepared = steps.build.prepare(app.station(), steps.build.BuildOrder(profile, calibration=file))
         fitted, warnings = dict(prepared.calibrations or {}), prepared.warnings
@@ -268,7 +270,7 @@ def _fits(console: Console, fitted: Sequence[Calibration], told: Sequence[dict[s
         if said["left_out"] is not None:
             worst, rms = said["left_out"]["maximum"], said["left_out"]["rms"]
             console.print(
-                f"Each inner point left out in turn is missed by up to {worst:.3g} {unit}, rms {rms:.3g} {unit}.",
+                f"Leave-one-out error of the inner points: up to {worst:.3g} {unit}, rms {rms:.3g} {unit}.",
                 markup=False,
             )
 

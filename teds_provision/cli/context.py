@@ -14,7 +14,14 @@ import click
 from teds_provision import protocol, vault
 from teds_provision import station as station_room
 from teds_provision.cli.config_file import home_of
-from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
+from teds_provision.errors import (
+    NoPassphrase,
+    PolicyRefused,
+    StoreFailure,
+    TedsProvisionError,
+    UsageFailure,
+    WrongPassphrase,
+)
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize, sanitize_json
 
@@ -239,7 +246,7 @@ class App:
 
     def _typed(self, prompt: str, *, confirm: bool, instead: str) -> str:
         if self.no_input or not sys.stdin.isatty():
-            raise WrongPassphrase(
+            raise NoPassphrase(
                 f"{prompt.rstrip(': ')} is needed, but there is no terminal to ask on.",
                 hint=f"Pass it through a file descriptor: {instead}.",
             )

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     ),
 )
 def evidence() -> None:
-    """List, export and check proof of every board: one file per board and attempt, signed by station and board."""
+    """List, export and verify evidence: one file per board and attempt, signed by station and board."""
 
 
 @command(
@@ -45,15 +45,15 @@ def evidence() -> None:
 @click.argument("files", metavar="FILE|DIR…", nargs=-1, required=True)
 @click.option("--ca", type=FileToRead(), required=True, metavar="KEY.pem", help="The owner's CA key.")
 @click.option("--pins", type=FileToRead(), metavar="FILE", help="Whitelist file: the key of each board.")
-@click.option("--roster", type=FileToRead(), metavar="FILE", help="Also hold it against this roster of the plant.")
+@click.option("--roster", type=FileToRead(), metavar="FILE", help="Also check it against this roster of the plant.")
 @pass_app
 def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster: Path | None) -> None:
-    """Check evidence with nothing but files.
+    """Verify evidence offline, from files alone.
 
-    It needs no station, no store and no network. A file holds if a station certified by this CA signed it, its
-    datasheet is authentic under this CA, and the board itself signed the facts. A good file may be about an attempt
-    that failed. One line each, totals at the end; exits with the worst: 4 for a file that does not hold, 8 for one
-    that cannot be read.
+    Needs no station, no store and no network. A file is valid if a station certified by this CA signed it, its
+    datasheet is authentic under this CA, and the board itself signed the facts. Valid evidence may document a failed
+    attempt. Prints one line each, then totals; exits with the worst: 4 for an invalid file, 8 for one that cannot be
+    read.
     """
     grounds = plant.verify_evidence.Grounds.of(protocol.keys.from_pem(read_file(ca)), pins, roster)
     names = json_files([Path(file) for file in files], "evidence")
@@ -67,7 +67,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
         words = ", ".join(f"{count} {word}" for word, count in sorted(totals.words.items()))
         app.lines([f"{totals.files} file{'' if totals.files == 1 else 's'}: {words}."])
         if roster is None:
-            app.note("Without --roster, evidence of a station that was stolen holds as well.")
+            app.note("Without --roster, evidence from a stolen station counts as valid too.")
     if totals.exit_code:
         raise click.exceptions.Exit(totals.exit_code)
 
@@ -87,7 +87,7 @@ def _json(judged: JudgedEvidence) -> str:
 
 @command("teds-provision evidence list", "teds-provision evidence list 8d4d --job 0b5f", name="list")
 @click.argument("uuids", metavar="[UUID…]", nargs=-1)
-@click.option("--job", metavar="ID", help="Only that of one job.")
+@click.option("--job", metavar="ID", help="Only evidence of this job.")
 @pass_app
 def list_evidence(app: App, uuids: tuple[str, ...], job: str | None) -> None:
     """List the evidence that this station keeps, by board and attempt."""
@@ -114,7 +114,7 @@ def list_evidence(app: App, uuids: tuple[str, ...], job: str | None) -> None:
             shown.add_row(row.uuid.hex(), job, unit, str(row.attempt), row.verdict, local_time(row.finished))
         print_table(console, shown)
 
-    none = "There is no evidence yet. To keep it: teds-provision provision --evidence"
+    none = "There is no evidence yet. To collect it: teds-provision provision --evidence"
     app.emit({"evidence": told}, table if told else none)
 
 
@@ -125,13 +125,13 @@ def list_evidence(app: App, uuids: tuple[str, ...], job: str | None) -> None:
 )
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @click.argument("uuids", metavar="[UUID…]", nargs=-1)
-@click.option("--job", metavar="ID", help="Only that of one job.")
+@click.option("--job", metavar="ID", help="Only evidence of this job.")
 @dry_run_option
 @pass_app
 def export(app: App, folder: Path, uuids: tuple[str, ...], job: str | None, dry_run: bool) -> None:
     """Write evidence to files, UUID.N.json.
 
-    One per board and attempt; a file that holds the same already is left as it is.
+    One file per board and attempt; a file with the same content is left alone.
     """
     station = app.station()
     files = plant.evidence.export(station.plant.line, _rows(station, uuids, job), folder, write=not dry_run)

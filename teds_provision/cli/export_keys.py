@@ -49,16 +49,16 @@ _MEANS = {
     metavar="FILE",
     help="Where to write the sealed bundle.",
 )
-@click.option("--send", is_flag=True, help="Leave it at the registry with the next sync, instead of a file.")
+@click.option("--send", is_flag=True, help="Send it through the registry at the next sync, instead of a file.")
 @click.option(
     "--expires",
     type=WholeNumber(1, 365),
     default=7,
     show_default=True,
     metavar="DAYS",
-    help="How many days it can be imported.",
+    help="Days until the bundle expires.",
 )
-@click.option("--ca", metavar="FINGERPRINT", help="Only nodes that keep this CA key.")
+@click.option("--ca", metavar="FINGERPRINT", help="Only nodes that hold this CA key.")
 @yes_option
 @dry_run_option
 @pass_app

@@ -41,7 +41,7 @@ _MOVED = "A move: each key is rotated at the first contact; until then, the send
     "teds-provision import-keys --received",
 )
 @click.argument("file", type=options.FileToRead(), required=False)
-@click.option("--received", is_flag=True, help="Take in what came through the registry and waits for a person.")
+@click.option("--received", is_flag=True, help="Import parcels from the registry that wait for confirmation.")
 @click.option(
     "--prove/--no-prove", default=None, help="Contact each node and open a session (default if a link is named)."
 )
@@ -121,7 +121,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
         except TedsProvisionError as error:
             app.warn(f"{row.id}: {error.message}")
             continue
-        app.note(f"{_import_text(station, shown)}\nIt waits because: {row.detail or 'it came just now'}")
+        app.note(f"{_import_text(station, shown)}\nReason for waiting: {row.detail or 'it has just arrived'}")
         one = {**_import_plan(shown), "parcel": row.id, "why": row.detail}
         told.append(one)
         if dry_run:
@@ -133,7 +133,7 @@ def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> N
             done = plant.parcels.import_parcel(station, row, plan)
         one["fresh"] = done.fresh
     count = f"{len(told)} parcel{'s' * (len(told) != 1)}"
-    text = f"{count}." if dry_run else f"{count} taken in; receipts leave with the next sync."
+    text = f"{count}." if dry_run else f"{count} imported; the receipts leave with the next sync."
     app.emit({"received": told, "plan": dry_run}, text if told else "Nothing waits.")
 
 

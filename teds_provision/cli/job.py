@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     ),
 )
 def job() -> None:
-    """Jobs for a line: a keeper says what may be built, how often, by which station and until when."""
+    """Jobs for a line: a keeper defines what may be built, how many, by which station and until when."""
 
 
 @command(
@@ -44,37 +44,51 @@ def job() -> None:
     "teds-provision job new --title spares -p load-cell --list boards.csv --station west --ends 2027-01-31",
     name="new",
 )
-@click.option("--title", required=True, metavar="TEXT", help="What people call it.")
-@click.option("--profile", "-p", required=True, metavar="P", help="Transducer type; its file is named by SHA-256.")
-@click.option("--count", type=WholeNumber(1), metavar="N", help="So many boards, whichever come.")
-@click.option("--list", "listed", type=FileToRead(), metavar="FILE", help="These boards: uuid, fingerprint.")
-@click.option("--station", "stations", multiple=True, required=True, metavar="NAME[=N]", help="Who builds, how many.")
+@click.option("--title", required=True, metavar="TEXT", help="Title of the job.")
+@click.option(
+    "--profile", "-p", required=True, metavar="P", help="Transducer type; the job pins the SHA-256 of its file."
+)
+@click.option("--count", type=WholeNumber(1), metavar="N", help="Any boards, up to this number.")
+@click.option("--list", "listed", type=FileToRead(), metavar="FILE", help="Only these boards (uuid, fingerprint).")
+@click.option(
+    "--station", "stations", multiple=True, required=True, metavar="NAME[=N]", help="Station that builds; its share."
+)
 @click.option("--ends", required=True, metavar="TIME", help="When it ends.")
 @click.option("--not-before", metavar="TIME", help="When it begins (default: now).")
-@click.option("--calibration", type=FileToRead(), metavar="FILE", help="The same calibration for all.")
+@click.option("--calibration", type=FileToRead(), metavar="FILE", help="One calibration for all boards.")
 @click.option(
     "--calibrations",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="A calibration for each board: files UUID.csv, .toml or .json.",
+    help="Directory with a calibration per board: UUID.csv, .toml or .json.",
 )
-@click.option("--calibration-age", type=WholeNumber(1), metavar="DAYS", help="Any calibration, at most so old.")
+@click.option("--calibration-age", type=WholeNumber(1), metavar="DAYS", help="Any calibration no older than this.")
 @click.option(
-    "--assurance", type=click.Choice(["uuid", "bus", "tap"]), default="tap", show_default=True, help="How it is met."
+    "--assurance",
+    type=click.Choice(["uuid", "bus", "tap"]),
+    default="tap",
+    show_default=True,
+    help="How boards are identified.",
 )
 @click.option("--sign", default="station", show_default=True, metavar="station|NAME", help="Who signs the datasheets.")
-@click.option("--no-evidence", is_flag=True, help="Keep no proof of each board.")
-@click.option("--read-only", multiple=True, metavar="CHANNEL:CODE", help="TEDS that boards bring and nobody writes.")
+@click.option("--no-evidence", is_flag=True, help="Do not keep evidence of each board.")
+@click.option("--read-only", multiple=True, metavar="CHANNEL:CODE", help="TEDS that boards bring and keep.")
 @click.option("--name", metavar="PATTERN", help="Name of each board: {unit}, {unit:03}, {uuid}, {uuid8}.")
-@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Also write it.")
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also write the job to FILE.",
+)
 @dry_run_option
 @pass_app
 def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
-    """Make a job and sign it; this station must be a keeper."""
+    """Create and sign a job; this station must be a keeper."""
     station = app.station()
     roster = plant.jobs.roster_of(station)
     if not roster.has(station.identity.fingerprint, "keeper"):
-        raise PolicyRefused("This station is not a keeper: nobody would take its job.", hint="Ask a keeper.")
+        raise PolicyRefused("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
     drafted = _drafted(station, roster, told)
     if dry_run:  # what nobody would take is refused in a plan too
         protocol.plant.job.seal_job(drafted, protocol.keys.SoftwareKey.generate())
@@ -85,13 +99,13 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
         if output is not None:
             write_file(output, octets.decode())
     app.emit(
-        _to_json(station, drafted), f"{'Would make' if dry_run else 'Made'} job {drafted.id}: {_sentence(drafted)}"
+        _to_json(station, drafted), f"{'Would create' if dry_run else 'Created'} job {drafted.id}: {_sentence(drafted)}"
     )
 
 
 def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
     if (told["count"] is None) == (told["listed"] is None):
-        raise UsageFailure("A job is for a number of boards or for a list.", hint="Use one of --count and --list.")
+        raise UsageFailure("A job needs a number of boards or a list of boards.", hint="Use one of --count and --list.")
     path = find_profile(told["profile"], default_folders(station.home))
     load_profile(path, default_folders(station.home)).build(bytes(10))  # else nobody could work on the job
     boards = _boards(told["listed"]) if told["listed"] is not None else {}
@@ -127,7 +141,7 @@ def _boards(path: Path) -> dict[bytes, str]:
     listed = steps.whitelist.read_whitelist(path)
     for one in listed:
         if one.fingerprint is None or len(one.fingerprint) != 64:
-            raise BadData(f"{path}:{one.line}: a job names the whole fingerprint (64 digits) of each board.")
+            raise BadData(f"{path}:{one.line}: a job needs the full fingerprint (64 digits) of each board.")
     return {one.uuid: one.fingerprint or "" for one in listed}
 
 
@@ -135,7 +149,7 @@ def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
     given = [name for name in ("calibration", "calibrations", "calibration_age") if told[name] is not None]
     if len(given) > 1:
         named = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise UsageFailure("A job has one rule for calibrations.", hint=f"Use one of {named}.")
+        raise UsageFailure("A job takes one calibration option.", hint=f"Use one of {named}.")
     rule = protocol.plant.job.CalibrationRule
     if told["calibration"] is not None:
         return rule("one", plant.jobs.digest_of_file(told["calibration"]))
@@ -158,7 +172,9 @@ def _allotments(roster: Roster, texts: Sequence[str], total: int) -> dict[str, i
     for text in texts:
         station, number = _allotment(roster, text, total)
         if station in allotted:
-            raise UsageFailure(f"Station {roster.name_of(station)} is named twice.", hint="Give each one allotment.")
+            raise UsageFailure(
+                f"Station {roster.name_of(station)} is named twice.", hint="Give each station one allotment."
+            )
         allotted[station] = number
     return allotted
 
@@ -169,7 +185,7 @@ def _allotment(roster: Roster, text: str, total: int) -> tuple[str, int]:
     if found is None or roster.member(found.fingerprint) is None:
         raise NotFound(f"The roster has no member {name!r}.", hint="See: teds-provision registry status")
     if not number.isdecimal() or not int(number) >= 1:
-        raise UsageFailure(f"{text!r}: an allotment is a number from 1 on.")
+        raise UsageFailure(f"{text!r}: an allotment must be 1 or more.")
     return found.fingerprint, int(number)
 
 
@@ -226,7 +242,9 @@ def list_jobs(app: App) -> None:
             shown.add_row(one.id[:8], one.title, one.profile, str(one.total), counted, until, said["state"])
         print_table(console, shown)
 
-    app.emit({"jobs": told}, table if told else "There are no jobs yet. A keeper makes one: teds-provision job new")
+    app.emit(
+        {"jobs": told}, table if told else "There are no jobs yet. To create one, at a keeper: teds-provision job new"
+    )
 
 
 @command("teds-provision job show fifty.jws", name="show")
@@ -248,7 +266,7 @@ def show(app: App, which: str) -> None:
         f"boards       {found.total}{', by list' if found.boards else ''}; {said['units']} given here",
         f"stations     {who}",
         f"from, until  {local_time(found.not_before.isoformat())}, {local_time(found.ends.isoformat())}",
-        f"met by       {found.assurance}",
+        f"assurance    {found.assurance}",
         f"signs        {'each station' if found.office is None else roster.name_of(found.office)}",
         f"evidence     {'yes' if found.evidence else 'no'}",
         f"state        {said['state']}",
@@ -262,14 +280,14 @@ def show(app: App, which: str) -> None:
     "--files",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="A folder that carries, in place of the registry.",
+    help="Transfer folder, instead of the registry.",
 )
 @dry_run_option
 @pass_app
 def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
     """Send a job to its stations and its office.
 
-    They know it after their next sync; `provision --job ID` takes it from there.
+    They have it after their next sync, and then run `provision --job ID`.
     """
     station = app.station()
     found = plant.jobs.find_job(station, which)
@@ -290,7 +308,7 @@ def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
 @dry_run_option
 @pass_app
 def close(app: App, which: str, dry_run: bool) -> None:
-    """Close a job at this station: it takes no further board here."""
+    """Close a job on this station: it accepts no further boards here."""
     station = app.station()
     found = plant.jobs.find_job(station, which)
     if not dry_run:
@@ -305,13 +323,19 @@ def close(app: App, which: str, dry_run: bool) -> None:
 )
 @click.argument("which", metavar="FILE|ID")
 @click.argument("evidence", metavar="[FILE|DIR…]", nargs=-1)
-@click.option("--csv", "csv_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Attempts.")
+@click.option(
+    "--csv",
+    "csv_file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also write all attempts to FILE.",
+)
 @pass_app
 def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None) -> None:
-    """Show how a job goes, station by station.
+    """Show the progress of a job, station by station.
 
-    Boards, first-pass yield, seconds per step, failures by code. Other stations' evidence may be added (what
-    `evidence export` wrote there); of a station without any, its pages count.
+    Counts boards, first-pass yield, seconds per step and failures by code. Add other stations' evidence, as written
+    there by `evidence export`; without it, a station's figures come from its pages.
     """
     station = app.station()
     found = plant.jobs.find_job(station, which)
@@ -321,10 +345,10 @@ def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None)
     if csv_file is not None:
         write_file(csv_file, plant.yields.to_csv(station, attempts))
     told = {**_to_json(station, found), "stations": [part.to_json() for part in parts]}
-    app.emit(told, lambda console: _table(console, found, parts))
+    app.emit(told, lambda console: _table(console, found, parts, station.fingerprint))
 
 
-def _table(console: Console, found: Job, parts: list[StationYield]) -> None:
+def _table(console: Console, found: Job, parts: list[StationYield], here: str) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -345,6 +369,10 @@ def _table(console: Console, found: Job, parts: list[StationYield]) -> None:
         for step, (middle, worst) in part.steps.items():
             times.add_row(step, f"{middle:.2f}", f"{worst:.2f}")
         print_table(console, times)
+    silent = ", ".join(part.name for part in parts if not part.attempts and part.station != here)
+    if silent:
+        hint = f"To add evidence exported there: teds-provision job status {found.id[:8]} DIR"
+        console.print(f"{silent}: nothing received yet, neither pages nor evidence. {hint}", markup=False)
 
 
 for one in (new, list_jobs, show, send, close, status):

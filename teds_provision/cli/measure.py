@@ -61,7 +61,9 @@ KINDS = ("periodic", "event", "free")
     "--to", "files", multiple=True, metavar="FILE", help="Record to this file: .csv, .txt, .mcap, .jsonl; repeatable."
 )
 @click.option(
-    "--wide", is_flag=True, help="Write .csv and .txt as one grid: a row a time, a column a channel, no raw values."
+    "--wide",
+    is_flag=True,
+    help="Write .csv and .txt as one table: a row per time, a column per channel, no raw values.",
 )
 @click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="With recover: the new file.")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
@@ -156,7 +158,7 @@ def _wide(files: Sequence[str]) -> list[str]:
     """The words for files of text whose rows are one grid."""
     text = [Path(name).suffix.lower() in measure_room.sinks.TEXT for name in files]
     if not any(text):
-        raise UsageFailure("--wide is for text files.", hint="Add --to FILE.csv")
+        raise UsageFailure("--wide only works with text files.", hint="Add --to FILE.csv")
     return [f"wide:{name}" if is_text else name for name, is_text in zip(files, text, strict=True)]
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import measure, teds
+from teds_provision import measure, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, dry_run_option, examples
 from teds_provision.errors import NotFound, UsageFailure
@@ -49,7 +49,7 @@ def list_names(app: App) -> None:
 def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> None:
     """Publish a channel under NAME.
 
-    Channel 0 stands for the node's or station's own part of its topics.
+    Channel 0 means the node's or station's own part of its topics.
     """
     station = app.station()
     uuid = _who(station, node)
@@ -77,7 +77,7 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
 def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
     """Publish a channel under its default name.
 
-    Channel 0 stands for the node's or station's own part of its topics.
+    Channel 0 means the node's or station's own part of its topics.
     """
     station = app.station()
     uuid = _who(station, node)
@@ -99,9 +99,9 @@ def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
 def set_frame(app: App, node: str, channel: int, frame: str, *, dry_run: bool) -> None:
     """Choose the coordinate frame of a channel for ROS.
 
-    Values are published with FRAME as their frame_id; "" takes the profile's again.
+    Values are published with FRAME as their frame_id; "" restores the profile's.
 
-    Channel 0 stands for every channel of the node that has no frame of its own.
+    Channel 0 means every channel of the node without a frame of its own.
     """
     station = app.station()
     uuid = station.nodes.resolve(node)
@@ -141,8 +141,11 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
         image = station.nodes.datasheet(record.uuid)
         if image is None:
             continue
-        for one in teds.sheet.Sheet.of(image).channels:
-            facts = measure.blocks.ChannelFacts(record.uuid.hex(), record.name or "", one.number, one.name)
+        sheet, judged = teds.sheet.Sheet.of(image), steps.reading.verdict_of(station, record.uuid)
+        unsigned = judged is not None and judged.verified.verdict == "unsigned"  # it is called what it calls itself
+        name = sheet.meta.name if unsigned else record.name or ""
+        for one in sheet.channels:
+            facts = measure.blocks.ChannelFacts(record.uuid.hex(), name, one.number, one.name, unverified=unsigned)
             found.append((record.uuid, one.number, facts))
     return found
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from teds_provision import client, plant
+from teds_provision import measure as measure_room
 from teds_provision.cli.config_file import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import (
@@ -63,13 +64,13 @@ _FILE = FileToRead(exists=True)
 )
 @click.option("--detection", type=click.Choice(["transparent", "whitelist"]), help="Which nodes to accept.")
 @click.option("--adopt", is_flag=True, help="In transparent mode, key factory nodes on a wired bus.")
-@click.option("--yes", "-y", is_flag=True, help="With --adopt: also sign the datasheet that such a node brought, where "
-              "nothing is wrong with it.")  # fmt: skip
-@click.option("--unverified", is_flag=True, help="With --adopt: measure such nodes by their own datasheets, "
-              "calibrated, under /STATION/unverified/.")  # fmt: skip
+@click.option("--yes", "-y", is_flag=True, help="With --adopt: also sign the datasheet that such a node"
+                                                " brought, unless it has findings.")  # fmt: skip
+@click.option("--unverified", is_flag=True, help="With --adopt: measure such nodes by their own unsigned"
+                                                 " datasheets, under /STATION/unverified/.")  # fmt: skip
 @click.option("--measure", metavar="all|GROUP|EXPR", help="Measure every authentic node that comes: all, a group, or "
               "type:PROFILE, name:GLOB, group:NAME, 'angle >= 360 deg', joined by commas.")  # fmt: skip
-@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="With --measure: at most so many samples a second.")
+@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="With --measure: maximum samples per second.")
 @click.option("--frozen", is_flag=True, help="With --measure: only the nodes known at the start, as one group array.")
 @click.option("--http", metavar="HOST:PORT", help="Serve the page and the API on this address, e.g. 127.0.0.1:8351.")
 @click.option(
@@ -93,7 +94,7 @@ _FILE = FileToRead(exists=True)
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Accept set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
               help="Time without set points before an actuator goes to its safe state.")  # fmt: skip
-@click.option("--registry", is_flag=True, help="Follow the registry that this station joined: sync as news come.")
+@click.option("--registry", is_flag=True, help="Stay in sync with the registry that this station joined.")
 @click.option("--metrics", is_flag=True, help="Serve /metrics for Prometheus.")
 @click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read-only.")
 @click.option("--nfc", multiple=True, metavar="PATH", help="Reader: auto, usb, udp:localhost:54321; repeatable.")
@@ -127,12 +128,12 @@ def run(
     if missing:
         raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install("ncap"))
     if said_here("yes") and not wished["adopt"]:
-        raise UsageFailure("--yes belongs to --adopt.", hint="Add --adopt --detection transparent.")
+        raise UsageFailure("--yes requires --adopt.", hint="Add --adopt --detection transparent.")
     if said_here("unverified") and not wished["adopt"]:
-        raise UsageFailure("--unverified belongs to --adopt.", hint="Add --adopt --detection transparent.")
+        raise UsageFailure("--unverified requires --adopt.", hint="Add --adopt --detection transparent.")
     wished["unverified"] = wished["unverified"] and wished["adopt"]
     if wished["measure"] is None and not wished["unverified"] and (wished["rate"] is not None or wished["frozen"]):
-        raise UsageFailure("--rate and --frozen belong to --measure.", hint="Add --measure all.")
+        raise UsageFailure("--rate and --frozen require --measure.", hint="Add --measure all.")
     places = [f"{link}:{one}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for one in named]
     sinks = [name for name, asked in (("ros1", ros1), ("ros2", ros2), (mqtt or "", mqtt)) if asked]
     wanted = settings.Settings(
@@ -282,7 +283,7 @@ def _status(console: Console, found: dict[str, Any]) -> None:
             why = f": {node['why']}" if node["why"] else ""
             console.print(f"  {node['uuid']} {node['state']}{why}", markup=False)
         if any(node["why"] == "no room on the bus" for node in one["nodes"]):
-            console.print("  → Who runs is not slowed. A lower --rate leaves room for all.", markup=False)
+            console.print("  → Running streams are not slowed down. A lower --rate leaves room for all.", markup=False)
     for one in found.get("sinks", ()):
         why = one["error"] or one["detail"]
         told = f"{one['state']}, {one['dropped']} dropped{f': {why}' if why else ''}"
@@ -294,7 +295,7 @@ def _verdict(node: dict[str, Any]) -> str:
         return "not verified yet"
     if node.get("unverified"):
         return "unverified (nobody signed its datasheet)"
-    kept = " (all but the Security TEDS as last read)" if node["verdict"]["from"] == "kept" else ""
+    kept = " (stored copy, except the Security TEDS)" if node["verdict"]["from"] == "kept" else ""
     return f"{node['verdict']['verdict']}{kept}"
 
 
@@ -311,18 +312,22 @@ def _link(link: dict[str, Any]) -> str:
     name="measure",
 )
 @click.argument("expression", metavar="EXPR")
-@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="At most so many samples a second.")
+@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Maximum samples per second.")
 @click.option("--frozen", is_flag=True, help="Only the nodes that match now, as one group array; none joins or leaves.")
 @click.option("--to", "files", multiple=True, metavar="NAME", help="Record to NAME.mcap, .jsonl, .csv; repeatable.")
 @pass_app
 def measure(app: App, expression: str, rate: float | None, frozen: bool, files: Sequence[str]) -> None:
-    """Measure every authentic node that comes and matches.
+    """Measure every authentic node that matches.
 
-    The running base station does it. EXPR is all, a group, or type:PROFILE, name:GLOB, group:NAME and bounds such as
-    'angle >= 360 deg', joined by commas; all must hold. It is kept until it is deleted on the page or through the API.
+    Runs on the base station that is already running. EXPR is all, a group, or terms joined by commas, all of which must
+    match: type:PROFILE, name:GLOB, group:NAME and bounds such as 'angle >= 360 deg'. The measurement is kept, across
+    restarts too, until it is deleted on the page or through the API.
     """
     with client.connect(home=app.home) as station:
         made = station.measure(match=expression, rate=rate, frozen=frozen, sinks=files)
+    unknown = measure_room.matching.Match.parse(expression).unknown_type(app.station())
+    if unknown:
+        app.warn(f"The measurement waits: {unknown}. To list the profiles: teds-provision profile list")
     app.emit({**made}, f"Measuring {expression} (measurement {made['id']}).")
 
 
@@ -337,7 +342,7 @@ def detection(app: App, mode: Mode) -> None:
 
 
 @command("teds-provision ncap open", "teds-provision ncap open --read-only", name="open")
-@click.option("--read-only", is_flag=True, help="For someone who may look but change nothing.")
+@click.option("--read-only", is_flag=True, help="The token may read but change nothing.")
 @pass_app
 def open_page(app: App, *, read_only: bool) -> None:
     """Print the page's address with a one-time token.

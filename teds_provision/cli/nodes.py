@@ -47,7 +47,7 @@ _GAP = "  "
     "--fits", metavar="EXPR", help='Check datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
 )
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), help="Default: table.")
-@click.option("--plant", "of_plant", is_flag=True, help="Show what the plant's stations say: who holds it, conflicts.")
+@click.option("--plant", "of_plant", is_flag=True, help="Show what the plant's stations report: holders, conflicts.")
 @pass_app
 def nodes(
     app: App,

@@ -52,7 +52,7 @@ _CHANGES_SHOWN = 20
 )
 @click.argument("uuid", required=False)
 @order_options
-@click.option("--adopt", is_flag=True, help="Sign the datasheet that the board brought, after it was shown.")
+@click.option("--adopt", is_flag=True, help="Sign the datasheet that the board brought, after showing it.")
 @click.option("--watch", is_flag=True, help="Provision board after board until Ctrl-C.")
 @click.option(
     "--batch",
@@ -67,20 +67,22 @@ _CHANGES_SHOWN = 20
     help="Write a report of the batch, .csv or .html.",
 )
 @click.option("--all", "everything", is_flag=True, help="Provision every whitelisted node on the bus in parallel.")
-@click.option("--job", metavar="FILE|ID", help="Work on a keeper's job: it says what may be built, and how often.")
+@click.option("--job", metavar="FILE|ID", help="Work on a job, which defines what may be built and how many.")
 @click.option(
     "--calibrations",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="With --job: a folder with a file UUID.csv (.toml, .json) for each board.",
+    help="With --job: directory with a calibration per board: UUID.csv, .toml or .json.",
 )
 @click.option(
     "--files",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="With --job: the folder that carries to the office, in place of the registry.",
+    help="With --job: transfer folder to the office, instead of the registry.",
 )
-@click.option("--only", type=click.Choice(["verify"]), help="With --job: test boards that others made; write nothing.")
+@click.option(
+    "--only", type=click.Choice(["verify"]), help="With --job: test boards that other stations built; writes nothing."
+)
 @click.option(
     "--label-to",
     type=click.Path(path_type=Path, file_okay=False),
@@ -92,14 +94,14 @@ _CHANGES_SHOWN = 20
     type=click.Choice(["svg", "png"]),
     default="svg",
     show_default=True,
-    help="What --label-to writes.",
+    help="Format of the labels.",
 )
 @click.option("--scan", is_flag=True, help="Read scanned labels from stdin: the next board must be the one scanned.")
-@click.option("--evidence", is_flag=True, help="Keep signed proof of each board; see: evidence export.")
+@click.option("--evidence", is_flag=True, help="Keep signed evidence of each board; see: evidence export.")
 @click.option(
     "--operator",
     metavar="NAME",
-    help="With --job, --evidence or --report: who worked, as evidence and report shall say.",
+    help="Name of the operator, for --job, --evidence or --report.",
 )
 @yes_option
 @dry_run_option
@@ -134,7 +136,7 @@ def provision(
     """
     order = replace(order, adopt=adopt and bool(said_here("adopt")))  # a setting of that name is meant for ncap run
     if order.adopt and (batch is not None or job is not None):
-        raise UsageFailure("A sheet or a job says itself what a board gets.", hint="Drop --adopt.")
+        raise UsageFailure("The sheet or job already defines what each board gets.", hint="Drop --adopt.")
     request = steps_room.batch.ProvisionRequest(uuid, order, watch, everything, batch, report, operator or "")
     several = everything or len(links.places) > 1
     reporter = BoardReporter(reporter_for(app, several=several))
@@ -156,7 +158,7 @@ def provision(
             app.closing(office.close)
     elif any((calibrations, operator and report is None, files, only, label_to, scan)):
         raise UsageFailure(
-            "--calibrations, --operator, --files, --only, --label-to and --scan belong to a job.",
+            "--calibrations, --operator, --files, --only, --label-to and --scan require a job.",
             hint="Add --job FILE, or --evidence.",
         )
     boards = steps_room.batch.Boards(base, links, request, reporter, line=line)
@@ -180,12 +182,12 @@ def _check_line(request: ProvisionRequest, job: str | None, only: str | None) ->
     """Raise UsageFailure where a job is named beside what a job says itself."""
     order = request.order
     if only is not None and job is None:
-        raise UsageFailure("--only verify tests the boards of a job.", hint="Add --job FILE.")
+        raise UsageFailure("--only verify requires --job.", hint="Add --job FILE.")
     if request.sheet is not None:
-        raise UsageFailure("A sheet and a job or evidence do not go together.", hint="Drop --batch.")
+        raise UsageFailure("--batch cannot be combined with --job or --evidence.", hint="Drop --batch.")
     if job is not None and not (order.names_nothing and order.accept_calibration is None and not order.retype):
         raise UsageFailure(
-            "The job says what each board gets.", hint="Drop --profile, --calibration, --name and --retype."
+            "The job already defines what each board gets.", hint="Drop --profile, --calibration, --name and --retype."
         )
 
 
@@ -298,7 +300,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
 
 def _show_brought(app: App, brought: Brought) -> None:
     """What a board says of itself, a line for each channel, and what was found."""
-    app.note(f"Node {brought.image.uuid.hex()} brought a datasheet of its own: {brought.name or '(no name)'}")
+    app.note(f"Node {brought.image.uuid.hex()} brought its own datasheet: {brought.name or '(no name)'}")
     for one in brought.channels[:_CHANGES_SHOWN]:
         kind = one.kind.word if one.kind is not None else "of unknown kind"
         limits = f"{one.show(one.low)} to {one.show(one.high)}"
@@ -306,7 +308,7 @@ def _show_brought(app: App, brought: Brought) -> None:
         made = f", calibrated {one.calibrated_at:%Y-%m-%d}" if one.calibrated_at else ""
         app.note(f"  channel {one.number}: {one.name or '(no name)'}, {kind}, {limits}{exact}{made}")
     if len(brought.channels) > _CHANGES_SHOWN:
-        app.note(f"  and {len(brought.channels) - _CHANGES_SHOWN} channels more")
+        app.note(f"  and {len(brought.channels) - _CHANGES_SHOWN} more channels")
     for finding in brought.findings[:_CHANGES_SHOWN]:
         app.note(f"  {finding['severity']}: {finding['message']}")
 

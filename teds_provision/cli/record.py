@@ -33,22 +33,22 @@ SHOWN = 20
     epilog=examples("teds-provision record info run.mcap", "teds-provision record convert run.mcap run.csv"),
 )
 def record() -> None:
-    """Look into recordings of `measure --to`, and convert them: CSV, text, MCAP, JSON lines, Parquet.
+    """Inspect and convert recordings of `measure --to`: CSV, text, MCAP, JSON lines, Parquet.
 
-    The format of a file is told by its content. Of a recording that was cut off, or is still being written, everything
-    up to its last complete line or chunk is read. docs/recording.md describes the formats.
+    The format is detected from the content. A recording that was cut off, or is still being written, is read up to its
+    last complete line or chunk. docs/recording.md describes the formats.
     """
 
 
 @record.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Show what a recording holds: channels, times, losses.",
+    short_help="Show a recording's channels, time span and losses.",
     epilog=examples("teds-provision record info run.mcap", "teds-provision --json record info run.csv"),
 )
 @click.argument("file", type=FileToRead())
 @pass_app
 def info(app: App, file: Path) -> None:
-    """Show the channels of a recording, from when to when it goes, and what is invalid, lost or cut off in it."""
+    """Show a recording's channels and time span, and what is invalid, lost or cut off."""
     recordings = measure_room.recordings
     recording, summary = recordings.opening.open_recording(file), recordings.summary.RecordingSummary()
     for entry in recording.entries():
@@ -65,10 +65,10 @@ def _lines(result: Mapping[str, Any], summary: RecordingSummary, recording: Reco
     if result["from"]:
         yield f"From {_local(result['from'])} until {_local(result['until'])}"
     else:
-        yield "It has no values."
+        yield "It contains no values."
     lost = "not recorded" if result["lost"] is None else f"{result['lost']} messages"
     yield (
-        f"{result['messages']} instants, {result['samples']} values, {result['invalid']} invalid; "
+        f"{result['messages']} time stamps, {result['samples']} values, {result['invalid']} invalid; "
         f"lost: {lost}, missing: {result['missing']} samples"
     )
     if result["being_written"]:
@@ -122,10 +122,10 @@ def _local(text: str) -> str:
 )
 @pass_app
 def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> None:
-    """Show values with time, node and channel, in the units for people.
+    """Show values with time, node and channel, in display units.
 
-    With --json the lines are the events of `measure --json` (SI units), and the last one, `end`, is what `record info`
-    gives. It counts the whole file, whatever --channel and --limit show of it.
+    With --json the lines are the events of `measure --json` (SI units). The last one, `end`, has the figures of `record
+    info` for the whole file, whatever --channel and --limit select.
     """
     recordings = measure_room.recordings
     recording, summary = recordings.opening.open_recording(file), recordings.summary.RecordingSummary()
@@ -138,7 +138,7 @@ def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> 
     if app.json:
         app.emit({"event": "end", **summary.to_json(recording)})
     elif summary.messages > (limit or SHOWN):
-        app.note(f"{summary.messages} instants in all; --limit shows more of them.")
+        app.note(f"{summary.messages} time stamps in all; use --limit to show more.")
 
 
 def _events(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str]:
@@ -180,13 +180,13 @@ def _value(value: float, known: ChannelFacts) -> str:
 )
 @click.argument("source", type=FileToRead(), metavar="FROM")
 @click.argument("target", type=click.Path(path_type=Path), metavar="TO")
-@click.option("--wide", is_flag=True, help="Write one grid: a row a time, a column a channel, no raw values.")
+@click.option("--wide", is_flag=True, help="Write one table: a row per time, a column per channel, no raw values.")
 @pass_app
 def convert(app: App, source: Path, target: Path, wide: bool) -> None:
     """Write the recording FROM in the format of TO: .csv, .txt, .mcap, .jsonl, or .parquet (needs pyarrow).
 
-    TO appears when it is complete, and nothing is overwritten. A recording whose datasheets changed midway becomes
-    several files of CSV or Parquet (TO, then TO.2 and so on).
+    TO appears when it is complete; nothing is overwritten. If datasheets changed midway, CSV and Parquet are split into
+    several files (TO, then TO.2 and so on).
     """
     done = measure_room.recordings.converting.convert(source, target, wide=wide)
     result = done.summary.to_json(done.recording)
@@ -196,5 +196,6 @@ def convert(app: App, source: Path, target: Path, wide: bool) -> None:
         app.warn(f"{source} was cut off: the result ends at {result['until']}.")
     files = [str(path) for path in done.files]
     app.emit(
-        {"files": files, **result}, f"{', '.join(files)}: {result['samples']} values in {result['messages']} instants"
+        {"files": files, **result},
+        f"{', '.join(files)}: {result['samples']} values at {result['messages']} time stamps",
     )

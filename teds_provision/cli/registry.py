@@ -55,10 +55,10 @@ _ROLES: Final = click.Choice(["keeper", "line", "sign", "base", "audit"])
     ),
 )
 def registry() -> None:
-    """Join this owner's stations into a plant: who holds which key, who signed what, which board was revoked.
+    """Connect an owner's stations into a plant: who holds which key, who signed what, which board was revoked.
 
-    What a station says is signed and travels in a folder (a stick, a share). A station that joined no registry works
-    as before, and one that did needs none to work.
+    Stations publish signed pages, carried in a folder (a stick, a share) or a PostgreSQL database. Joining is optional,
+    and a station that joined keeps working while the registry is out of reach.
     """
 
 
@@ -70,7 +70,7 @@ def _change_options(function: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         dry_run_option,
         yes_option,
-        click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to this new file."),
+        click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to a new file."),
         click.option("--draft", type=_FILE, metavar="FILE", help="Only write a draft; sign it where the CA key is."),
     ):
         function = option(function)
@@ -93,7 +93,7 @@ def _emit_change(
         if output is not None and not dry_run:
             _write_once(output, before.octets + b"\n")
         plan = {"plan": dry_run, "draft": None} if dry_run or file is not None else {}
-        app.emit({**_to_json(before), **plan}, f"Nothing to do: roster {before.version} says so already.")
+        app.emit({**_to_json(before), **plan}, f"Nothing to do: roster {before.version} already says so.")
         return
     said = "\n".join(plant.owner.changes(before, draft))
     if dry_run or file is not None:
@@ -108,12 +108,14 @@ def _emit_change(
     with station.lock("registry", app.note):
         held = station.plant.roster
         if held is None or draft.previous != held.hash:  # two rosters of one version would be an alarm everywhere
-            raise PolicyRefused("Another command changed the roster meanwhile.", hint="Run this again.")
+            raise PolicyRefused("Another command changed the roster in the meantime.", hint="Run this again.")
         signed = plant.owner.signed(station, draft)
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
         plant.folding.put_roster(station, signed)
-    app.emit(_to_json(signed), f"Roster {signed.version} counts here. To tell the others: teds-provision registry sync")
+    app.emit(
+        _to_json(signed), f"Roster {signed.version} is in force here. To tell the others: teds-provision registry sync"
+    )
 
 
 def _write_once(path: Path, octets: bytes) -> None:
@@ -154,16 +156,16 @@ def _time(when: Any) -> str:
 @command("teds-provision registry create --name 'plant Augsburg'", name="create")
 @click.option("--name", required=True, help="Name of the plant.")
 @click.option(
-    "--days", type=WholeNumber(1, 400), default=90, show_default=True, metavar="DAYS", help="How long the roster holds."
+    "--days", type=WholeNumber(1, 400), default=90, show_default=True, metavar="DAYS", help="Validity of the roster."
 )
-@click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to this new file.")
+@click.option("--output", type=_FILE, metavar="FILE", help="Also write the signed roster to a new file.")
 @yes_option
 @dry_run_option
 @pass_app
 def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_run: bool) -> None:
     """Create a registry; this station is its first member.
 
-    It gets the roles keeper, sign, line and base. Needs the CA key.
+    Requires the CA key. The station gets the roles keeper, sign, line and base.
     """
     station = app.station()
     draft = plant.owner.draft_first(station, name, timedelta(days=days))
@@ -187,16 +189,16 @@ def create(app: App, name: str, days: int, output: Path | None, yes: bool, dry_r
 def _past(past: Sequence[Any]) -> str:
     counts = plant.backlog.count(list(past))
     listed = ", ".join(f"{count} {act}" for act, count in sorted(counts.items())) or "nothing"
-    return f"  it will tell the plant what this store knows: {listed}"
+    return f"  it will publish what this store knows: {listed}"
 
 
 @command("teds-provision registry request --output south.request", name="request")
 @click.option("--output", type=_FILE, required=True, metavar="FILE", help="Where to write the request.")
 @pass_app
 def request(app: App, output: Path) -> None:
-    """Write this station's request to be a member.
+    """Write this station's membership request.
 
-    It is for the owner of the CA key. Run again, it writes the same.
+    Give it to the owner of the CA key. Running the command again writes the same request.
     """
     station = app.station()
     station.unlock()
@@ -213,14 +215,14 @@ def request(app: App, output: Path) -> None:
 
 @command("teds-provision registry add south.request --role base", name="add")
 @click.argument("file", type=FileToRead())
-@click.option("--role", "roles", type=_ROLES, multiple=True, required=True, help="What its word counts for; several.")
-@click.option("--name", help="Another name than the station's own.")
+@click.option("--role", "roles", type=_ROLES, multiple=True, required=True, help="Its roles; repeatable.")
+@click.option("--name", help="Name in the roster (default: the station's own).")
 @_change_options
 @pass_app
 def add(app: App, /, file: Path, roles: Sequence[roster.Role], name: str | None, **how: Any) -> None:
     """Add the station that made this request to the roster.
 
-    Compare its fingerprint by voice.
+    Compare the fingerprint by voice.
     """
     station = app.station()
     asked = document.open_request(read_file(file))
@@ -231,11 +233,11 @@ def add(app: App, /, file: Path, roles: Sequence[roster.Role], name: str | None,
 @command("teds-provision registry role west line", "teds-provision registry role west line --signed 88", name="role")
 @click.argument("name")
 @click.argument("roles", type=_ROLES, nargs=-1, required=True, metavar="ROLE…")
-@click.option("--signed", type=WholeNumber(0, 1 << 31), metavar="N", help="The last page whose datasheets it signed.")
+@click.option("--signed", type=WholeNumber(0, 1 << 31), metavar="N", help="Last page whose signatures still count.")
 @_change_options
 @pass_app
 def role(app: App, /, name: str, roles: Sequence[roster.Role], signed: int | None, **how: Any) -> None:
-    """Give a member these roles, all of them. What one that loses "sign" has signed before stays authentic."""
+    """Set a member's roles. If it loses "sign", what it has signed stays authentic."""
     station = app.station()
     member = plant.owner.require_member(plant.folding.require_roster(station), name)
     place = None if signed is None else plant.owner.page_place(station, member.fingerprint, signed)
@@ -244,18 +246,18 @@ def role(app: App, /, name: str, roles: Sequence[roster.Role], signed: int | Non
 
 @command("teds-provision registry share --group left-hand --to south", name="share")
 @click.option("--all", "every", is_flag=True, help="All nodes.")
-@click.option("--group", metavar="NAME", help="The nodes of a group.")
-@click.option("--profile", metavar="NAME", help="The nodes of a type.")
+@click.option("--group", metavar="NAME", help="Nodes of a group.")
+@click.option("--profile", metavar="NAME", help="Nodes of a type.")
 @click.option(
-    "--to", "names", multiple=True, required=True, metavar="NAME", help="A member with the role base; several."
+    "--to", "names", multiple=True, required=True, metavar="NAME", help="A member with the role base; repeatable."
 )
-@click.option("--forget", is_flag=True, help="A sender that is not named deletes its key once all have it.")
+@click.option("--forget", is_flag=True, help="Senders not named here delete their key once all have it.")
 @_change_options
 @pass_app
 def share(
     app: App, /, every: bool, group: str | None, profile: str | None, names: Sequence[str], forget: bool, **how: Any
 ) -> None:
-    """Have the keys of nodes copied to these members by themselves."""
+    """Copy node keys to these members automatically."""
     station = app.station()
     held = plant.folding.require_roster(station)
     to = tuple(plant.owner.require_member(held, name).fingerprint for name in names)
@@ -265,14 +267,14 @@ def share(
 
 @command("teds-provision registry unshare --group left-hand", name="unshare")
 @click.option("--all", "every", is_flag=True, help="All nodes.")
-@click.option("--group", metavar="NAME", help="The nodes of a group.")
-@click.option("--profile", metavar="NAME", help="The nodes of a type.")
+@click.option("--group", metavar="NAME", help="Nodes of a group.")
+@click.option("--profile", metavar="NAME", help="Nodes of a type.")
 @_change_options
 @pass_app
 def unshare(app: App, /, every: bool, group: str | None, profile: str | None, **how: Any) -> None:
-    """Have the keys of these nodes copied no more.
+    """Stop copying the keys of these nodes.
 
-    What was copied stays.
+    Keys that were already copied stay where they are.
     """
     station = app.station()
     _emit_change(app, station, plant.owner.unshared(station, _what(every, group, profile)), **_named(how))
@@ -288,14 +290,14 @@ def _what(every: bool, group: str | None, profile: str | None) -> Any:
 
 @command("teds-provision registry remove west --lost --last 88", name="remove")
 @click.argument("name")
-@click.option("--retired", is_flag=True, help="It went out of service in order.")
-@click.option("--lost", is_flag=True, help="Nobody knows where it is.")
-@click.option("--stolen", is_flag=True, help="Somebody else has it.")
-@click.option("--last", type=WholeNumber(0, 1 << 31), metavar="N", help="The last page of it that counts.")
+@click.option("--retired", is_flag=True, help="Taken out of service in an orderly way.")
+@click.option("--lost", is_flag=True, help="Its whereabouts are unknown.")
+@click.option("--stolen", is_flag=True, help="Somebody else has it: its sessions end at once.")
+@click.option("--last", type=WholeNumber(0, 1 << 31), metavar="N", help="Its last page that counts.")
 @_change_options
 @pass_app
 def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
-    """Remove a station. Its key never comes back; what it said on pages up to the last one stays."""
+    """Remove a station for good. What it published up to its last page still counts."""
     reasons: tuple[roster.Why, ...] = ("retired", "lost", "stolen")
     given = [one for one in reasons if how[one]]
     if len(given) != 1:
@@ -317,12 +319,12 @@ def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
     default=90,
     show_default=True,
     metavar="DAYS",
-    help="How long it holds from now on.",
+    help="Validity from now on.",
 )
 @_change_options
 @pass_app
 def renew(app: App, /, days: int, **how: Any) -> None:
-    """Sign the same roster with a new end."""
+    """Extend the roster."""
     station = app.station()
     _emit_change(app, station, plant.owner.renewed(station, timedelta(days=days)), **_named(how))
 
@@ -340,7 +342,7 @@ def _named(how: dict[str, Any]) -> dict[str, Any]:
 def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     """Sign a draft of a roster with the CA key.
 
-    The key need not be a member's. Shows all that is in the draft.
+    The station that signs need not be a member. Shows everything in the draft first.
     """
     station = app.station()
     draft = plant.owner.read_draft(read_file(file), station.ca)
@@ -360,7 +362,7 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
             plant.folding.take_rosters(station, [signed.octets])
     app.emit(
         _to_json(signed),
-        f"Signed: {output}. Bring it: registry sync --files DIR, or connect --roster {quote(output.name)}",
+        f"Signed: {output}. To distribute it: registry sync --files DIR, or connect --roster {quote(output.name)}",
     )
 
 
@@ -373,18 +375,24 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     name="connect",
 )
 @click.argument("url", required=False)
-@click.option("--files", type=_FOLDER, metavar="DIR", help="The folder that carries.")
-@click.option("--roster", "roster_file", type=FileToRead(exists=True), metavar="FILE", help="The roster, by hand.")
+@click.option("--files", type=_FOLDER, metavar="DIR", help="Transfer folder: a stick or a share.")
+@click.option(
+    "--roster",
+    "roster_file",
+    type=FileToRead(exists=True),
+    metavar="FILE",
+    help="Roster file, if it is not in the folder.",
+)
 @yes_option
 @dry_run_option
 @pass_app
 def connect(app: App, url: str | None, files: Path | None, roster_file: Path | None, yes: bool, dry_run: bool) -> None:
     """Join a registry whose roster names this station.
 
-    Shows registry and CA to compare, and what it will tell.
+    Shows the registry and CA, to compare, and what this station will publish.
 
-    URL is where PostgreSQL is: postgresql://HOST/DATABASE, with ?sslrootcert=FILE where the server's certificate is
-    the owner's own. The station logs in with the key that its request brought; no password is ever typed.
+    URL names a PostgreSQL database: postgresql://HOST/DATABASE, with ?sslrootcert=FILE if the server has a private
+    certificate. The station logs in with the key from its request; there is no password to type.
     """
     if (files is None) == (url is None):
         raise click.UsageError("Give a URL, or --files DIR.")
@@ -404,7 +412,7 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
     same = joined is not None and joined.registry == found.registry
     if joined is not None and not same:
         raise PolicyRefused(
-            f"This station belongs to the registry {joined.registry} already.", hint="First: registry disconnect"
+            f"This station already belongs to registry {joined.registry}.", hint="Leave it first: registry disconnect"
         )
     past = [] if same else list(plant.backlog.backlog(station))
     said = "\n".join([
@@ -433,18 +441,18 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
 @dry_run_option
 @pass_app
 def disconnect(app: App, yes: bool, dry_run: bool) -> None:
-    """Take no part in the registry any more. Keys, pins and pages stay; the roster decides nothing here any more."""
+    """Leave the registry. Keys, pins and pages stay; the roster no longer applies here."""
     station = app.station()
     held = plant.folding.require_roster(station)
     said = (
-        f"Leave {held.name}: this station tells nothing any more, and every station that the CA certified counts here"
-        " again, also one that was removed. To be removed from the roster is another thing: registry remove."
+        f"Leave {held.name}: this station stops publishing, and trusts every station that the CA certified again,"
+        " removed ones included. It stays on the roster until the owner runs: registry remove"
     )
     if dry_run:
         app.emit({"registry": held.registry, "plan": True}, f"Plan: {said}")
         return
     app.note(said)
-    app.confirm("Leave?", yes=yes)
+    app.confirm("Leave this registry?", yes=yes)
     with station.lock("registry disconnect", app.note):
         plant.membership.disconnect(station)
     app.emit({"registry": held.registry}, f"Left {held.name}.")
@@ -458,18 +466,20 @@ def _post(station: Station, files: Path | None) -> tuple[Post, bool]:
         return named, joined is not None and joined.where == str(files.resolve())
     if joined is None:
         plant.folding.require_roster(station)
-        raise NotFound("Nothing is known that carries to this registry.", hint="Name it: registry sync --files DIR")
+        raise NotFound(
+            "This station does not know how to reach the registry.", hint="Name a folder: registry sync --files DIR"
+        )
     return joined, True
 
 
-_files = click.option("--files", type=_FOLDER, metavar="DIR", help="A folder that carries: a stick, a share.")
+_files = click.option("--files", type=_FOLDER, metavar="DIR", help="Transfer folder: a stick or a share.")
 
 
 @command("teds-provision registry sync", "teds-provision registry sync --files /media/stick", name="sync")
 @_files
 @pass_app
 def sync(app: App, files: Path | None) -> None:
-    """Exchange news with the others; if it is cut, run it again."""
+    """Exchange pages with the other stations. If interrupted, run it again."""
     station = app.station()
     post, connected = _post(station, files)
     try:
@@ -489,7 +499,8 @@ def sync(app: App, files: Path | None) -> None:
     }
     if doors:
         app.warn(
-            f"A station's login may do there what none should: {', '.join(doors)}. The database's superuser runs:"
+            f"The stations' database login has rights that it should not have: {', '.join(doors)}. As the"
+            " database's superuser, run:"
             " registry sql | psql"
         )
     app.emit(told, _synced(station, done, alarms))
@@ -503,8 +514,8 @@ def _synced(station: Station, done: Synced, alarms: Sequence[Any]) -> str:
         lines.append(f"{_count(done.parcels_out, 'parcel')} out, {done.parcels_in} in")
     if done.waiting:
         waits = f"{_count(done.waiting, 'parcel')} {'waits' if done.waiting == 1 else 'wait'}"
-        lines.append(f"{waits} for a person: teds-provision import-keys --received")
-    lines += [f"roster {version} counts from now on" for version in done.rosters]
+        lines.append(f"{waits} for confirmation: teds-provision import-keys --received")
+    lines += [f"roster {version} is now in force" for version in done.rosters]
     lines += done.told
     lines += [f"ALARM {_alarm_line(station, one)}" for one in alarms]
     return "\n".join(lines)
@@ -526,11 +537,9 @@ def _alarm_line(station: Station, one: Any) -> str:
 @command("teds-provision registry status", name="status")
 @pass_app
 def status(app: App) -> None:
-    """Show where every station stands and what is to be decided.
+    """Show the state of every station, and open decisions.
 
-    Opens no connection.
-
-    Exits with 4 while there are alarms that nobody has seen, with 6 when the roster has expired or this station was
+    Works offline. Exits 4 while there are unacknowledged alarms, 6 if the roster has expired or this station was
     removed.
     """
     station = app.station()
@@ -582,14 +591,17 @@ def _shown(station: Station, found: PlantStatus) -> str:
     last = f"last sync {local_time(found.record.synced)}" if found.record.synced else "never synced"
     lines.append(f"{_count(found.conflicts, 'conflict')}, {_count(found.unsent, 'event')} unsent, {last}")
     review, due = plant.leaving.last(station), plant.leaving.due(station)
-    if review is not None and (due or review.alone):
+    if review is not None and due:
         tap = f"; {review.alone} need a tap" if review.alone else ""
         lines.append(f"to rotate: {due} of {review.of}{tap}")
+    elif review is not None and review.alone:
+        need = "needs" if review.alone == 1 else "need"
+        lines.append(f"{_count(review.alone, 'node')} {need} a tap: only a station that left held the key")
     lines += [f"{'alarm' if one.seen else 'ALARM'} {_alarm_line(station, one)}" for one in found.alarms]
     if found.expired:
-        lines.append("The roster has EXPIRED: where the CA key is, registry renew")
+        lines.append("The roster has EXPIRED: on the station with the CA key: registry renew")
     elif found.expires_soon:
-        lines.append("The roster expires soon: where the CA key is, registry renew")
+        lines.append("The roster expires soon: on the station with the CA key: registry renew")
     return "\n".join(lines)
 
 
@@ -606,13 +618,13 @@ def _age(seconds: int) -> str:
 
 @command("teds-provision registry log --since today", "teds-provision registry log 8d4d --station west", name="log")
 @click.argument("node", required=False, metavar="[UUID]")
-@click.option("--station", "name", metavar="NAME", help="Only what this station said.")
-@click.option("--since", metavar="TIME", help="Only pages made since then: ISO 8601, today, 2h.")
+@click.option("--station", "name", metavar="NAME", help="Only what this station published.")
+@click.option("--since", metavar="TIME", help="Only pages made since: ISO 8601, today, 2h.")
 @pass_app
 def log(app: App, node: str | None, name: str | None, since: str | None) -> None:
-    """Show what the stations said, with station and page.
+    """Show what the stations published, with station and page.
 
-    The signature of every page was checked.
+    Every page's signature has been checked.
     """
     station = app.station()
     held = plant.folding.require_roster(station)
@@ -646,15 +658,15 @@ def _members(event: dict[str, Any]) -> str:
 @command("teds-provision registry vouch --all", name="vouch")
 @click.argument("nodes", nargs=-1, metavar="[UUID …]")
 @click.option(
-    "--all", "every", is_flag=True, help="All that this store knows as authentic and nobody may sign any more."
+    "--all", "every", is_flag=True, help="Every datasheet that is authentic here and whose signer is not in the plant."
 )
 @yes_option
 @dry_run_option
 @pass_app
 def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool) -> None:
-    """Say as a keeper that older datasheets are good everywhere.
+    """As a keeper, declare older datasheets valid everywhere.
 
-    For those of stations that left before the plant was made.
+    For datasheets signed by stations that left before the plant was created.
     """
     if every == bool(nodes):
         raise click.UsageError("Give UUIDs, or --all.")
@@ -666,9 +678,11 @@ def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool)
     if dry_run:
         app.emit({**told, "done": 0, "plan": True}, f"Plan: vouch for these datasheets:\n{said}")
         return
-    app.note(f"Datasheets that are authentic here and not in the plant:\n{said}")
-    if found:
-        app.confirm("Vouch for them?", yes=yes)
+    if not found:
+        app.emit({**told, "done": 0}, "Nothing to do: no datasheet needs a keeper's word.")
+        return
+    app.note(f"Datasheets that are authentic here but not in the plant:\n{said}")
+    app.confirm("Vouch for them?", yes=yes)
     station.unlock()
     with station.lock("registry vouch", app.note):
         done = plant.membership.vouch(station, found)
@@ -677,27 +691,29 @@ def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool)
 
 @command("teds-provision registry accept west --page 4f1c09aa77e012bd", name="accept")
 @click.argument("name")
-@click.option("--page", metavar="HASH", help="The first page of the branch: at least 8 digits of its H.")
+@click.option("--page", metavar="HASH", help="First page of the branch: at least 8 digits of its hash.")
 @_files
 @yes_option
 @dry_run_option
 @pass_app
 def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool, dry_run: bool) -> None:
-    """Take one of a station's two histories, here alone. A roster that removes it goes before this."""
+    """Accept one of a station's two histories, here only."""
     station = app.station()
     held = plant.folding.require_roster(station)
     member = plant.owner.require_member(held, name)
     post = plant.files.FilesPost(files) if files is not None else plant.reaching.post_of(station)
     if dry_run:
         n, hash = plant.membership.branch(station, member.fingerprint, page, post)
-        app.emit({"done": 0, "n": n, "hash": hash, "plan": True}, f"Plan: page {n} ({hash[:16]}) would count here.")
+        app.emit(
+            {"done": 0, "n": n, "hash": hash, "plan": True}, f"Plan: page {n} ({hash[:16]}) would be accepted here."
+        )
         return
-    app.confirm(f"Take this history of {member.name}?", yes=yes, named="--page")
+    app.confirm(f"Accept this history of {member.name}?", yes=yes, named="--page")
     station.unlock()
     with plant.sync.alone(station):
         n, hash = plant.membership.accept(station, member.fingerprint, page, post)
         plant.folding.apply_claims(station)
-    app.emit({"done": 1, "n": n, "hash": hash}, f"Page {n} ({hash[:16]}) and what follows it counts here.")
+    app.emit({"done": 1, "n": n, "hash": hash}, f"Page {n} ({hash[:16]}) and its successors count here.")
 
 
 @command("teds-provision registry resume", name="resume")
@@ -706,11 +722,11 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool,
 @dry_run_option
 @pass_app
 def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
-    """Go on after a fork.
+    """Continue after a fork.
 
-    Pages under this station's key that lie there are taken for its own.
+    Adopts the pages found there under this station's key.
 
-    First look who else works with a copy of this home. If nobody knows, remove this station instead.
+    First find out who else uses a copy of this home. If you cannot, remove this station instead.
     """
     station = app.station()
     post, _ = _post(station, files)
@@ -718,7 +734,7 @@ def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
         there = len(plant.sync.strange(station, post))
         app.emit({"done": 0, "adopts": there, "plan": True}, f"Plan: {_count(there, 'page')} would be adopted.")
         return
-    app.note("If a copy of this home is at work elsewhere, end it first; in doubt have this station removed.")
+    app.note("If a copy of this home is in use elsewhere, stop it first. If in doubt, have this station removed.")
     app.confirm("Is this the only home with this station's key?", yes=yes)
     done = plant.sync.resume(station, post)
     app.emit({"done": done}, f"Adopted: {_count(done, 'page')}. Next: teds-provision registry sync")
@@ -727,9 +743,9 @@ def resume(app: App, files: Path | None, yes: bool, dry_run: bool) -> None:
 @command("teds-provision registry seen", name="seen")
 @pass_app
 def seen(app: App) -> None:
-    """Note that somebody has seen the alarms up to now.
+    """Acknowledge all alarms so far.
 
-    They are still shown, and end no command with 4 any more.
+    They are still shown, but commands no longer exit 4 because of them.
     """
     station = app.station()
     plant.folding.require_roster(station)
@@ -745,15 +761,17 @@ def seen(app: App) -> None:
     "teds-provision registry sql --close west",
     name="sql",
 )
-@click.option("--member", type=FileToRead(), metavar="FILE", help="The login of the station that asked.")
-@click.option("--close", "closed", metavar="NAME", help="Nothing more from this station.")
-@click.option("--mend", nargs=2, metavar="NAME N", help="Take off rows from number N on that NAME did not sign.")
+@click.option(
+    "--member", type=FileToRead(), metavar="FILE", help="Create the login of the station that sent this request."
+)
+@click.option("--close", "closed", metavar="NAME", help="Disable this station's login.")
+@click.option("--mend", nargs=2, metavar="NAME N", help="Delete rows from number N on that NAME did not sign.")
 @pass_app
 def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str] | None) -> None:
-    """Print the SQL for the database's superuser.
+    """Print the SQL for the database superuser.
 
-    This program runs none of it: pipe it into psql. Without an option
-    it prints the schema, which may be run again at any time and must be after every pg_restore.
+    Pipe it into psql; this program never runs it. Without options it prints the schema, which can be run again at any
+    time, and must be after every pg_restore.
     """
     if sum(one is not None for one in (member, closed, mend)) > 1:
         raise click.UsageError("Give one of --member, --close and --mend.")
@@ -766,7 +784,7 @@ def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str]
         text = plant.schema.close_sql(_of_roster(held, closed))
     elif mend is not None:
         if not mend[1].isdecimal() or len(mend[1]) > 10:
-            raise click.UsageError(f"--mend: {mend[1]!r} is no number of a page.")
+            raise click.UsageError(f"--mend: {mend[1]!r} is not a page number.")
         text = plant.schema.mend_sql(_of_roster(held, mend[0]), int(mend[1]))
     else:
         text = plant.schema.registry_sql(held.registry, [one.fingerprint for one in held.removed])

@@ -246,9 +246,9 @@ def _require_unit(app: App, channel: Channel, value: float, unit: str | None) ->
     """Refuse a bare number of a person where the unit that this channel is shown in is not SI: 45 would be radians."""
     if unit is None and app.interactive and channel.shown.text != channel.si_unit:
         raise UsageFailure(
-            f"{value:g} is in {channel.si_unit} without --unit, and channel {channel.number} is shown in "
+            f"Without --unit, {value:g} means {value:g} {channel.si_unit}, but channel {channel.number} is shown in "
             f"{channel.shown.text}.",
-            hint=f"Say which: --unit {channel.shown.text} or --unit {channel.si_unit}.",
+            hint=f"Add --unit {channel.shown.text} or --unit {channel.si_unit}.",
         )
 
 

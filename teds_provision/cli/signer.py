@@ -34,7 +34,7 @@ _MOST_WAIT_SECONDS = 1.0
     ),
 )
 def signer() -> None:
-    """Sign what a line builds: every datasheet is made anew here, and nothing else is signed."""
+    """Sign what a line builds: every datasheet is rebuilt here before it is signed."""
 
 
 @command("teds-provision signer run --job 0b5f --files /media/stick", name="run")
@@ -43,9 +43,11 @@ def signer() -> None:
     "--files",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="A folder that carries, in place of the registry.",
+    help="Transfer folder, instead of the registry.",
 )
-@click.option("--for", "seconds", type=Seconds(min=0), metavar="SECONDS", help="End after that time (default: Ctrl-C).")
+@click.option(
+    "--for", "seconds", type=Seconds(min=0), metavar="SECONDS", help="Stop after this time (default: Ctrl-C)."
+)
 @pass_app
 def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None) -> None:
     """Answer requests until Ctrl-C, one line each.
@@ -84,14 +86,14 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="FILE.json: the signed image, for `write --image`; else the answer.",
+    help="FILE.json for the signed image (see: write --image), otherwise the answer.",
 )
 @click.option("--jump", is_flag=True, help="Accept a sequence far above the one known here.")
 @pass_app
 def once(app: App, file: Path, output: Path, jump: bool) -> None:
     """Answer one request that came as a file.
 
-    It was made with `sign UUID --by OFFICE --output FILE`. Its job must be known here: teds-provision job show FILE.
+    `sign UUID --by OFFICE --output FILE` creates it. This station must know its job: teds-provision job show FILE.
     """
     station = app.station()
     station.unlock()
@@ -99,8 +101,8 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
     sealed = plant.office.answer(station, octets, jump=jump)
     if sealed is None:
         raise NotAuthentic(
-            f"{file} is no request of a member of this plant to this office.",
-            hint="Make it with: teds-provision sign UUID --by OFFICE --output FILE",
+            f"{file} is not a request from a member of this plant to this office.",
+            hint="To create one: teds-provision sign UUID --by OFFICE --output FILE",
         )
     request = protocol.plant.signing.open_request(octets, plant.jobs.roster_of(station).point_of)
     answered = protocol.plant.signing.open_answer(sealed, lambda kid: station.point)

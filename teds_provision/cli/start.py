@@ -186,7 +186,7 @@ def _print(console: Console, found: dict[str, Any]) -> None:
     for link in found["links"]:
         console.print(f"  {_link_line(link)}", markup=False)
     if not found["links"]:
-        console.print("  No reader is plugged in, and no bus is named.", markup=False)
+        console.print("  No reader is plugged in, and no bus is configured.", markup=False)
     if found["nodes"]:
         table = Table("uuid", "name", "link", "state", "verdict", box=None, pad_edge=False)
         for node in found["nodes"][:_SHOWN]:

@@ -52,7 +52,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "show": Entry("show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },
     "Measure and actuate": {
-        "record": Entry("record", "record", "Look into recordings, and convert them."),
+        "record": Entry("record", "record", "Inspect and convert recordings."),
         "sample": Entry("sample", "sample", "Take one verified, calibrated reading."),
         "calibrate": Entry("calibrate", "calibrate", "Zero a sensor where it is mounted; take calibration points."),
         "set": Entry("sample", "set_value", "Drive an actuator within its limits; it returns to its safe state."),
@@ -75,12 +75,14 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "lock": Entry("vault", "lock", "Lock the vault again."),
     },
     "The plant": {
-        "registry": Entry("registry", "registry", "Join this owner's stations: what one did, all know."),
+        "registry": Entry(
+            "registry", "registry", "Connect an owner's stations, so that each knows what the others did."
+        ),
     },
     "The line": {
-        "job": Entry("job", "job", "Say what a line may build, and see how it does."),
+        "job": Entry("job", "job", "Define what a line may build, and follow its progress."),
         "signer": Entry("signer", "signer", "Sign what a line builds, as the office of a job."),
-        "evidence": Entry("evidence", "evidence", "List, export and check the proof of every board."),
+        "evidence": Entry("evidence", "evidence", "List, export and verify evidence of every board."),
     },
     "Try it out": {
         "demo": Entry("demo", "demo", "Run two stations and a virtual node on this machine, start to finish."),

@@ -74,12 +74,12 @@ def run_line(reporter: Reporter, say: Callable[[str], None]) -> LineDone:
 
 
 def _run(demo: Demo) -> LineDone:
-    demo.say("An owner: the office keeps the CA key and signs; the bench keys boards and signs nothing.")
+    demo.say("One owner: the office has the CA key and signs; the bench keys boards but signs nothing.")
     office, bench = _plant(demo)
-    demo.say(f"The order: {BOARDS} boards of one type, signed by the office as a keeper.")
+    demo.say(f"The order: {BOARDS} boards of one type, a job signed by the office as keeper.")
     line = _job(demo, office, bench)
     folders, refused = {}, []
-    demo.say("The bench works on it, board after board; a board of another type lies among them.")
+    demo.say("The bench works through it, board after board. One of them is of a different type.")
     for name, profile in (("one", PROFILE), ("other", OTHER), ("two", PROFILE), ("three", PROFILE), ("four", PROFILE)):
         folders[name] = make_node(demo, name, profile)
         with demo.steps.step(f"board {name}") as step, run_node(folders[name], "--nfc", demo.nfc) as uuid:
@@ -88,7 +88,7 @@ def _run(demo: Demo) -> LineDone:
             except PolicyRefused as error:
                 step.detail = error.message
                 refused.append("wrong-board" if isinstance(error, WrongBoard) else "one too many")
-    demo.say("Afterwards somebody changes a TEDS in the flash of board two. The office tests boards one and two.")
+    demo.say("Then somebody changes a TEDS in board two's flash. The office tests boards one and two.")
     _tamper(folders["two"])
     tests = LineRun(office, line.job, only_verify=True)
     for name in ("one", "two"):
@@ -174,13 +174,13 @@ def _tamper(folder: Path) -> None:
 def _proof(demo: Demo, office: Station, bench: Station) -> EvidenceTotals:
     """Export the evidence of both stations, and check it with nothing but files."""
     totals = EvidenceTotals()
-    demo.say("The evidence of both, checked with nothing but files and the CA key.")
+    demo.say("Evidence of both stations, verified from files and the CA key alone.")
     with demo.steps.step("evidence") as step:
         for station in (bench, office):
             rows = station.plant.line.evidence()
             for path in export(station.plant.line, rows, demo.folder / "evidence" / station.name):
                 totals.add(judge_file(Grounds(office.ca, roster=plant.jobs.roster_of(office)), path))
         if totals.exit_code:
-            raise LinkFailure(f"The demo's evidence does not hold: {totals.words}")
-        step.detail = f"{totals.files} files hold: " + ", ".join(f"{n} {word}" for word, n in totals.words.items())
+            raise LinkFailure(f"The demo's evidence is not valid: {totals.words}")
+        step.detail = f"{totals.files} files valid: " + ", ".join(f"{n} {word}" for word, n in totals.words.items())
     return totals

@@ -53,14 +53,17 @@ def page_demo(say: Callable[[str], None], http: str | None = None) -> Iterator[P
     folder = Path(tempfile.mkdtemp(prefix="teds-provision-page-"))
     try:
         home, secret, nfc = folder / "home", secrets.token_hex(16), f"udp:127.0.0.1:{free_port()}"
-        say("A base station with keys of its own, in a folder that is thrown away.")
+        say("A base station with its own keys, in a temporary folder.")
         station, _ = initialise(
             home, name="bench", keystore="file", ask=lambda prompt, confirm: secret, costs=vault.passphrase.THROWAWAY
         )
         station.close()
         where = http or f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         with _daemon(home, secret, "--http", where, "--nfc", nfc), client.connect(home=home) as api:
-            say("Three virtual transducers: made, provisioned and verified by the station, then measured as one group.")
+            say(
+                "Three virtual transducers: created, provisioned and verified by the station, then measured as"
+                " one group."
+            )
             _measured(api)
             tapped = folder / "oven"
             _run("node", "create", str(tapped), "--profile", _TAPPED, "--name", "oven")

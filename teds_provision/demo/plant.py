@@ -80,27 +80,30 @@ class _Story:
         demo, began = self.demo, time.monotonic()
         if self.bin is None:
             lacks = "PostgreSQL 15" if find_spec("psycopg") is not None else "psycopg (the extra registry)"
-            demo.say(f"No {lacks} is installed here, so the stations meet in a folder, as by a stick.")
+            demo.say(f"No {lacks} is installed here, so the stations exchange pages through a folder, as with a stick.")
         else:
-            demo.say("A PostgreSQL of the demo's own: TLS, its own port; nothing of the system's is touched.")
+            demo.say(
+                "A PostgreSQL server of the demo's own, with TLS and its own port; the system's server is not touched."
+            )
             with demo.steps.step("start database") as step:
                 made = cluster.running(demo.folder / "postgresql", free_port(), self.bin)
                 self.server = demo.stack.enter_context(made)
                 step.detail = f"port {self.server.port}, as user {cluster.runs_as()}"
-        demo.say("Station north has the owner's CA key and makes the roster; west and south ask to be members.")
+        demo.say("Station north has the owner's CA key and creates the roster; west and south ask to join.")
         self._set_up()
-        demo.say("West, on the line, provisions a board; its key is shared with south, which never met the board.")
+        demo.say("West, on the line, provisions a board. Its key is shared with south, which has never seen the board.")
         demo.uuid = demo.stack.enter_context(_node(demo, "board", PROFILE))
         provision_over(demo, self["west"], "can", demo.uuid, BuildOrder(PROFILE, name="joint 1"))
         self._sync("west", "south", "west")
         before = self._verdict("verify")
         demo.say(
-            "West is stolen. North removes it; what it signed before stays, what it signs from now on does not count."
+            "West is stolen. North removes it: what it signed before stays valid, what it signs from now on"
+            " does not count."
         )
         self._stolen()
         with demo.steps.step("thief") as step:
             provision_over(demo, self["west"], "can", demo.uuid, BuildOrder(PROFILE, name="joint 1, forged"))
-            step.detail = "who has west's key has signed and written another datasheet"
+            step.detail = "the thief signs and writes another datasheet with west's key"
         after = self._verdict("verify")
         if (before, after) != ("authentic", "not authentic"):
             raise NotAuthentic(f"South found the board {before} before the theft and {after} after it.")
@@ -139,7 +142,7 @@ class _Story:
                 step.detail = f"{name} as {' '.join(sorted(roles))}"
         with demo.steps.step("registry share") as step:
             self._change(plant.owner.shared(north, Share(("all", ""), (self["south"].fingerprint,))))
-            step.detail = "every key goes to south by itself"
+            step.detail = "every key goes to south automatically"
         for name in ("north", *_ROLES):
             with demo.steps.step("registry connect") as step:
                 self._sync("north", tell=False)
@@ -158,7 +161,7 @@ class _Story:
             self._change(plant.owner.without(north, "west", "stolen", last))
             if self.server is not None:
                 self.server.psql(plant.schema.close_sql(west.fingerprint), _DATABASE)
-            step.detail = f"west, stolen; its pages count up to {last}"
+            step.detail = f"west, stolen; its pages up to {last} count"
         self._sync("north", "south")
 
     def _verdict(self, what: str) -> str:

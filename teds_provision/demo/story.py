@@ -110,7 +110,7 @@ def hand_over(demo: Demo, first: Station, second: Station) -> None:
         for station, other in ((first, second), (second, first)):
             record = TrustRecord(other.name, "station", other.point, fingerprint(other.point))
             add(station, [Candidate(record, demo.folder)])
-        step.detail = "each station trusts the other's key, by a person's word"
+        step.detail = "each station trusts the other's key"
     _send(demo, first, second, "copy")
     verify_from(demo, second, "verify")
     verify_from(demo, first, "verify")
@@ -232,7 +232,7 @@ def move_gripper(demo: Demo, station: Station, uuid: bytes) -> None:
                 hand.apply(OPENING)
             if not hand.safe:
                 raise LinkFailure("The demo's gripper is not in its safe state.")
-        step.detail = f"hand: opening {applied.value:.4g} {applied.unit}, then let go: safe state"
+        step.detail = f"hand: opening {applied.value:.4g} {applied.unit}, then back to its safe state"
 
 
 PROFILE = "magnetic-angular-position-sensor"
@@ -261,19 +261,20 @@ def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoDone:
 
 
 def _run(demo: Demo) -> DemoDone:
-    demo.say("Two base stations, each with its own keys, and a sensor on a reader (a process of its own).")
+    demo.say("Two base stations with their own keys, and a virtual sensor on a reader, in a process of its own.")
     first, second = new_station(demo, "bench"), new_station(demo, "crane")
     with demo.steps.step("start node") as step:
         demo.uuid = demo.stack.enter_context(_node(demo, "node", PROFILE, "--nfc", demo.nfc))
         step.detail = f"{demo.uuid.hex()} on {demo.nfc} and {demo.can}"
     demo.say("Tap: station bench provisions the sensor over NFC.")
     done = provision_over(demo, first, "nfc", demo.uuid, BuildOrder(PROFILE))
-    demo.say("The same sensor over CAN: written anew under another name, verified, its key rotated.")
+    demo.say("The same sensor over CAN: renamed, verified, its key rotated.")
     _over_can(demo, first)
-    demo.say("Hand over: crane gets a copy of the key, then bench gives the sensor away for good.")
+    demo.say("Handover: crane gets a copy of the key, then bench hands the sensor over for good.")
     hand_over(demo, first, second)
     demo.say(
-        "Measure: crane calibrates the sensor, takes up a gripper on the same bus, records both, moves the gripper."
+        "Measuring: crane calibrates the sensor, provisions a gripper on the same bus, records both and moves"
+        " the gripper."
     )
     _measure(demo, second)
     return DemoDone(tuple(demo.steps.done), done.verified.verdict, demo.uuid)

@@ -28,20 +28,18 @@ def config(system: System) -> Iterator[Finding]:
     try:
         values = load_toml(read_text(path, LIMITS.text_file, "config.toml"), str(path))
     except (BadData, NotFound) as error:
-        yield Finding("config", "failed", error.message, error.hint or "Mend or remove the file.")
+        yield Finding("config", "failed", error.message, error.hint or "Fix or remove the file.")
         return
     unknown = list(_unknown(values, system))
     if unknown:
         names = ", ".join(unknown[:_SHOWN])
-        yield Finding(
-            "config", "failed", f"{path} has keys that no command knows: {names}.", f"Take them out of {path}."
-        )
+        yield Finding("config", "failed", f"{path} has unknown settings: {names}.", f"Remove them from {path}.")
         return
     bad = system.bad_value(values)
     if bad:
-        yield Finding("config", "failed", bad, "Mend that line.")
+        yield Finding("config", "failed", bad, "Fix that line.")
     else:
-        yield Finding("config", "ok", f"{path} holds {len(values)} settings.")
+        yield Finding("config", "ok", f"{path} contains {len(values)} settings.")
 
 
 def _unknown(values: dict[str, Any], system: System) -> Iterator[str]:
@@ -74,17 +72,17 @@ def profiles(system: System) -> Iterator[Finding]:
     ]
     for one in listed:
         if one.error:
-            why = f"The profile {one.name} cannot be used: {one.error}"
+            why = f"Cannot use profile {one.name}: {one.error}"
             yield Finding("profiles", "failed", why, f"teds-provision profile check {one.path}")
     if not any(one.error for one in listed):
-        yield Finding("profiles", "ok", f"{len(listed)} of this station's own in {folder}.")
+        yield Finding("profiles", "ok", f"{len(listed)} profiles in {folder}.")
 
 
 @check("store file", "store")
 def store_file(system: System) -> Iterator[Finding]:
     """Is the store there where the vault is: one without the other is a loss."""
     if (system.home / "vault.json").exists() and not has_store(system.home):
-        why = f"The vault is in {system.home}, and its store is gone: names, pins and wrapped keys of every node."
+        why = f"{system.home} has a vault but no store: names, pins and wrapped keys of all nodes are missing."
         yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
 
 
@@ -96,18 +94,18 @@ def nodes(system: System) -> Iterator[Finding]:
     with Store.open(system.home) as opened:
         tally = opened.tally(datetime.now(UTC).strftime("%Y-%m-%d"))
     told = [
-        (tally.overdue, "with a calibration that has ended", "teds-provision nodes --due 0"),
-        (tally.twice, "under a name that another one has", "Name them apart: build UUID --name, sign, write"),
-        (tally.drafts, "with a datasheet that was built and not written", "teds-provision draft list"),
-        (tally.unverified, "keyed and never verified", "teds-provision verify UUID"),
-        (tally.rotations, "whose key has to be rotated", "Use it once: teds-provision verify UUID"),
+        (tally.overdue, "with an expired calibration", "teds-provision nodes --due 0"),
+        (tally.twice, "with a name that another node has", "Give them different names: build UUID --name, sign, write"),
+        (tally.drafts, "with a datasheet that was built but not written", "teds-provision draft list"),
+        (tally.unverified, "keyed but never verified", "teds-provision verify UUID"),
+        (tally.rotations, "whose key must be rotated", "Open a session once: teds-provision verify UUID"),
     ]
     for uuids, what, fix in told:
         if uuids:
             some = ", ".join(uuid.hex() for uuid in uuids[:_SHOWN]) + (" …" if len(uuids) > _SHOWN else "")
             yield Finding("nodes", "warning", f"{len(uuids)} {what}: {some}.", fix)
     if not any(uuids for uuids, _, _ in told):
-        yield Finding("nodes", "ok", "Nothing waits for anybody.")
+        yield Finding("nodes", "ok", "No node needs attention.")
 
 
 @check("seals", "store")
@@ -118,7 +116,7 @@ def seals(system: System) -> Iterator[Finding]:
     station = Station.open(system.home, ask=system.ask or _nobody)
     try:
         if system.ask is None and station.identity.keystore != "keyring":  # which opens by itself, or not at all
-            why = "Pins and trust are checked where the vault opens; no passphrase was given."
+            why = "Not checked: pins and trust need the vault, and no passphrase was given."
             yield Finding("seals", "skipped", why, "teds-provision --passphrase-fd 3 doctor 3<FILE")
             return
         station.unlock()
@@ -133,11 +131,11 @@ def seals(system: System) -> Iterator[Finding]:
         station.close()
     if broken:
         some = ", ".join(broken[:_SHOWN]) + (" …" if len(broken) > _SHOWN else "")
-        fix = "Take them away (whitelist remove, trust remove), find out who wrote the file, and add them anew."
-        yield Finding("seals", "failed", f"Changed by another program, and not believed: {some}.", fix)
+        fix = "Remove them (whitelist remove, trust remove), find out who changed the file, and add them again."
+        yield Finding("seals", "failed", f"Changed by another program and not trusted: {some}.", fix)
     else:
-        yield Finding("seals", "ok", "Pins, trust and the station's own CA are as this station wrote them.")
+        yield Finding("seals", "ok", "Pins, trust and the station's own CA are unchanged.")
 
 
 def _nobody(_prompt: str, _confirm: bool = False) -> str:
-    raise VaultFailure("Nobody is asked for a passphrase here.")
+    raise VaultFailure("doctor never asks for a passphrase.")

@@ -56,7 +56,9 @@ def readers(system: System) -> Iterator[Finding]:
         found = True
         yield _reader(system, device, ids)
     if not found:
-        yield Finding("nfc readers", "skipped", f"No USB reader of the {len(READERS)} that nfcpy knows is plugged in.")
+        yield Finding(
+            "nfc readers", "skipped", f"None of the {len(READERS)} USB readers that nfcpy supports is plugged in."
+        )
     yield from _pcscd(system, found)
 
 
@@ -68,23 +70,23 @@ def _reader(system: System, device: Path, ids: tuple[int, int]) -> Finding:
     try:
         bus, number = (int((device / part).read_text()) for part in ("busnum", "devnum"))
     except (OSError, ValueError):
-        return Finding(name, "warning", f"{what} is going away or was just plugged in.", "Run the doctor again.")
+        return Finding(name, "warning", f"{what} is being plugged in or removed.", "Run doctor again.")
     node = system.at(f"/dev/bus/usb/{bus:03}/{number:03}")
     held = {os.path.basename(os.path.realpath(link)) for link in device.parent.glob(f"{device.name}:*/driver")}
     driver = next(iter(held - {"usbfs"}), None)
     if driver is not None:
         fix = f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
-        return Finding(name, bad, f"{what} is held by the kernel driver {driver}.", fix)
+        return Finding(name, bad, f"{what} is in use by the kernel driver {driver}.", fix)
     if "usbfs" in held:
-        fix = "End it; for pcscd: sudo systemctl stop pcscd.socket pcscd"
-        return Finding(name, bad, f"{what} is held by another program.", fix)
+        fix = "Stop it; for pcscd: sudo systemctl stop pcscd.socket pcscd"
+        return Finding(name, bad, f"{what} is in use by another program.", fix)
     if not os.access(node, os.R_OK | os.W_OK):
         rule = (
             f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{vendor:04x}", ATTRS{{idProduct}}=="{product:04x}", '
             'TAG+="uaccess", GROUP="plugdev", MODE="0660"'
         )
         fix = f"echo '{rule}' | sudo tee /etc/udev/rules.d/70-nfc.rules, then plug the reader in again"
-        return Finding(name, bad, f"This user may not open {what} at {_shown(system, node)}.", fix)
+        return Finding(name, bad, f"You do not have permission to open {what} at {_shown(system, node)}.", fix)
     return Finding(name, "ok", f"{what} at {_shown(system, node)}: --nfc usb:{vendor:04x}:{product:04x}.")
 
 
@@ -98,7 +100,7 @@ def _pcscd(system: System, found: bool) -> Iterator[Finding]:
             yield Finding(
                 "pcscd",
                 "warning" if found else "ok",
-                "pcscd is running; it takes the ACR122U and other readers for itself: --nfc pcsc uses them through it.",
+                "pcscd is running and claims the ACR122U and other readers; use them with --nfc pcsc.",
                 "sudo systemctl stop pcscd.socket pcscd, or use --nfc pcsc" if found else "",
             )
             return
@@ -109,7 +111,7 @@ def pcsc(system: System) -> Iterator[Finding]:
     """Which PC/SC readers pcscd offers; a failure only where one was asked for."""
     asked = (system.nfc or "").partition(":")[0] == "pcsc"
     if system.root != Path("/"):
-        yield Finding("pc/sc", "skipped", "Another machine's folders are looked at.")
+        yield Finding("pc/sc", "skipped", "These checks are running on another machine's files.")
         return
 
     try:
@@ -121,8 +123,8 @@ def pcsc(system: System) -> Iterator[Finding]:
         paths = ", ".join(f"--nfc 'pcsc:{name}'" for name in found)
         yield Finding("pc/sc", "ok", f"Readers: {paths}.")
     else:
-        fix = "Plug it in; pcsc_scan of the package pcsc-tools lists what pcscd sees" if asked else ""
-        yield Finding("pc/sc", "failed" if asked else "skipped", "pcscd sees no reader.", fix)
+        fix = "Plug it in; pcsc_scan (package pcsc-tools) lists the readers of pcscd" if asked else ""
+        yield Finding("pc/sc", "failed" if asked else "skipped", "pcscd has no reader.", fix)
 
 
 @check("serial ports", "machine")
@@ -130,11 +132,11 @@ def serial_ports(system: System) -> Iterator[Finding]:
     """May this user open the serial ports that a reader or a CAN adapter could be behind."""
     ports = sorted(path for kind in ("USB", "ACM", "AMA") for path in system.at("/dev").glob(f"tty{kind}*"))
     if not ports:
-        yield Finding("serial ports", "skipped", "There is none that a reader could be behind.")
+        yield Finding("serial ports", "skipped", "There is no serial port that a reader could use.")
         return
     closed = [port.name for port in ports if not os.access(port, os.R_OK | os.W_OK)]
     if closed:
-        why = f"This user may not open {', '.join(closed)}."
+        why = f"You do not have permission to open {', '.join(closed)}."
         yield Finding("serial ports", "warning", why, "sudo adduser $USER dialout, then log in again")
     else:
         yield Finding("serial ports", "ok", f"{', '.join(port.name for port in ports)} can be opened.")
@@ -156,14 +158,14 @@ def nfc_loopback(system: System) -> Iterator[Finding]:
             fix = "sudo ip link set lo up; allow loopback in the firewall"
             yield Finding("nfc loopback", "warning", f"Simulated readers cannot work: {error}.", fix)
             return
-    yield Finding("nfc loopback", "ok" if arrived else "warning", "Simulated readers (udp:) can be used.")
+    yield Finding("nfc loopback", "ok" if arrived else "warning", "Simulated readers (udp:) work.")
 
 
 @check("nfc", "link")
 def nfc(system: System) -> Iterator[Finding]:
     """Open the reader that was asked for, and look what lies on it."""
     if system.nfc is None:
-        yield Finding("nfc", "skipped", "No reader was named, so none was opened.", "")
+        yield Finding("nfc", "skipped", "No reader was given, so none was opened.", "")
         return
 
     try:
@@ -174,11 +176,13 @@ def nfc(system: System) -> Iterator[Finding]:
     try:
         tag = any(reader.sense() is not None for _ in range(_SENSES))
     except nfc_room.tag.ReaderLost as error:
-        yield Finding("nfc", "failed", f"{reader.name} opened, but failed at once: {error}.", "Unplug it, plug it in.")
+        yield Finding(
+            "nfc", "failed", f"{reader.name} opened but failed immediately: {error}.", "Unplug it, plug it in."
+        )
         return
     finally:
         reader.close()
-    lies = "a tag lies on it" if tag else "nothing lies on it"
+    lies = "there is a tag on it" if tag else "there is nothing on it"
     fix = "" if tag or not system.nfc.startswith("udp") else f"teds-provision node run DIR --nfc {system.nfc}"
     yield Finding("nfc", "ok" if tag or not fix else "warning", f"{reader.name} on {system.nfc} opens; {lies}.", fix)
 
@@ -208,7 +212,7 @@ def can_interfaces(system: System) -> Iterator[Finding]:
             yield Finding(name, "ok", f"{interface.name} is up{at}: --can socketcan:{interface.name}.")
     if not found:
         told = "no CAN interface" if _kernel_can() else "no CAN (modprobe can can_raw, where its modules are there)"
-        yield Finding("can interfaces", "skipped", f"The kernel has {told}; other kinds of --can can be used.")
+        yield Finding("can interfaces", "skipped", f"The kernel has {told}; other interfaces of --can may still work.")
 
 
 def _kernel_can() -> bool:
@@ -238,7 +242,7 @@ def can_loopback(system: System) -> Iterator[Finding]:
     """Do frames of a simulated bus come back, without leaving this machine (hop limit 0)."""
     channel = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
     arrived, why, fix = _self_test(f"udp_multicast:{channel}?hop_limit=0&port={free_port()}")
-    told = "Simulated buses (udp_multicast:) can be used." if arrived else why
+    told = "Simulated buses (udp_multicast:) work." if arrived else why
     yield Finding("can loopback", "ok" if arrived else "warning", told, fix)
 
 
@@ -254,7 +258,7 @@ def _self_test(spec: str) -> tuple[bool, str, str]:
     finally:
         for bus in buses:
             bus.close()
-    why = "" if arrived else "A frame sent to a simulated bus did not come back."
+    why = "" if arrived else "A frame sent to a simulated bus was not received."
     return arrived, why, "" if arrived else "sudo ip route add 239.0.0.0/8 dev lo; allow multicast in the firewall"
 
 
@@ -262,7 +266,7 @@ def _self_test(spec: str) -> tuple[bool, str, str]:
 def can(system: System) -> Iterator[Finding]:
     """Open the bus that was asked for; listen a moment for errors, and for another station of our address."""
     if system.can is None:
-        yield Finding("can", "skipped", "No bus was named, so none was opened.", "")
+        yield Finding("can", "skipped", "No bus was given, so none was opened.", "")
         return
 
     try:
@@ -318,7 +322,7 @@ def switches(system: System) -> Iterator[Finding]:
     """Does the kernel know a Bluetooth adapter, and is it blocked by rfkill or by a switch."""
     found = sorted(path.name for path in system.at("/sys/class/bluetooth").glob("hci*") if ":" not in path.name)
     if not found:
-        yield Finding("bluetooth switches", "skipped", "The kernel knows no Bluetooth adapter.")
+        yield Finding("bluetooth switches", "skipped", "The kernel has no Bluetooth adapter.")
         return
     blocked = list(_blocked(system))
     yield from blocked
@@ -337,7 +341,10 @@ def _blocked(system: System) -> Iterator[Finding]:
             continue
         if hard:
             yield Finding(
-                "bluetooth switches", "warning", f"{name} is off by a switch.", "Use the machine's switch or key."
+                "bluetooth switches",
+                "warning",
+                f"{name} is turned off by a switch.",
+                "Use the machine's switch or key.",
             )
         else:
             yield Finding("bluetooth switches", "warning", f"{name} is blocked.", "rfkill unblock bluetooth")
@@ -347,7 +354,7 @@ def _blocked(system: System) -> Iterator[Finding]:
 def bluetooth(system: System) -> Iterator[Finding]:
     """System bus, bluetoothd, its adapters: switched on, central role, connections that are held."""
     if system.root != Path("/") and "DBUS_SYSTEM_BUS_ADDRESS" not in system.environment:
-        yield Finding(_BLUETOOTH, "skipped", "Another machine's folders are looked at.")
+        yield Finding(_BLUETOOTH, "skipped", "These checks are running on another machine's files.")
         return
     asked = system.ble is not None
     try:
@@ -374,7 +381,9 @@ def _adapter(facts: AdapterFacts, spec: BleSpec, *, asked: bool) -> Finding:
     name = f"{_BLUETOOTH} {facts.name}"
     bad: Result = "failed" if asked and spec.adapter in (None, facts.name) else "warning"
     if not facts.central:
-        return Finding(name, bad, f"{facts.name} has no LE central role.", "Use an adapter of Bluetooth 4.0 up.")
+        return Finding(
+            name, bad, f"{facts.name} has no LE central role.", "Use an adapter with Bluetooth 4.0 or later."
+        )
     if not facts.powered:
         return Finding(name, bad, f"{facts.name} is switched off.", POWER_HINT)
     held = f"{facts.held} connection{'' if facts.held == 1 else 's'} held"

@@ -42,7 +42,7 @@ def python(system: System) -> Iterator[Finding]:
     """Is this Python new enough."""
     version = platform.python_version()
     enough = sys.version_info[:2] >= _MIN_PYTHON
-    fix = "" if enough else "Install Python 3.11 or newer and make the virtual environment anew."
+    fix = "" if enough else "Install Python 3.11 or newer and recreate the virtual environment."
     yield Finding("python", "ok" if enough else "failed", f"Python {version} on {platform.platform()}.", fix)
 
 
@@ -73,12 +73,12 @@ def _shadowed() -> Iterator[Finding]:
     try:
         version = metadata.version("ndef")
     except metadata.PackageNotFoundError:
-        yield Finding("ndeflib", "ok", "No other package hides it.")
+        yield Finding("ndeflib", "ok", "Not shadowed by another package.")
         return
     yield Finding(
         "ndeflib",
         "failed",
-        f"The package ndef {version} hides ndeflib, which nfcpy needs.",
+        f"The package ndef {version} shadows ndeflib, which nfcpy needs.",
         "pip uninstall --yes ndef; pip install --force-reinstall ndeflib",
     )
 
@@ -87,7 +87,7 @@ def _shadowed() -> Iterator[Finding]:
 def argon2id(system: System) -> Iterator[Finding]:
     """Can this OpenSSL derive keys from passphrases."""
     vault.passphrase.SealingKey.derive("a self-test, no secret", costs=vault.passphrase.THROWAWAY)
-    yield Finding("argon2id", "ok", "Passphrases can be used.")
+    yield Finding("argon2id", "ok", "Passphrases work.")
 
 
 @check("libusb", "machine")
@@ -101,7 +101,7 @@ def libusb(system: System) -> Iterator[Finding]:
         yield Finding("libusb", "ok", f"{name} loads.")
         return
     asked = (system.nfc or "").startswith("usb")
-    why = "The C library libusb is missing: USB readers cannot be used (simulated and serial ones can)."
+    why = "The C library libusb is missing: USB readers do not work (simulated and serial ones do)."
     yield Finding("libusb", "failed" if asked else "warning", why, "sudo apt install libusb-1.0-0")
 
 
@@ -111,12 +111,12 @@ def clock(system: System) -> Iterator[Finding]:
     now = datetime.now(UTC)
     fix = "sudo timedatectl set-ntp true, or: sudo date --utc --set '2026-01-31 12:00'"
     if not _FIRST_YEAR <= now.year <= _LAST_YEAR:
-        yield Finding("clock", "failed", f"The clock says {now:%Y-%m-%d}, which cannot be.", fix)
+        yield Finding("clock", "failed", f"The clock is wrong: {now:%Y-%m-%d}.", fix)
         return
     last = _last_entry(system)
     if last is not None and (last - now).total_seconds() > _TOLERANCE_SECONDS:
         yield Finding(
-            "clock", "failed", f"The clock says {now:%Y-%m-%d %H:%M} UTC, before the last entry of the audit log.", fix
+            "clock", "failed", f"The clock is wrong: {now:%Y-%m-%d %H:%M} UTC is before the last audit log entry.", fix
         )
         return
     drift = _drift(system)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 
@@ -13,6 +13,7 @@ from teds_provision.store.database import has_store
 
 _SYNC = "teds-provision registry sync"
 _LATE = timedelta(days=7)
+_AHEAD = timedelta(minutes=5)
 
 
 @check("registry", "store")
@@ -31,10 +32,7 @@ def registry(system: System) -> Iterator[Finding]:
         synced = datetime.fromisoformat(record.synced) if record.synced is not None else None
         if synced is None or now - synced > _LATE:
             yield Finding("registry", "warning", f"The last sync was {record.synced or 'never'}.", _SYNC)
-        newest = max((created for _, created in store.page_newest()), default="")
-        if newest and now + timedelta(minutes=5) < datetime.fromisoformat(newest):
-            why = f"The clock is behind the newest page ({newest})."
-            yield Finding("registry", "warning", why, "Set the clock of this machine.")
+        yield from _clocks(roster, store.page_newest(), now)
         alarms = [one for one in store.alarms() if not one.seen]
         for one in alarms:
             yield Finding("registry", "warning", f"Alarm {one.code}: {one.why}.", "teds-provision registry status")
@@ -42,6 +40,25 @@ def registry(system: System) -> Iterator[Finding]:
         said = f"{store.unsent()} events unsent, {conflicts} conflicts."
         fix = "teds-provision registry status" if conflicts else ""
         yield Finding("registry", "warning" if conflicts else "ok", said, fix)
+
+
+def _clocks(roster: Roster, newest: Iterable[tuple[str, str]], now: datetime) -> Iterator[Finding]:
+    """Whose clock is wrong, by the date of each member's newest page.
+
+    A page from beyond the roster's end was dated by a wrong clock there; a nearer one may mean that this one is slow.
+    """
+    members = {member.fingerprint: member.name for member in roster.members}
+    for station, created in newest:
+        when = datetime.fromisoformat(created)
+        if station not in members or when <= now + _AHEAD:
+            continue
+        name = members[station]
+        if when > roster.expires:
+            why, fix = f"{name} has dated its newest page {created}.", f"Set the clock of {name}."
+        else:
+            why = f"The clock is behind the newest page of {name} ({created})."
+            fix = f"Set the clock of this machine, or that of {name}."
+        yield Finding("registry", "warning", why, fix)
 
 
 def _roster(roster: Roster, now: datetime) -> Finding:

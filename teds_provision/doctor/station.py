@@ -38,15 +38,15 @@ def home(system: System) -> Iterator[Finding]:
         why = f"{system.home} belongs to another user."
         yield Finding("home", "warning", why, f"sudo chown -R $USER {system.home}, or use another --home")
     elif status.st_mode & 0o022:
-        yield Finding("home", "failed", f"Others may write in {system.home}.", f"chmod 700 {system.home}")
+        yield Finding("home", "failed", f"Other users can write to {system.home}.", f"chmod 700 {system.home}")
     elif status.st_mode & 0o055:
-        yield Finding("home", "warning", f"Others may look into {system.home}.", f"chmod 700 {system.home}")
+        yield Finding("home", "warning", f"Other users can read {system.home}.", f"chmod 700 {system.home}")
     else:
-        yield Finding("home", "ok", f"{system.home} is this user's alone.")
+        yield Finding("home", "ok", f"{system.home} is private to this user.")
     open_files = [path for path in sorted(system.home.iterdir()) if _open_to_others(path)]
     if open_files:
         names = " ".join(str(path) for path in open_files)
-        why = f"Others may read {', '.join(path.name for path in open_files)}."
+        why = f"Other users can read {', '.join(path.name for path in open_files)}."
         yield Finding("files", "failed", why, f"chmod 600 {names}")
 
 
@@ -78,17 +78,17 @@ def store(system: System) -> Iterator[Finding]:
             return
         facts = opened.facts()
         if facts is None or facts.point is None:
-            yield Finding("store", "warning", "An init was begun here and not finished.", _INIT)
+            yield Finding("store", "warning", "init was started here but not finished.", _INIT)
             return
         count = opened.count("nodes")
-        yield Finding("store", "ok", f"Whole; {count} nodes, {opened.count('whitelist')} whitelisted.")
+        yield Finding("store", "ok", f"Intact; {count} nodes, {opened.count('whitelist')} whitelisted.")
         yield from _audit(opened)
         yield from _backups(opened, count)
     holder = holder_of(system.home)
     if holder is None:
-        yield Finding("lock", "ok", "Nobody holds the store.")
+        yield Finding("lock", "ok", "The store is not locked.")
     else:
-        yield Finding("lock", "warning", f"The store is held by {holder}.", "Wait until it has ended.")
+        yield Finding("lock", "warning", f"The store is locked by {holder}.", "Wait until it has ended.")
 
 
 def _audit(opened: Store) -> Iterator[Finding]:
@@ -96,22 +96,22 @@ def _audit(opened: Store) -> Iterator[Finding]:
     if verdict.intact:
         yield Finding("audit log", "ok", f"{verdict.count} entries, chain intact.")
     else:
-        fix = "Keep a copy, see teds-provision log, and find out who wrote the file."
-        yield Finding("audit log", "failed", f"The chain does not hold: {verdict.why}.", fix)
+        fix = "Keep a copy, run teds-provision log, and find out who changed the file."
+        yield Finding("audit log", "failed", f"The hash chain is broken: {verdict.why}.", fix)
 
 
 def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
     taken = [entry.at for entry in opened.audit.chosen(Choice(act="backup"))]
     fix = "teds-provision backup FILE"
     if not taken:
-        why = "There is no backup: if this machine is lost, every node has to come back to the bench."
+        why = "There is no backup: without one, losing this machine means re-keying every node at the bench."
         yield Finding(
             "backup", "warning" if nodes else "ok", why if nodes else "Nothing to back up yet.", fix * bool(nodes)
         )
         return
     days = (datetime.now(UTC) - datetime.strptime(taken[-1], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)).days
     old = days > _BACKUP_DAYS
-    yield Finding("backup", "warning" if old else "ok", f"The last one is {days} days old.", fix if old else "")
+    yield Finding("backup", "warning" if old else "ok", f"The last backup is {days} days old.", fix if old else "")
 
 
 @check("keyring", "store")
@@ -125,11 +125,11 @@ def keyring(system: System) -> Iterator[Finding]:
         if used == "keyring":
             yield Finding("keyring", "failed", failure.message, failure.hint)
         elif used is not None:
-            yield Finding("keyring", "skipped", f"This station does not use it. {failure.message}")
+            yield Finding("keyring", "skipped", f"Not used by this station: {failure.message}")
         else:
             none = isinstance(failure, NoKeyring)
             fix = "teds-provision init --keystore file" if none else failure.hint
-            yield Finding("keyring", "warning", f"{failure.message} init will take a passphrase file.", fix)
+            yield Finding("keyring", "warning", f"{failure.message} init will use a passphrase file.", fix)
         return
     yield Finding("keyring", "ok", f"{name}.")
 
@@ -170,9 +170,9 @@ def unlocked(system: System) -> Iterator[Finding]:
     """Does a process hold the vault open."""
     left = agent.seconds_left(system.home)
     if left is None:
-        yield Finding("unlock", "ok", "No process holds the vault open.")
+        yield Finding("unlock", "ok", "The vault is locked.")
     else:
-        why = f"The vault is held open for {left // 60} min {left % 60} s more: whoever runs as this user opens it."
+        why = f"The vault stays unlocked for {left // 60} min {left % 60} s more, for every process of this user."
         yield Finding("unlock", "warning", why, "teds-provision lock")
 
 
@@ -183,10 +183,8 @@ def _file_vault(system: System) -> Finding:
             raise VaultFailure("vault.json belongs to another store.", hint="teds-provision restore FILE")
     memory = content.get("memory_kib")
     if not isinstance(memory, int) or memory < 19 * 1024:  # OWASP's least for Argon2id
-        return Finding(
-            "vault", "warning", "The passphrase file is sealed cheaply, as for a demo.", "Make a new station."
-        )
-    return Finding("vault", "ok", f"The passphrase file is there (Argon2id, {memory >> 10} MiB).")
+        return Finding("vault", "warning", "The passphrase file has weak demo settings.", "Create a new station.")
+    return Finding("vault", "ok", f"The passphrase file exists (Argon2id, {memory >> 10} MiB).")
 
 
 def _keystore(system: System) -> str | None:
@@ -205,12 +203,12 @@ def keys_folder(system: System) -> Iterator[Finding]:
     """Does the workspace's ``keys/`` hold public keys only."""
     folder = system.workspace / "keys"
     if not folder.is_dir():
-        yield Finding("keys folder", "skipped", "There is no folder keys/ here.")
+        yield Finding("keys folder", "skipped", "There is no keys/ folder here.")
         return
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     private = [str(path.relative_to(system.workspace)) for path in files if holds_private_key(path)]
     if private:
-        fix = f"git rm --cached {' '.join(private)}; take it away, and make a new key: this one is no secret any more"
+        fix = f"git rm --cached {' '.join(private)}; remove it, and create a new key: this one is no longer secret"
         yield Finding("keys folder", "failed", f"Private keys: {', '.join(private)}.", fix)
     else:
         yield Finding("keys folder", "ok", f"{len(files)} files, no private key.")

@@ -24,7 +24,7 @@ def why_not(station: Station, statement: Statement, bundle: Bundle) -> str:
     brought = next((node for node in bundle.nodes if node.uuid == statement.uuid), None)
     key = _key_of(station, statement.uuid, bundle)
     if key is None:
-        return "nothing is known of this node here"
+        return "this node is unknown here"
     if statement.fingerprint is not None and not same_key(statement.fingerprint, key):
         return f"it names the key {str(statement.fingerprint)[:32]}, and the node here has another"
     if not _has_authority(station, statement) and not (brought is not None and statement.sender == bundle.sender):

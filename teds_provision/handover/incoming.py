@@ -144,9 +144,9 @@ class ImportedRows:
         for one in taken:
             uuid = one.node.uuid
             if uuid in self.resting:
-                marks[uuid] = {"rotation": f"it came back by {self.bundle.id}: others have had this key"}
+                marks[uuid] = {"rotation": f"it was returned by {self.bundle.id}: others have held this key"}
             if self.bundle.mode == "move":
-                marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has had this key"}
+                marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has held this key"}
             if one.decision == "same" or self.cas.get(uuid, own) == ca:
                 continue
             if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
@@ -204,7 +204,7 @@ class NothingTaken(PolicyRefused):
 
     def __init__(self, bundle: Bundle, nodes: tuple[PlannedNode, ...]) -> None:
         super().__init__(
-            f"No node of the bundle can be taken in; {nodes[0].node.uuid.hex()}: {nodes[0].why}.",
+            f"None of the nodes in the bundle can be imported; {nodes[0].node.uuid.hex()}: {nodes[0].why}.",
             hint="Nothing was imported. Tell the sender.",
         )
         self.bundle, self.nodes = bundle, nodes
@@ -306,8 +306,8 @@ def _before(row: Handover, content: str) -> Imported:
     notes = Notes.from_json(row.nodes)
     if notes.content != content:
         raise PolicyRefused(
-            f"The bundle {row.id} was taken in before with other content: it is replayed or forged.",
-            hint="Ask its sender, by voice, what was sent.",
+            f"The bundle {row.id} was already imported with different content: it is a replay or a forgery.",
+            hint="Ask its sender by voice what was sent.",
         )
     assert row.receipt is not None
     return Imported(row, notes, row.receipt.encode("ascii"), fresh=False)
@@ -318,8 +318,8 @@ def _check_certified(station: Station, opened: OpenedBundle) -> None:
     ca = opened.bundle.ca
     if opened.station_signature is None and station.identity.certificate(ca, station.point) is None:
         raise PolicyRefused(
-            f"The bundle brings no signature of the CA {fingerprint(ca)[:16]} over this station's key.",
-            hint="Ask the sender to export it again, where that CA key is kept.",
+            f"The bundle has no signature by CA {fingerprint(ca)[:16]} over this station's key.",
+            hint="Ask the sender to export it again on the station with that CA key.",
         )
 
 
@@ -363,7 +363,7 @@ class _Judge:
             return f"it is revoked: {why}"
         tombstone = self.tombstones.get(node.uuid)
         if tombstone is not None and (self.sender != tombstone.to_fingerprint or self.mode != "move"):
-            return f"it was moved to station {tombstone.to_fingerprint[:32]}, which alone can move it back"
+            return f"it was moved to station {tombstone.to_fingerprint[:32]}, and only that station can move it back"
         if pin is not None and not same_key(pin, fingerprint(node.node_key)):
             return "this UUID is known here with another node key"
         return ""
@@ -374,7 +374,7 @@ class _Judge:
         if node.kid in held:
             return ""
         if sum(state == "pending" for state, _ in held.values()) >= MAX_PENDING:
-            return f"{MAX_PENDING} keys of it wait here for their proof"
+            return f"{MAX_PENDING} of its keys are already waiting for proof here"
         known = self.nodes.get(node.uuid)
         active = max((epoch for state, epoch in held.values() if state == "active"), default=0)
         latest = max(known.epoch if known is not None else 0, *(epoch for _, epoch in held.values()), 0)
@@ -387,7 +387,7 @@ class _Judge:
     def _taken(self, node: BundledNode) -> PlannedNode:
         notes = []
         if node.uuid in self.tombstones:
-            notes.append("it comes back: its key is rotated at the first contact")
+            notes.append("it is returning: its key is rotated at the first contact")
         known = self.nodes.get(node.uuid)
         name = known.name if known is not None and known.name else node.name
         if name is not None and name == node.name:

@@ -121,7 +121,7 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
     described = [(number, AccessCode.CHANNEL) for number, _ in blocks]
     blocks |= {block: image.blocks[block] for block in described if block in image.blocks}
     if not blocks:
-        raise NotFound(f"No calibration of node {old.uuid.hex()} is known here.", hint="Leave --copy-calibration away.")
+        raise NotFound(f"No calibration of node {old.uuid.hex()} is known here.", hint="Omit --copy-calibration.")
     if old.profile is None:
         raise BadData("The profile of the old node is not known, so its calibration cannot be built in.")
     return blocks

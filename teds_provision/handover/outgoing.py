@@ -43,7 +43,7 @@ from teds_provision.store import (
 DEFAULT_DAYS = 7
 OUT_OF_SERVICE = ("decommissioned", "replaced by")  # the words of handover/life.py
 _UNKNOWN = "its public key is not known"
-_CURE = "See teds-provision nodes UUID; settle it by any session, or: teds-provision agree UUID --rotate"
+_CURE = "See teds-provision nodes UUID; any session settles it, or: teds-provision agree UUID --rotate"
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Selection:
         why = self._every() if self.order.nodes is None else self._named(self.order.nodes)
         chosen = [self.keys[uuid] for uuid, obstacle in why.items() if not obstacle]
         if not chosen:
-            raise NotFound("There is no node to hand over.", hint="Name nodes, or see: teds-provision nodes")
+            raise NotFound("There is no node to hand over.", hint="Name the nodes; see: teds-provision nodes")
         return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
 
     def fitting(self) -> Chosen:
@@ -128,10 +128,10 @@ class Selection:
         resting = self._cut_move()
         for uuid in resting:
             if uuid in self.revoked or uuid not in self.keys:
-                why = "it is revoked" if uuid in self.revoked else "no key of it is held here"
+                why = "it is revoked" if uuid in self.revoked else "this station holds no key for it"
                 raise PolicyRefused(
-                    f"The move under way cannot be sealed again, as node {uuid.hex()} is in it: {why}.",
-                    hint="Take the move back (handover list, handover undo ID), then hand over the others.",
+                    f"The pending move includes node {uuid.hex()} and cannot be sealed again: {why}.",
+                    hint="Undo the move (handover list, handover undo ID), then hand over the others.",
                 )
         return dict.fromkeys(resting, "")
 
@@ -145,7 +145,8 @@ class Selection:
         if tombstone is not None and not (self.order.nodes is not None and self._is_cut(uuid)):
             return f"it was moved to station {tombstone.to_fingerprint[:16]}"
         if uuid not in self.keys:
-            return "its key was never proven in a session" if uuid in self.pending else "no key of it is held here"
+            never = "its key was never proven in a session"
+            return never if uuid in self.pending else "this station holds no key for it"
         if self.order.mode == "move" and uuid in self.pending:
             return "an agreement with it is not settled: the key that it has now may be a newer one"
         if uuid in self.due:
@@ -252,7 +253,7 @@ def plan_export(station: Station, order: ExportOrder, now: datetime | None = Non
     """:func:`plan_exports` for what fits into one bundle; raises UsageFailure for more."""
     plans = plan_exports(station, order, now=now)
     if len(plans) > 1:
-        raise UsageFailure("These are too many nodes for one bundle.", hint="Export them in several.")
+        raise UsageFailure("These are too many nodes for one bundle.", hint="Export them in several bundles.")
     return plans[0]
 
 
@@ -268,7 +269,7 @@ def plan_exports(
     """
     receivers = tuple({record.point: record for record in _receivers(station, order)}.values())
     if order.mode == "move" and len(receivers) != 1:
-        raise UsageFailure("A move has exactly one receiver.", hint="Use --mode copy for several.")
+        raise UsageFailure("A move has exactly one receiver.", hint="For several receivers, use --mode copy.")
     if order.days < 1:
         raise UsageFailure("A bundle is valid for at least one day.")
     selection = Selection(station, order, {record.fingerprint for record in receivers})
@@ -411,7 +412,7 @@ def outputs_of(output: Path, count: int) -> list[Path]:
 
 def _receivers(station: Station, order: ExportOrder) -> list[TrustRecord]:
     if not order.to:
-        raise UsageFailure("Nobody is named to hand the keys to.", hint="Add --to STATION; see: trust list")
+        raise UsageFailure("No receiver was given.", hint="Add --to STATION; see: trust list")
     return [find_trusted(station, text, "station") for text in order.to]
 
 
@@ -421,11 +422,11 @@ def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
     if order.ca is not None:
         found = {digits: ca for digits, ca in found.items() if digits.startswith(order.ca.lower())}
         if not found:
-            raise NotFound(f"None of these nodes keeps a CA key {order.ca}.")
+            raise NotFound(f"None of these nodes holds the CA key {order.ca}.")
     if len(found) > 1:
         raise PolicyRefused(
-            f"These nodes keep {len(found)} different CA keys; a bundle is for one.",
-            hint=f"Export them apart: --ca {' / --ca '.join(sorted(digits[:16] for digits in found))}",
+            f"These nodes hold {len(found)} different CA keys; a bundle covers one.",
+            hint=f"Export them separately: --ca {' / --ca '.join(sorted(digits[:16] for digits in found))}",
         )
     return next(iter(found.values()))
 
@@ -452,7 +453,7 @@ def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
     if known is None:
         raise PolicyRefused(
             f"Station {receiver.name!r} is not certified by the CA {fingerprint(ca)[:16]}, whose key is not here:"
-            " it could read these nodes, but neither write nor rotate them.",
+            " it could read these nodes but neither write nor rotate them.",
             hint="Where the CA key is kept: trust ca sign REQUEST --output CERT; here: trust add NAME CERT",
         )
     return known
@@ -509,7 +510,7 @@ def _bundled(station: Station, nodes: Iterable[Leaving]) -> Iterator[BundledNode
         for leaving in page:
             record, key = records.get(leaving.uuid), keys.get((leaving.uuid, leaving.key_id))
             if record is None or record.point is None or key is None:
-                raise PolicyRefused(f"Node {leaving.uuid.hex()} was changed meanwhile.", hint="Run it again.")
+                raise PolicyRefused(f"Node {leaving.uuid.hex()} was changed in the meantime.", hint="Run it again.")
             yield BundledNode(
                 uuid=record.uuid,
                 node_key=record.point,

@@ -103,7 +103,7 @@ def find_handover(station: Station, text: str) -> Handover:
     """Return the bundle that left under this id, or its first digits; raises NotFound."""
     fits = [row for row in station.handovers.all() if row.direction == "out" and row.id.startswith(text.lower())]
     if len(fits) != 1 or len(text) < 4:
-        raise NotFound(f"No handover that left here is known as {text!r}.", hint="See: teds-provision handover list")
+        raise NotFound(f"No outgoing handover matches {text!r}.", hint="See: teds-provision handover list")
     return fits[0]
 
 
@@ -125,12 +125,12 @@ def undo(station: Station, row: Handover) -> Undone:
     uuids = tuple(bytes.fromhex(uuid) for uuid in Notes.from_json(row.nodes).uuids)
     if row.mode == "copy":
         raise PolicyRefused(
-            "A copy cannot be taken back: the other station holds the keys.",
-            hint="Make new ones: teds-provision agree UUID --rotate",
+            "A copy cannot be undone: the other station holds the keys.",
+            hint="To replace them: teds-provision agree UUID --rotate",
         )
     if row.state == CLOSED:
         raise PolicyRefused(
-            f"The receipt of this move came: station {peer_name(station, row.peers[0])} holds the keys now.",
+            f"The receipt of this move has arrived: station {peer_name(station, row.peers[0])} holds the keys now.",
             hint="Have the nodes handed back: export-keys there, import-keys here.",
         )
     if row.state == UNDONE:
@@ -236,7 +236,7 @@ def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
         raise NotAuthentic("The receipt is for another bundle than any that left here under this id.")
     named = [uuid.hex() for uuid in receipt.imported] + [refused.uuid.hex() for refused in receipt.refused]
     if sorted(named) != sorted(notes.uuids):
-        raise NotAuthentic("The receipt names other nodes than the bundle held.")
+        raise NotAuthentic("The receipt names other nodes than the bundle.")
 
 
 def _lift(station: Station, uuid: bytes, row: Handover) -> None:

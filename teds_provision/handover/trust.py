@@ -64,10 +64,10 @@ def make_request(name: str, key: PrivateKey) -> bytes:
 def read_request(octets: bytes) -> CertificateRequest:
     """Read and check a request; raises BadData, NotAuthentic (the proof does not verify)."""
     if b"PRIVATE KEY" in octets:
-        raise BadData("This file holds a private key where a request belongs.")
+        raise BadData("This file contains a private key, not a request.")
     members = load_object(octets, "The request")
     if members.get("format") != REQUEST_FORMAT:
-        raise BadData(f"This is not a station's request ({REQUEST_FORMAT}).", hint="Make one: init --request FILE")
+        raise BadData(f"This is not a station's request ({REQUEST_FORMAT}).", hint="To create one: init --request FILE")
     name = _name(members.get("name"))
     station = point_of(members.get("station"), "The station's key")
     if not verify(station, _LABEL + station + name.encode(), decode_base64url(members.get("proof"), "The proof")):
@@ -143,7 +143,7 @@ def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Stat
     Raises NotFound (no station asked here), PolicyRefused (a certificate for another key, or another CA already).
     """
     if not has_store(home):
-        raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
+        raise NotFound("This station has not requested a certificate.", hint="First: init --request FILE")
     station = Station(Store.open(home), ask)
 
     def adopt(known: Ask) -> None:
@@ -164,7 +164,7 @@ def _adopt(station: Station, certificate: Certificate) -> None:
     identity = station.identity
     own = identity.point if identity.is_complete() else identity.requested
     if own is None:
-        raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
+        raise NotFound("This station has not requested a certificate.", hint="First: init --request FILE")
     if certificate.station != own:
         raise PolicyRefused(
             f"The certificate is for station {fingerprint(certificate.station)[:16]},"
@@ -196,7 +196,7 @@ def require_ca(station: Station) -> PrivateKey:
     if ca is None or ca.point != station.ca:
         raise PolicyRefused(
             f"The key of this station's CA {fingerprint(station.ca)[:16]} is not in this vault.",
-            hint="Bring it: trust ca import FILE. A CA of its own has a station made by init in another --home.",
+            hint="To import it: trust ca import FILE. A station with its own CA is created by init in another --home.",
         )
     return ca
 
@@ -219,7 +219,7 @@ def drop_ca(station: Station) -> bool:
 def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
     """Bring the CA key back; raises WrongPassphrase, NotFound, VaultFailure, PolicyRefused (another CA's key)."""
     if SoftwareKey.from_secret(vaults.ca_file.read_ca(path, passphrase)).point != station.ca:
-        raise PolicyRefused(f"{path} holds another CA key than that of this station ({fingerprint(station.ca)[:16]}).")
+        raise PolicyRefused(f"{path} contains a CA key other than this station's ({fingerprint(station.ca)[:16]}).")
     vault.import_ca(path, passphrase)
     station.audit("ca", None, "imported", ca=fingerprint(station.ca))
 
@@ -253,12 +253,14 @@ def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candi
     """
     point, certificate = _read(path)
     if certificate is not None and role == "ca":
-        raise UsageFailure(f"{path} is a station's certificate, not a CA's key.", hint="Leave --role away.")
+        raise UsageFailure(f"{path} is a station's certificate, not a CA's key.", hint="Omit --role.")
     digits = fingerprint(point)
     if point == station.point or (role == "ca" and point == station.ca):
-        raise PolicyRefused(f"{path} holds this station's own key ({digits[:16]}); it needs no trust.")
+        raise PolicyRefused(f"{path} contains this station's own key ({digits[:16]}), which is always trusted.")
     if not name.strip() or name != name.strip() or not name.isprintable() or len(name) > 100:
-        raise UsageFailure(f"{name!r} is no name for a key.", hint="Give printable text of at most 100 characters.")
+        raise UsageFailure(
+            f"{name!r} is not a valid name for a key.", hint="Give printable text of at most 100 characters."
+        )
     if role == "station":
         _refuse_in_roster(station, digits)
     record = TrustRecord(name, role, point, digits)
@@ -268,8 +270,8 @@ def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candi
 def _refuse_in_roster(station: Station, fingerprint: str) -> None:
     if station.policy.in_roster(fingerprint):
         raise PolicyRefused(
-            f"The roster of the plant decides about the key {fingerprint[:16]}, not this station.",
-            hint="Where the CA key is: teds-provision registry add, or remove",
+            f"Trust in the key {fingerprint[:16]} is decided by the plant's roster, not by this station.",
+            hint="On the station with the CA key: teds-provision registry add, or remove",
         )
 
 
@@ -303,7 +305,7 @@ def candidates_of(station: Station, folder: Path, role: TrustRole) -> list[Candi
             continue
         found.append(candidate(station, name, path, "ca" if of_ca else role))
     if not found:
-        raise NotFound(f"{folder} holds no key of another station or CA.", hint="Keys are NAME.pem or NAME.ca.pem.")
+        raise NotFound(f"{folder} contains no key of another station or CA.", hint="Keys are NAME.pem or NAME.ca.pem.")
     return found
 
 
@@ -312,7 +314,7 @@ def refuse_private_keys(folder: Path) -> None:
     for path, why in private_keys(folder):
         raise PolicyRefused(
             f"{path} holds {why}; this folder is for public keys.",
-            hint="Remove it there and from the version history, and treat that key as lost.",
+            hint="Remove it there and from the version history, and treat that key as compromised.",
         )
 
 
@@ -366,7 +368,7 @@ def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> 
     known = station.policy.listed() if role is None else station.policy.trusted(role)
     fits = [record for record in known if record.name == text] or _by_digits(known, text)
     if len(fits) > 1:
-        raise UsageFailure(f"{text!r} fits {len(fits)} trusted keys.", hint="Give the name, or more digits.")
+        raise UsageFailure(f"{text!r} matches {len(fits)} trusted keys.", hint="Give the name, or more digits.")
     if fits:
         return fits[0]
     if Path(text).is_file():
@@ -434,7 +436,7 @@ def remove(station: Station, record: TrustRecord) -> Removal:
         removal = plan_removal(station, record)
         station.policy.distrust(record.fingerprint if record.role == "station" else record.name)
         for uuid in removal.shared:
-            station.keys.demand_rotation(uuid, f"station {record.name} is trusted no more, and holds this key")
+            station.keys.demand_rotation(uuid, f"station {record.name} is no longer trusted, and holds this key")
         for ca in removal.cas:
             station.policy.end_ca(ca)
         for uuid in removal.bans:

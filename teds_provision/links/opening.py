@@ -38,7 +38,7 @@ LINKS: Final = {
             "teds_provision.links.can.port",
             CAN,
             "can:socketcan:can0",
-            needs="--via can needs to know the bus. Add --can, e.g. --can socketcan:can0?bitrate=500000.",
+            needs="--via can requires --can, e.g. --can socketcan:can0?bitrate=500000.",
         ),
         LinkKind("ble", "teds_provision.links.ble.port", BLE, "ble:hci0"),
     )
@@ -69,8 +69,8 @@ def open_port(settings: LinkSettings) -> Port:
         named = ", ".join(place.partition(":")[2] for place in places)
         raise UsageFailure(
             f"{len(places)} {'readers' if settings.via == 'nfc' else 'buses'} are named ({named}), "
-            "and this command works with one.",
-            hint=f"Name one with --{settings.via}; several are for --watch and measure.",
+            "but this command works with one.",
+            hint=f"Choose one with --{settings.via}; several only work with --watch and measure.",
         )
     return open_place(places[0], settings.trace)
 

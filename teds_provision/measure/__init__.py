@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         interpreter,
         keeper,
         lookout,
+        matching,
         planning,
         recordings,
         request,

@@ -206,7 +206,7 @@ class ClockSet:
     def words(self) -> str:
         """For people and the notes of a recording."""
         way = "forward" if self.by > 0 else "back"
-        return f"The system's clock was put {way} by {abs(self.by):.3f} s: earlier times follow the old clock."
+        return f"The system clock was set {way} by {abs(self.by):.3f} s; earlier times follow the old clock."
 
 
 @dataclass(frozen=True)

@@ -88,14 +88,14 @@ def _point(settled: Settled, reference: float) -> Point:
     channel = settled.interpreter.channel
     raw, _ = settled.interpreter.reader.numbers(settled.raw)
     if not np.isfinite(raw).all():
-        raise PolicyRefused(f"Channel {channel.number} gives raw values that are no numbers.")
+        raise PolicyRefused(f"Channel {channel.number} delivers raw values that are not numbers.")
     reading = reading_of(raw)
     ends = channel.calibration.raw_range if channel.calibration is not None else None
     ends = ends or settled.interpreter.reader.form.raw_range
     if channel.full_turn and ends is not None and float(np.ptp(raw)) > (ends[1] - ends[0]) / 2:
         raise PolicyRefused(
-            f"Channel {channel.number} stands where its raw values begin anew: some lie at either end of the turn.",
-            hint="Turn it on a little, and take the point there.",
+            f"Channel {channel.number} is at the wrap of its raw values: some are at either end of the turn.",
+            hint="Turn it a little further and take the point there.",
         )
     if channel.calibration is not None and not settled.interpreter.problem:
         require_still(settled)

@@ -104,19 +104,19 @@ class ClockMap:
     def exchange(self, one: Exchange) -> bool:
         """Take an exchange; False where the clock lies (``lie`` says how). It moves no stamp where there is better."""
         if one.sent >= END_OF_TICKS:
-            self.lie = "the node says that it has run for centuries"
+            self.lie = "the node claims to have run for centuries"
             return False
         if one.sent < one.received:
-            self.lie = "the node sent its reply before it received the request, by its own clock"
+            self.lie = "by its own clock, the node replied before it received the request"
         elif one.sent - one.received > (one.answered - one.asked) * (1 + one.drift / 1e6) + 2 * one.step:
-            self.lie = "the node says that it took longer over the reply than the whole exchange"
+            self.lie = "the node claims that its reply took longer than the whole exchange"
         else:
             if (one.drift + self._own) / 1e6 > self._rate:
                 self._rate = (one.drift + self._own) / 1e6
                 self._low, self._high = -math.inf, math.inf  # what was gathered held for a better clock
             low, high = self._limits(one.tick)
             if one.offset - one.error > high or one.offset + one.error < low:
-                self.lie = "two exchanges contradict each other: the node's clock was set, or runs at another speed"
+                self.lie = "two exchanges contradict each other: the node's clock was set or runs at the wrong speed"
                 return False
             self._exchanges.append(one)
             self._narrow(one.tick, one.offset - one.error, one.offset + one.error)

@@ -46,7 +46,7 @@ def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
     if unit.units != channel.units:
         words = " or ".join(dict.fromkeys((channel.shown.text, channel.unit.text, channel.si_unit)))
         raise BadData(
-            f"{text} is no unit of channel {channel.number}, whose values are in {channel.si_unit}.",
+            f"{text} is not a unit for channel {channel.number}, whose values are in {channel.si_unit}.",
             hint=f"Use {words}.",
         )
     return unit
@@ -58,7 +58,7 @@ class HeldActuator:
     def __init__(self, trusted: Trusted, number: int, *, unit: str | None = None, dead_man: int = DEAD_MAN) -> None:
         channel = trusted.channel(number)
         if not channel.actuator:
-            raise BadData(f"Channel {number} of node {trusted.uuid} is no actuator.")
+            raise BadData(f"Channel {number} of node {trusted.uuid} is not an actuator.")
         self.unit = unit_for(channel, unit)
         self.channel, self._trusted, self._dead_man = channel, trusted, dead_man
         self._interpreter = ChannelInterpreter(trusted.sheet, number)
@@ -72,7 +72,7 @@ class HeldActuator:
         own = one.unit.from_si(self.unit.to_si(value))
         beyond = one.beyond(own, self.unit)
         if beyond:
-            raise PolicyRefused(beyond, hint="The limits of the signed datasheet are kept.")
+            raise PolicyRefused(beyond, hint="Limits come from the signed datasheet and cannot be exceeded.")
         return one.encode(own)
 
     def __enter__(self) -> HeldActuator:
@@ -104,11 +104,13 @@ class HeldActuator:
             )
         except SessionLost as lost:
             raise LinkFailure(
-                f"The session was lost while the actuator was operated: {lost.cause.message}",
-                hint="The node brings it to its safe state by itself.",
+                f"The session was lost while the actuator was in use: {lost.cause.message}",
+                hint="The node returns it to its safe state by itself.",
             ) from lost
         if time.monotonic() - began > self._dead_man / 1000:
-            raise LinkFailure("The value took longer than the dead-man.", hint="The actuator is in its safe state.")
+            raise LinkFailure(
+                "Setting the value took longer than the dead-man time.", hint="The actuator is in its safe state."
+            )
         raw = self._interpreter.reader.raw(octets)
         shown = float(np.asarray(self._interpreter.values(raw).value)[0])
         taken = self.unit.from_si(self._interpreter.unit.to_si(shown)) if np.isfinite(shown) else value

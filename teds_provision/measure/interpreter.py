@@ -20,7 +20,7 @@ from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.sheet import Sheet
 
-NODE_SAYS_SO = "the node marks them as not valid"
+NODE_SAYS_SO = "the node marks them as invalid"
 
 
 class StreamInterpreter:
@@ -187,7 +187,8 @@ def _why_raw(one: ChannelInterpreter, present: set[int]) -> str:
         return one.problem
     missing = [number for number in one.others if number not in present]
     if missing:
-        return f"Channel {one.channel.number} is compensated by channel {missing[0]}, which is not in the same stream."
+        other = missing[0]
+        return f"Channel {one.channel.number} is compensated by channel {other}, which is not part of the same stream."
     return ""
 
 

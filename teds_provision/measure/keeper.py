@@ -225,7 +225,7 @@ class NodeKeeper:
             passed = time.monotonic() - since
             if passed > TELL and not told:
                 told = True
-                self._say("waiting", why="a command of this station works on it")
+                self._say("waiting", why="a command of this station is using it")
 
     def _once(self) -> None:
         self._let_others_finish()
@@ -419,14 +419,12 @@ class NodeKeeper:
                     self._events.read(self.uuid)
             if self.streams.clock.lie and not lied:
                 lied = True
-                self._say("running", why=f"its clock lies: {self.streams.clock.lie}")
+                self._say("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")
             silent = self.streams.silent(now)
             if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
                 raise failure
             if silent:
-                raise LinkFailure(
-                    f"No message of the node came for {silent:.1f} s.", hint="Check its power and the bus."
-                )
+                raise LinkFailure(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
 
     def _is_gone(self) -> bool:
         """Whether it is of no use to wait for its answer: it is silent, or was since it was seen at another place."""
@@ -458,7 +456,7 @@ class NodeKeeper:
             elif now - since > LOOK_FOR_DATA:
                 self._announced = 0.0
                 self._anew.set()
-                raise LinkFailure("The node has started anew, or answers elsewhere now.")
+                raise LinkFailure("The node has restarted, or now answers elsewhere.")
             return False
         doubted = now - since >= ANNOUNCED
         if doubted:

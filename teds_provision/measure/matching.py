@@ -13,14 +13,16 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 
-from teds_provision.errors import BadData, PolicyRefused, UsageFailure
+from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
 from teds_provision.measure.planning import BusTime, plan_node, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.base import ROWS
 from teds_provision.station.groups import ALL
 from teds_provision.station.station import Station
 from teds_provision.steps.reading import verdict_of
+from teds_provision.store import Search
 from teds_provision.teds.fits import Requirement, judge, met, parse_fits
+from teds_provision.teds.profile.load import default_folders, find_profile, is_profile_name
 from teds_provision.teds.sheet import Sheet
 
 _BOUND = re.compile(r"[<>]")
@@ -71,13 +73,23 @@ class Match:
         for group in self.groups:
             station.groups.get(group)
 
+    def unknown_type(self, station: Station) -> str:
+        """Half a sentence on a type that is neither a profile here nor that of a known node; "" where there is none.
+
+        No mistake for certain: a node of that type may be handed over later.
+        """
+        for kind in self.types:
+            if not _is_profile(kind, station) and not station.nodes.find(Search(profile=kind)):
+                return f"no profile and no known node is called {kind!r}"
+        return ""
+
     def why_not(self, station: Station, uuid: bytes) -> str:
         """Why a node is not meant by this expression, in half a sentence; "" where it is."""
         record = station.nodes.get(uuid)
         profile, name = (record.profile or "", record.name or "") if record is not None else ("", "")
         for kind in self.types:
             if profile != kind:
-                return f"its type is {profile or 'not known'}, not {kind}"
+                return f"its type is {profile or 'unknown'}, not {kind}"
         for pattern in self.names:
             if not fnmatchcase(name, pattern):
                 return f"its name {name!r} is not {pattern}"
@@ -91,7 +103,7 @@ class Match:
         judged = judge(self.fits, Sheet.of(image), datetime.now(UTC)) if image is not None else ()
         if met(self.fits, judged):
             return ""
-        return next((one.why.rstrip(".") for one in judged), "its datasheet is not known")
+        return next((one.why.rstrip(".") for one in judged), "its datasheet is unknown")
 
 
 @dataclass(frozen=True)
@@ -110,7 +122,7 @@ class Unsigned:
         if judged.origin == "plain" or judged.verified.verdict != "unsigned":
             return f"its datasheet is {judged.verified.verdict}"
         image = station.nodes.datasheet(uuid)
-        return "" if image is not None and Sheet.of(image).channels else "it brings no datasheet of its own"
+        return "" if image is not None and Sheet.of(image).channels else "it has no datasheet of its own"
 
 
 @dataclass(frozen=True)
@@ -133,7 +145,7 @@ def why_not_measured(station: Station, uuid: bytes) -> str:
         return f"it was revoked: {banned.why}"
     if station.policy.tombstone(uuid) is not None:
         return "its key was given away"
-    return "" if station.keys.held(uuid) else "no key of it is held here"
+    return "" if station.keys.held(uuid) else "this station holds no key for it"
 
 
 @dataclass(frozen=True)
@@ -168,8 +180,15 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
     return Load(plans.load, len(rates), max(rates, default=0.0))
 
 
+def _is_profile(kind: str, station: Station) -> bool:
+    try:
+        return is_profile_name(kind) and find_profile(kind, default_folders(station.home)).is_file()
+    except NotFound:
+        return False
+
+
 def _wrong(part: str, text: str) -> UsageFailure:
     return UsageFailure(
-        f"{part!r} in {text!r} does not say which nodes to measure.",
+        f"{part!r} in {text!r} does not select nodes to measure.",
         hint="Use all, a group, type:PROFILE, name:GLOB, group:NAME or 'angle >= 360 deg', joined by commas.",
     )

@@ -169,7 +169,7 @@ def plan_node(
             break
         factor *= max(1.02, load / MOST_LOAD)
     else:
-        raise NoRoom("The bus has no room for another node's data.", hint="Measure fewer nodes, or more slowly.")
+        raise NoRoom("The bus has no capacity left for another node.", hint="Measure fewer nodes, or at a lower rate.")
     slowed = _slowed(_fastest(groups), _fastest(paced), rate, by_bus=factor > slower)
     streams = tuple(replace(plan, subscribe=replace(plan.subscribe, gap=gap)) for plan in plans)
     return Plans(streams, load - bus.taken, slowed)
@@ -187,9 +187,9 @@ def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> st
     if rate is not None:
         raise NoRoom(
             f"{rate:g} Hz does not fit the bus ({MOST_LOAD:.0%} of it for data).",
-            hint=f"The fastest is --rate {possible}",
+            hint=f"The maximum is --rate {possible}",
         )
-    why = "more does not fit the bus" if by_bus else "the node takes no shorter period"
+    why = "the bus does not allow more" if by_bus else "the node allows no shorter period"
     return f"slowed from {1e9 / asked:.6g} Hz to {possible} Hz: {why}"
 
 
@@ -199,11 +199,11 @@ def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: StreamK
     for number in wanted:
         if number not in fitting:
             raise BadData(
-                f"Channel {number} is no sensor of this datasheet that can be measured so.",
+                f"Channel {number} is not a sensor that can be measured this way.",
                 hint=f"It has {', '.join(map(str, fitting)) or 'none'}.",
             )
     if not fitting:
-        raise BadData("The datasheet describes no sensor that can be measured so.")
+        raise BadData("The datasheet has no sensor that can be measured this way.")
     return [fitting[number] for number in dict.fromkeys(wanted or fitting)]
 
 
@@ -230,7 +230,7 @@ def _groups(channels: Sequence[Channel], rate: float | None, kind: StreamKind | 
     if len(groups) > LAST_STREAM + 1:
         raise PolicyRefused(
             f"{len(channels)} channels need {len(groups)} streams; a node has {LAST_STREAM + 1}.",
-            hint="Name fewer with --channel.",
+            hint="Select fewer with --channel.",
         )
     return groups
 
@@ -278,7 +278,7 @@ def _plan(
     octets = sum(width for _, width in widths)
     most = most_instants(kind, octets, bus.most_octets)
     if most < 1:
-        raise BadData(f"One instant of channels {', '.join(str(n) for n, _ in widths)} does not fit a message.")
+        raise BadData(f"One sample of channels {', '.join(str(n) for n, _ in widths)} does not fit into a message.")
     n = max(1, min(most, BLOCK // period)) if kind != StreamKind.EVENT else 1
     plan = StreamPlan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
     # Fuller messages where the bus is short of room: the overhead of a message is 13 octets.

@@ -57,8 +57,8 @@ class Requirements:
             unmet = self._judge()
         if unmet:
             raise PolicyRefused(
-                f"The datasheets do not suffice for: {', '.join(unmet)}.",
-                hint="See the reasons: nodes --fits, or --json.",
+                f"The datasheets do not meet: {', '.join(unmet)}.",
+                hint="For the reasons: nodes --fits, or --json.",
             )
 
     def _judge(self) -> list[str]:

@@ -85,7 +85,7 @@ class Rest:
             return
         failed = next((check.why for check in verified.checks if check.result == "failed"), "another Security TEDS")
         raise BadDatasheet(
-            f"The datasheet on the node is not the one that it is measured by: {failed}. "
+            f"The datasheet on the node is not the one used for the measurement: {failed}. "
             f"Values recorded of it since {iso(datetime.fromtimestamp(self._began, UTC))} do not count.",
             hint=f"See: teds-provision verify {uuid.hex()}",
         )

@@ -152,7 +152,7 @@ class Measurement:
             trigger.pull(self._common_start, self.keepers, self.watcher.note)
         elif late and len(late) < len(self.keepers) and self._common_start.tells():
             names = ", ".join(one.uuid.hex() for one in late[:3]) + (" …" if len(late) > 3 else "")
-            self.watcher.note(f"The trigger waits for {names}, up to {TOGETHER:.0f} s.")
+            self.watcher.note(f"Waiting for {names} before the trigger, up to {TOGETHER:.0f} s.")
 
     def _until(self, now: float, duration: float | None) -> float:
         """When ``duration`` seconds of data are over: they count from the first values."""
@@ -364,7 +364,7 @@ class Measurement:
         for keeper in self.keepers:
             if not keeper.ever_ran and keeper.error is None:
                 keeper.error = NoNode(
-                    f"Node {keeper.uuid.hex()} did not answer until the measurement was over.",
+                    f"Node {keeper.uuid.hex()} did not answer before the measurement ended.",
                     hint="Check its power, the bit rate and the address.",
                 )
 
@@ -391,8 +391,8 @@ def _as_error(sink: Sink) -> TedsProvisionError | None:
     """What ended a sink: of a recording it is the disk (7), of one that took nothing of what came the way to it (5)."""
     stats, recorder = sink.stats, sink.recorder
     if stats.dropped and not stats.written and not recorder:
-        why = stats.error or f"{sink.name} took nothing: all {stats.dropped} values were dropped."
-        return LinkFailure(why, hint=stats.hint or "See whether it runs, and where it listens.")
+        why = stats.error or f"{sink.name} accepted nothing: all {stats.dropped} values were dropped."
+        return LinkFailure(why, hint=stats.hint or "Check that it is running, and where it listens.")
     kind = StoreFailure if recorder else TedsProvisionError
     return kind(stats.error, hint=stats.hint) if stats.error else None
 

@@ -112,7 +112,7 @@ def _parts(interpreters: dict[int, ChannelInterpreter]) -> list[list[int]]:
 
 def _missing(one: ChannelInterpreter, raws: dict[int, np.ndarray]) -> str:
     missing = [other for other in one.others if other not in raws]
-    return f"channel {missing[0]}, which compensates it, is not there" if missing else ""
+    return f"channel {missing[0]}, which compensates it, is missing" if missing else ""
 
 
 def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int, bool], stamp: float) -> Sample:
@@ -126,7 +126,7 @@ def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int
         if not valid:
             flagged = not all(good[other] for other in (channel.number, *one.others))
             reasons = one.why_invalid(raws[channel.number], {other: raws[other] for other in one.others})
-            why = "the node marks it as not valid" if flagged else next(iter(reasons), "")
+            why = "the node marks it as invalid" if flagged else next(iter(reasons), "")
     uncertainty = channel.stated_uncertainty
     return Sample(
         channel=channel.number,

@@ -43,7 +43,7 @@ class Settled:
         values, possible, _ = self.interpreter.calibrated(self.raw, self.others)
         if not (possible & np.isfinite(values)).all():
             raise PolicyRefused(
-                f"Channel {self.interpreter.channel.number} gives raw values that its type cannot give."
+                f"Channel {self.interpreter.channel.number} delivers raw values that its type does not allow."
             )
         return values
 
@@ -75,7 +75,7 @@ def settle(trusted: Trusted, number: int, *, count: int = SAMPLES, seconds: floa
             reply = Sampled.decode(trusted.node.send(sample(tuple(readers)), "to sample"), width)
             if not reply.valid:
                 raise PolicyRefused(
-                    f"The node marks the reading of channel {number} as not valid: it warms up, or has a fault.",
+                    f"The node marks the reading of channel {number} as invalid: it is warming up, or has a fault.",
                     hint="See: teds-provision mode UUID",
                 )
             octets += reply.data
@@ -105,9 +105,9 @@ def require_still(settled: Settled) -> SampleStatistics:
     moves = abs(reading.drift) > reading.spread
     amount = own.unit.difference_to_si(abs(reading.drift) if moves else reading.spread)
     raise PolicyRefused(
-        f"Channel {channel.number} is too restless: its reading {'drifts' if moves else 'spreads'} by "
-        f"{channel.show(amount, difference=True)}; {channel.show(least, difference=True)} is the most.",
-        hint="Hold it still, and try again.",
+        f"Channel {channel.number} is not steady: its reading {'drifts' if moves else 'spreads'} by "
+        f"{channel.show(amount, difference=True)}; {channel.show(least, difference=True)} is allowed.",
+        hint="Keep it still and try again.",
     )
 
 
@@ -121,7 +121,7 @@ def reference_for(channel: Channel, value: float | None, unit: str | None, *, sh
     unclear = bool(channel.shown.offset) if value is None else shown_unit_asked and other
     if unit is None and unclear:
         raise UsageFailure(
-            f"Channel {channel.number} is shown in {channel.shown.text}; say in which unit its value is meant.",
+            f"Channel {channel.number} is shown in {channel.shown.text}; give the unit of the value.",
             hint=f"Add --unit {_TYPED.get(channel.shown.text, channel.shown.text)}, or --unit {channel.si_unit}.",
         )
     return unit_for(channel, unit).to_si(value or 0.0)

@@ -207,5 +207,6 @@ class Sightings:
             return conflict(min(recent))
         return NoNode(
             f"Node {uuid.hex()} did not answer within {seconds:g} s.",
-            hint="Check its power, the bit rate and the address; teds-provision identify --via can lists who answers.",
+            hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
+            " nodes that answer.",
         )

@@ -79,12 +79,12 @@ def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, s
     if not spec.source_named:
         raise StoreLocked(
             f"Every source address on {spec.text} is in use, 0x{spec.source:02X} by {first.holder}.",
-            hint="End one of those processes.",
+            hint="Stop one of those processes.",
         ) from first
     another = "0xF2" if spec.source == 0xF1 else "0xF1"
     raise StoreLocked(
         f"Source address 0x{spec.source:02X} on {spec.text} is in use by {first.holder}.",
-        hint=f"Add source={another} to --can, or leave source= out, or end that process.",
+        hint=f"Add source={another} to --can, omit source=, or stop that process.",
     ) from first
 
 

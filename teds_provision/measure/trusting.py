@@ -187,8 +187,8 @@ def require_whitelisted(station: Station, uuid: bytes) -> None:
     """Actuators move only for nodes on the whitelist (operation.md section 7); raises PolicyRefused."""
     if station.pins.entry(uuid) is None:
         raise PolicyRefused(
-            f"Node {uuid.hex()} is not on the whitelist: its actuators are not moved.",
-            hint=f"Put it there: teds-provision whitelist add {uuid.hex()}",
+            f"Node {uuid.hex()} is not on the whitelist, so its actuators are not moved.",
+            hint=f"To add it: teds-provision whitelist add {uuid.hex()}",
         )
 
 
@@ -219,7 +219,7 @@ class NodeStanding:
         if revoked is not None:
             raise PolicyRefused(f"Node {self._uuid.hex()} was revoked: {revoked.why}.")
         if not self._station.keys.held(self._uuid):
-            raise PolicyRefused(f"The key of node {self._uuid.hex()} is not held here any more.")
+            raise PolicyRefused(f"The key of node {self._uuid.hex()} is no longer held here.")
         stolen = self._station.keys.stolen(self._uuid)
         if stolen is None:
             self._stolen = None

@@ -183,8 +183,8 @@ class _Zeroing:
                 said = unit_for(channel, order.unit) if order.unit is not None else channel.shown
                 asked, low, high = (format_value(each, said) for each in (si, channel.low, channel.high))
                 raise PolicyRefused(
-                    f"{asked} is beyond the limits of channel {channel.number}, {low} to {high}.",
-                    hint="The limits of the signed datasheet are kept.",
+                    f"{asked} exceeds the limits of channel {channel.number}, {low} to {high}.",
+                    hint="Limits come from the signed datasheet and cannot be exceeded.",
                 )
         return own.unit.from_si(si)
 
@@ -194,7 +194,7 @@ class _Zeroing:
             first, last = own.inputs[0].boundaries[0], own.inputs[0].boundaries[-1]
             out.append(f"The reading lies outside the calibrated range (raw {first:.8g} to {last:.8g}).")
         if self.visit.station.nodes.draft(self.visit.node.uuid) is not None:
-            out.append("A draft lies ready for this node, and does not have this zero; to drop it: draft drop UUID.")
+            out.append("This node has a draft, which does not include this zero offset; to drop it: draft drop UUID.")
         return tuple(out)
 
     def _bring(self, image: Image, found: Zeroed) -> Zeroed:
@@ -237,8 +237,8 @@ def _require_nobody_else(trusted: Trusted) -> None:
     claimed = [one for one in operation(trusted.node).channels.values() if one[0] & ChannelState.CLAIMED_BY_OTHER]
     if claimed:
         raise PolicyRefused(
-            f"Node {trusted.uuid} is measured from source address 0x{claimed[0][1]:02X} by somebody else.",
-            hint="End that measurement first. A running ncap of this home lets the node go by itself.",
+            f"Node {trusted.uuid} is being measured by another station, source address 0x{claimed[0][1]:02X}.",
+            hint="End that measurement first. A running ncap of this home releases the node by itself.",
         )
 
 
@@ -251,7 +251,7 @@ def _adjustable(trusted: Trusted, number: int) -> tuple[Channel, Calibration]:
     if own is None:
         why = channel.calibration_problem or "it has none."
         raise PolicyRefused(
-            f"Channel {number} has no calibration whose offset could be moved: {why}",
+            f"Channel {number} has no calibration with an offset that can be changed: {why}",
             hint="Calibrate it first: calibrate capture, then provision with --calibration FILE.",
         )
     return channel, own

@@ -208,7 +208,7 @@ class Measuring:
             Match.parse(match).require_groups(self._station)
             if trigger and not frozen:
                 raise UsageFailure(
-                    "Nodes that come one by one cannot begin together.", hint="Leave the trigger out, or freeze it."
+                    "Nodes that join one by one cannot start together.", hint='Omit the trigger, or set "frozen".'
                 )
         kept = KeptMeasurement(
             "",
@@ -514,7 +514,7 @@ class Measuring:
                 one.uuids = tuple(uuid.hex() for uuid in meant)
                 one.kept = replace(one.kept, match=None, uuids=tuple(meant), actuators=False)
                 return
-            self._say(one, "waiting", "no known node matches")
+            self._say(one, "waiting", match.unknown_type(self._station) or "no known node matches")
             one.stop.wait(1.0)
 
     def _run_open(self, one: Running) -> None:
@@ -576,10 +576,11 @@ class Measuring:
             return
         self._say(one, "starting")
         job.start(self._buses, self._watcher(one))
+        unknown = Match.parse(one.kept.match).unknown_type(self._station)
         try:
             while job.alive and not one.stop.is_set():
                 newcomers.work()
-                self._say(one, *_state_of_open(one, job))
+                self._say(one, *_state_of_open(one, job, unknown))
         finally:
             job.stop()
             newcomers.end()
@@ -671,7 +672,7 @@ class Measuring:
         self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=why)
 
 
-def _state_of_open(one: Running, job: MeasurementJob) -> tuple[str, str]:
+def _state_of_open(one: Running, job: MeasurementJob, unknown: str) -> tuple[str, str]:
     if any(one.reports.get(uuid, {}).get("state") == "running" for uuid in one.uuids):
         return "running", ""
     if job.error is not None:
@@ -679,7 +680,7 @@ def _state_of_open(one: Running, job: MeasurementJob) -> tuple[str, str]:
     taken = one.newcomers.taken if one.newcomers is not None else 0
     if taken:
         return "waiting", f"{taken} matching node{'s are' if taken > 1 else ' is'} measured by another measurement"
-    return "waiting", "no matching node is present"
+    return "waiting", (unknown if not one.reports else "") or "no matching node is present"
 
 
 def _state_of(one: Running, job: MeasurementJob) -> tuple[str, str]:

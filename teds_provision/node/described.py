@@ -41,7 +41,7 @@ def from_file(path: Path) -> Described:
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
             raise BadData(
                 f"{path}: no node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.",
-                hint=f"See what is wrong: show {path}",
+                hint=f"To see what is wrong: show {path}",
             )
     return Described(found, stated_uuid(found))
 

@@ -314,7 +314,9 @@ class VirtualNode:
         now = time.monotonic()
         if missed > self._told_missed and (now >= self._tell_at or not streaming):
             more = missed - self._told_missed
-            board.tell(f"{more} data messages of node {self.tim.flash.uuid.hex()} could not leave in time ({missed}).")
+            board.tell(
+                f"{more} data messages of node {self.tim.flash.uuid.hex()} could not be sent in time ({missed})."
+            )
             self._told_missed, self._tell_at = missed, now + _TELL_EVERY
 
     def _send_frames(self) -> float | None:

@@ -85,7 +85,9 @@ def post_of(station: Station, folder: Path | None) -> Post:
     """What carries between the stations: the folder, or the registry that this station is connected to."""
     post = FilesPost(folder) if folder is not None else reaching.post_of(station)
     if post is None:
-        raise PolicyRefused("Nothing carries to other stations.", hint="Name a folder or stick: --files DIR")
+        raise PolicyRefused(
+            "This station has no way to reach the other stations.", hint="Give a transfer folder: --files DIR"
+        )
     return post
 
 
@@ -96,7 +98,7 @@ def send(station: Station, post: Post, to: str, document: bytes, name: str) -> N
     """
     member = roster_of(station).member(to)
     if member is None:
-        raise PolicyRefused(f"Station {to[:16]} is no member of the plant.", hint="See: registry status")
+        raise PolicyRefused(f"Station {to[:16]} is not a member of the plant.", hint="See: registry status")
     sealed = jose.encrypt(document, [member.point], cty=CONTENT_TYPE)
     until = time_text(datetime.now(UTC) + timedelta(days=DAYS))
     post.send(Parcel(name, to, sealed, until, station.identity.fingerprint))
@@ -317,7 +319,7 @@ def by_office(
     if answer is None:
         raise NotAnswered(
             f"The office {roster.name_of(wanted.office)} has not answered yet.",
-            hint="The request is kept: the same command carries on, once the office has signed.",
+            hint="The request is kept. Run the same command again once the office has signed.",
         )
     signed = _taken(station, roster, keys, wanted, request.octets, answer)
     row = SignRequestRow(
@@ -351,15 +353,17 @@ def sign_by_office(station: Station, links: LinkSettings, order: SignBy, reporte
     Raises UsageFailure (no job), NotFound (no draft), and what :func:`by_office` raises.
     """
     if order.job is None:
-        raise UsageFailure("An office signs for a job.", hint="Name it: --job ID; see: teds-provision job list")
+        raise UsageFailure("An office only signs for a job.", hint="Name it: --job ID; see: teds-provision job list")
     job = find_job(station, order.job)
     member = roster_of(station).named(order.by)
     if member is None or member.fingerprint != job.office:
-        raise PolicyRefused(f"The job “{job.title}” does not name {order.by} as its office.")
+        raise PolicyRefused(f"The job “{job.title}” names another office than {order.by}.")
     uuid = station.nodes.resolve(order.node)
     draft = station.nodes.draft(uuid)
     if draft is None:
-        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
+        raise NotFound(
+            f"Nothing has been built for node {uuid.hex()}.", hint=f"To build it: teds-provision build {uuid.hex()}"
+        )
     with ExitStack() as stack:
         office: Office
         if order.output is not None:
@@ -399,7 +403,7 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
     asked = challenge(nonce, key.point, keys.uuid, wanted.epoch, wanted.sequence, blocks)
     proof = node.ask(security_command(Function.PROVE, asked), "to sign the request to the office")
     if not verify(keys.key, prove_message(keys.uuid, asked), proof):
-        raise NotAuthentic("The node did not sign the request under the key that it shows.")
+        raise NotAuthentic("The node's signature of the request does not match the key it presented.")
     unsigned = SignRequest(
         str(uuids.uuid4()),
         wanted.office,
@@ -431,12 +435,12 @@ def _taken(
     office = roster.point_of(wanted.office)
     answer = open_answer(octets, lambda kid: office if kid == wanted.office else None)
     if answer.of != hash_of(request):
-        raise NotAuthentic("The office answered another request.")
+        raise NotAuthentic("The office's answer belongs to another request.")
     if answer.refused:
         raise _refusal(roster, wanted, answer)
     if not _says_the_same(station, roster, keys, wanted, answer.security, by=wanted.office):
         raise NotAuthentic(
-            "What the office signed is not what it was asked for.", hint="Have the owner look at this office."
+            "The office signed something other than what was requested.", hint="Ask the owner to check this office."
         )
     return Signed(wanted.image.with_block(SECURITY, answer.security), answer.sequence, reused=False)
 
@@ -444,9 +448,9 @@ def _taken(
 def _refusal(roster: Roster, wanted: Wanted, answer: Answer) -> TedsProvisionError:
     hints = {
         "job": "Ask whoever runs the office: signer run --job ID.",
-        "full": "Lay the board aside, or ask the keeper for another job.",
+        "full": "Set the board aside, or ask the keeper for another job.",
         "differs": "Station and office need the same profile and version of the program.",
-        "sequence": "A person at the office has to look: signer once FILE --jump",
+        "sequence": "Someone at the office must confirm it: signer once FILE --jump",
     }
     return OfficeRefused(
         f"The office {roster.name_of(wanted.office)} does not sign ({answer.refused}): {answer.why.rstrip('.')}.",

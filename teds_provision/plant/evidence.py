@@ -57,7 +57,7 @@ def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes
     asked = claim.challenge(nonce)
     proof = node.ask(security_command(Function.PROVE, asked), "to sign the evidence")
     if not verify(security.decode(claim.teds).node_key, prove_message(claim.uuid, asked), proof):
-        raise NotAuthentic("The node did not sign the evidence under the key that it shows.")
+        raise NotAuthentic("The node's signature of the evidence does not match the key it presented.")
     return proof
 
 
@@ -87,4 +87,4 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StoreFailure(f"Cannot make the folder {folder}: {error.strerror}.") from error
+        raise StoreFailure(f"Cannot create folder {folder}: {error.strerror}.") from error

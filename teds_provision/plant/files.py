@@ -1,4 +1,4 @@
-"""A folder that carries: a stick, a share. ``roster/VERSION.jws``, ``FINGERPRINT/N.jws``, ``to/FINGERPRINT/ID``.
+"""Transfer folder: a stick or a share. ``roster/VERSION.jws``, ``FINGERPRINT/N.jws``, ``to/FINGERPRINT/ID``.
 
 Pages of everybody travel in it. A file is written whole, or not at all, and never over another: a roster or page that
 is there with other content gets a second file beside it, named by the first 16 digits of its H, and readers take both.
@@ -31,7 +31,7 @@ class FilesPost:
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
-            raise LinkFailure(f"There is no folder {folder}.", hint="Make it, or plug in the stick.")
+            raise LinkFailure(f"There is no folder {folder}.", hint="Create it, or plug in the stick.")
         self._folder = folder
         self.where = str(folder)
 
@@ -150,5 +150,5 @@ class FilesPost:
 
     def _failed(self, error: OSError) -> TedsProvisionError:
         return LinkFailure(
-            f"The folder {self._folder} cannot be used: {error.strerror}.", hint="Check its owner, mode and room."
+            f"Cannot use folder {self._folder}: {error.strerror}.", hint="Check its owner, its mode and the free space."
         )

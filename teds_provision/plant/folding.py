@@ -83,7 +83,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
         own = station.plant.roster
         how, why = taking(roster, own, registry)
         if roster.created > now() + MOST_AHEAD:
-            how, why = "refused", "it was made in the future: check the clock of this machine"
+            how, why = "refused", "it is dated in the future: check this machine's clock"
         if how in ("same", "older") and (how == "same" or roster.hash in known):
             continue
         told.append((roster, how, why))
@@ -215,7 +215,7 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
         claims[uuid] = claim.to_json()
     tables.put_claims(chain.chain, claims)
     if wrong:
-        why = f"{len(wrong)} events were passed over: {wrong[0]}"
+        why = f"{len(wrong)} events were skipped: {wrong[0]}"
         alarm(station, "bad-event", chain.station, n, why)
 
 

@@ -27,12 +27,13 @@ def roster_of(station: Station) -> Roster:
     roster = station.plant.roster
     if roster is None:
         raise PolicyRefused(
-            "This station has joined no registry, and a job is a keeper's word.",
-            hint="Join one: teds-provision registry connect; or begin one: teds-provision registry create",
+            "Jobs need a registry, and this station has not joined one.",
+            hint="To join one: teds-provision registry connect. To create one: teds-provision registry create",
         )
     if now_of(roster) >= roster.expires:
         raise RosterExpired(
-            "The roster has expired: no job begins.", hint="Have it renewed: teds-provision registry renew"
+            "The roster has expired, so no job can start.",
+            hint="Ask the owner to renew it: teds-provision registry renew",
         )
     return roster
 
@@ -48,10 +49,10 @@ def read_job(station: Station, octets: bytes) -> Job:
     job = open_job(octets, roster.point_of)
     if not roster.has(job.signer, "keeper"):
         raise PolicyRefused(
-            f"{roster.name_of(job.signer)} signed this job and is not a keeper.", hint="Ask a keeper for a job."
+            f"{roster.name_of(job.signer)} signed this job but is not a keeper.", hint="Ask a keeper for a job."
         )
     if job.registry != roster.registry:
-        raise PolicyRefused("This job is of another registry.")
+        raise PolicyRefused("This job belongs to another registry.")
     return job
 
 
@@ -70,8 +71,8 @@ def take_job(station: Station, octets: bytes) -> Job:
         kept = station.plant.line.job(job.id)
         if kept is None or kept.hash != job.hash:
             raise PolicyRefused(
-                f"Another job is known here under the id {job.id}: two were signed under one id.",
-                hint="Ask the keeper for a job with an id of its own.",
+                f"A different job with the ID {job.id} is already known here.",
+                hint="Ask the keeper for a job with a new ID.",
             )
     return job
 
@@ -95,7 +96,7 @@ def take_received(station: Station) -> None:
         except RosterExpired:
             return  # nothing begins now; a renewed roster decides
         except (BadData, NotAuthentic, PolicyRefused) as error:
-            station.notice(f"A job that came was not taken: {error.message}")
+            station.notice(f"A received job was rejected: {error.message}")
         with station.durable("job"):
             station.plant.parcels.drop_parcel(row.id, "in")
 
@@ -113,9 +114,12 @@ def job_row(station: Station, text: str) -> JobRow:
     else:
         rows = [row for row in station.plant.line.jobs() if len(text) >= 4 and row.id.startswith(text.lower())]
     if len(rows) > 1:
-        raise NotFound(f"{len(rows)} jobs begin with {text}.", hint="Give more digits; see: teds-provision job list")
+        raise NotFound(
+            f"{len(rows)} jobs have an ID that begins with {text}.",
+            hint="Give more digits; see: teds-provision job list",
+        )
     if not rows:
-        raise NotFound(f"There is no job {text}, and no file of that name.", hint="See: teds-provision job list")
+        raise NotFound(f"There is no job {text}, and no file with that name.", hint="See: teds-provision job list")
     return rows[0]
 
 
@@ -125,7 +129,7 @@ def require_open(station: Station, job: Job, *, for_station: str | None = None) 
     ``for_station``: its fingerprint, this one's where None is named.
     """
     row = station.plant.line.job(job.id)
-    why = "it was closed here" if row is not None and row.state == CLOSED else None
+    why = "it is closed here" if row is not None and row.state == CLOSED else None
     why = why or job.why_not(now_of(roster_of(station)), for_station or station.identity.fingerprint)
     if why is not None:
         raise PolicyRefused(f"The job “{job.title}” cannot be worked on: {why}.", hint="Ask the keeper for a new job.")
@@ -135,8 +139,8 @@ def require_adopted(station: Station) -> None:
     """Raise PolicyRefused where a backup rebuilt this home and it does not know yet which units it gave since."""
     if station.plant.restored:
         raise PolicyRefused(
-            "This home came back from a backup: which units it gave since then, only its pages say.",
-            hint="Bring them: teds-provision registry sync",
+            "This home was restored from a backup, and only its own pages show which units it has assigned since.",
+            hint="To get them: teds-provision registry sync",
         )
 
 
@@ -155,8 +159,8 @@ def profile_file(station: Station, job: Job) -> Path:
     path = find_profile(job.profile, default_folders(station.home))
     if digest_of_file(path) != job.profile_sha256:
         raise PolicyRefused(
-            f"The profile {job.profile} here is not the one of the job: {path} has another SHA-256.",
-            hint=f"Put the job's profile into {station.home / 'profiles'}.",
+            f"Profile {job.profile} is not the one in the job: {path} has a different SHA-256.",
+            hint=f"Copy the job's profile to {station.home / 'profiles'}.",
         )
     return path
 

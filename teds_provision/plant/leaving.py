@@ -130,9 +130,9 @@ def _mark(
                 continue
             if key.source == "agreement" or now - ours.get(one.fingerprint, now) >= OTHERS:
                 if one.why == "stolen":
-                    wanted[uuid] = f"{STOLEN}{one.name} has had this key"
+                    wanted[uuid] = f"{STOLEN}{one.name} has held this key"
                     break
-                wanted[uuid] = f"{WHY}{one.name} ({one.why}) has had this key"
+                wanted[uuid] = f"{WHY}{one.name} ({one.why}) has held this key"
     wanted = {uuid: why for uuid, why in wanted.items() if uuid not in marked or why.startswith(STOLEN)}
     if wanted:
         with station.durable(_COMMAND):
@@ -142,7 +142,7 @@ def _mark(
 
 
 def _had(one: Removed, key: Key, said: Mapping[str, Claim]) -> bool:
-    """Whether by anybody's claims of a node somebody who left has had this key of it."""
+    """Whether by anybody's claims of a node somebody who left has held this key of it."""
     own = said.get(one.fingerprint)
     if own is not None and key in ((own.agreed or ())[:2], own.took, *((e, k) for _, _, e, k, _ in own.gave)):
         return True

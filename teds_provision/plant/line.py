@@ -70,8 +70,8 @@ class LineRun:
         roster = self.station.plant.roster
         if not self.only_verify and roster is not None and not roster.has(self._own, "line"):
             raise PolicyRefused(
-                "This station keys no new boards: the roster does not give it the role line.",
-                hint="Have the owner give it: teds-provision registry role NAME line",
+                "This station may not key new boards: it does not have the role 'line' in the roster.",
+                hint="Ask the owner for it: teds-provision registry role NAME line",
             )
         profile_file(self.station, self.job)
         self.order_of_all = replace(_NO_CALIBRATION, profile=self.job.profile)
@@ -128,11 +128,11 @@ class LineRun:
         if job.boards:
             listed = job.boards.get(who.uuid)
             if listed is None:
-                raise PolicyRefused(f"Board {who.uuid.hex()} is not in the list of the job.", hint="Lay it aside.")
+                raise PolicyRefused(f"Board {who.uuid.hex()} is not on the job's list.", hint="Set it aside.")
             if not same_key(listed, who.fingerprint):
                 raise OtherKey(
                     f"Board {who.uuid.hex()} holds the key {who.fingerprint[:32]}; the job says {listed[:32]}.",
-                    hint="It may be another board under the same UUID. Lay it aside.",
+                    hint="It may be another board under the same UUID. Set it aside.",
                 )
         path = None if self.only_verify else self._calibration_of(who.uuid)
         if path is None:
@@ -140,7 +140,7 @@ class LineRun:
         digest = digest_of_file(path)
         wanted = job.calibration.wants(who.uuid)
         if wanted is not None and digest != wanted:
-            raise PolicyRefused(f"The calibration {path} is not the one that the job names for {who.uuid.hex()}.")
+            raise PolicyRefused(f"The calibration {path} is not the one the job specifies for {who.uuid.hex()}.")
         order = replace(self.order_of_all, calibration=path, drop_calibration=False)
         one_for_all = job.calibration.rule == "one"
         prepared = self._with_digest(
@@ -159,7 +159,7 @@ class LineRun:
         prepared = read()
         if calibration is not None and digest_of_file(calibration) != digest:
             raise PolicyRefused(
-                f"The calibration {calibration} changed while it was read.", hint="Tap the board again."
+                f"The calibration {calibration} changed while it was being read.", hint="Tap the board again."
             )
         if digest is not None:
             with self._turn:
@@ -192,11 +192,13 @@ class LineRun:
             return self._common_calibration()
         folder = self.calibrations
         if folder is None or not folder.is_dir():
-            raise NotFound("This job needs a calibration for each board.", hint="Name their folder: --calibrations DIR")
+            raise NotFound(
+                "This job requires a calibration for each board.", hint="Give their directory: --calibrations DIR"
+            )
         found = sorted(path for path in folder.glob(f"{uuid.hex()}.*") if path.is_file())
         if len(found) != 1:
             there = "no file" if not found else f"{len(found)} files"
-            raise NotFound(f"There is {there} {uuid.hex()}.* in {folder}.", hint="Put this board's calibration there.")
+            raise NotFound(f"There is {there} {uuid.hex()}.* in {folder}.", hint="Copy this board's calibration there.")
         return found[0]
 
     def _common_calibration(self) -> Path:
@@ -208,8 +210,8 @@ class LineRun:
             if path.is_file() and digest_of_file(path) == self.job.calibration.sha256:
                 return path
         raise NotFound(
-            f"The calibration of the job (SHA-256 {self.job.calibration.sha256}) is not here.",
-            hint="Name its file or folder: --calibrations PATH",
+            f"The job's calibration (SHA-256 {self.job.calibration.sha256}) was not found.",
+            hint="Give its file or directory: --calibrations PATH",
         )
 
     def _require_fresh(self, path: Path, prepared: Prepared) -> None:
@@ -218,9 +220,9 @@ class LineRun:
         now = datetime.now(UTC)
         for number, one in (prepared.calibrations or {}).items():
             if one.date is None or not now - timedelta(days=days) <= one.date <= now + timedelta(days=1):
-                when = "has no date" if one.date is None else f"is of {one.date:%Y-%m-%d}"
+                when = "has no date" if one.date is None else f"is dated {one.date:%Y-%m-%d}"
                 raise PolicyRefused(
-                    f"The calibration {path} of channel {number} {when}; the job takes {days} days at most."
+                    f"The calibration {path} of channel {number} {when}; the job allows at most {days} days."
                 )
 
     # -- units -----------------------------------------------------------------------------------------------------
@@ -241,8 +243,9 @@ class LineRun:
             return LineUnit(self, prepared, tables.unit(job.id, who.uuid), mine + 1, assurance, begun)
         if WORTH.get(assurance, 0) < WORTH[job.assurance]:
             raise PolicyRefused(
-                f"The job asks for the assurance {job.assurance}; board {who.uuid.hex()} was met by {assurance}.",
-                hint="Tap it on the NFC reader." if job.assurance == "tap" else "Meet it on a wired bus, or tap it.",
+                f"The job requires assurance '{job.assurance}'; board {who.uuid.hex()} was identified by"
+                f" '{assurance}'.",
+                hint="Tap it on the NFC reader." if job.assurance == "tap" else "Connect it to a wired bus, or tap it.",
             )
         with self.station.durable("job"):
             row = self._row(job, who.uuid)
@@ -266,8 +269,8 @@ class LineRun:
         allotment = job.stations[self._own] if job.count is not None else len(job.boards)
         if given >= allotment:
             raise PolicyRefused(
-                f"All {allotment} units of the job “{job.title}” for this station are given: {uuid.hex()} is one "
-                "too many.",
+                f"All {allotment} units of the job “{job.title}” for this station are assigned: {uuid.hex()} is"
+                " one too many.",
                 hint="Lay it aside, or ask the keeper for another job.",
             )
         return UnitRow(job.id, uuid, greatest + 1, utc_now())
@@ -332,11 +335,11 @@ class Scans:
         if found is None and len(digits) == 20 and set(digits) <= set("0123456789abcdef"):
             found = bytes.fromhex(digits), None
         if found is None and digits:
-            self._notice(f"This is no label of a board: {digits[:40]}")
+            self._notice(f"This is not a board label: {digits[:40]}")
         elif found is not None:
             with self._turn:
                 self._expected = found
-            self._notice(f"Expecting board {found[0].hex()}.")
+            self._notice(f"Waiting for board {found[0].hex()}.")
 
     def require(self, who: Identified) -> None:
         """Raise PolicyRefused where no label was scanned, WrongBoard where another board's was."""
@@ -347,8 +350,8 @@ class Scans:
         uuid, key = expected
         if uuid != who.uuid or (key is not None and not same_key(key, who.fingerprint)):
             raise WrongBoard(
-                f"The label that was scanned is of board {uuid.hex()}, and this is board {who.uuid.hex()}.",
-                hint="Take the board of that label, or scan this one's.",
+                f"The scanned label belongs to board {uuid.hex()}, but this is board {who.uuid.hex()}.",
+                hint="Use the board with that label, or scan the label of this board.",
             )
 
     def clear(self, uuid: bytes) -> None:
@@ -376,8 +379,8 @@ class LineUnit:
             return None
         if self.run.office is None:
             raise PolicyRefused(
-                "An office signs for this job, and nothing is named that carries to it.",
-                hint="Name the folder or stick: --files DIR",
+                "An office signs for this job, but this station has no way to reach it.",
+                hint="Give a transfer folder: --files DIR",
             )
         assert job.office is not None
         path = self.prepared.order.calibration

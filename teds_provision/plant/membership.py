@@ -59,19 +59,20 @@ def found_roster(station: Station, post: Post, octets: bytes | None) -> Roster:
     mine = [roster for roster in found if roster.member(station.fingerprint) is not None]
     if not mine:
         raise NotFound(
-            f"No roster of this owner's CA names this station in {post.where}.",
-            hint="Give the owner a request: registry request --output FILE; there: registry add FILE --role …",
+            f"No roster in {post.where} that this owner's CA signed names this station.",
+            hint="Send the owner a request (registry request --output FILE); the owner then runs: registry add"
+            " FILE --role …",
         )
     registries = {roster.registry for roster in mine}
     if len(registries) > 1:
         raise PolicyRefused(
-            f"Rosters of {len(registries)} registries lie in {post.where}.", hint="Say which: --roster FILE"
+            f"{post.where} contains rosters of {len(registries)} registries.", hint="Choose one: --roster FILE"
         )
     best = max(mine, key=lambda one: (one.version, one.hash))
     if best.expires <= now():
         raise RosterExpired(
             f"The roster of {best.name} expired on {best.expires:%Y-%m-%d}.",
-            hint="Have its owner renew it: registry renew",
+            hint="Ask its owner to renew it: registry renew",
         )
     return best
 
@@ -117,7 +118,7 @@ def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
     """Say as a keeper that these datasheets are good; returns how many were not said before."""
     roster = require_roster(station)
     if not roster.has(station.fingerprint, "keeper"):
-        raise PolicyRefused("Only a keeper vouches for datasheets.", hint="See: registry status")
+        raise PolicyRefused("Only a keeper can vouch for datasheets.", hint="See: registry status")
     fresh = 0
     with station.transaction():
         for uuid, digest, _ in found:
@@ -156,10 +157,10 @@ def branch(station: Station, of: str, hash: str | None, post: Post | None) -> tu
         shown = {carried.n: carried for carried in post.pages(of, n - 1)}
         wanted = [one for one in branches if n in shown and hash_of(shown[n].octets) == one]
     if len(branches) < 2:
-        raise NotFound(f"{roster.name_of(of)} has one history here.", hint="See: teds-provision registry status")
+        raise NotFound(f"{roster.name_of(of)} has only one history here.", hint="See: teds-provision registry status")
     if len(wanted) != 1:
         listed = ", ".join(one[:16] for one in branches)
         raise PolicyRefused(
-            f"Page {n} of {roster.name_of(of)} is here twice: {listed}.", hint="Name the one to take: --page HASH"
+            f"Page {n} of {roster.name_of(of)} exists here twice: {listed}.", hint="Choose one: --page HASH"
         )
     return n, wanted[0]

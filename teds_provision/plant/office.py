@@ -66,8 +66,8 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
     roster = roster_of(station)
     if not roster.has(station.identity.fingerprint, "sign"):
         raise PolicyRefused(
-            "This station signs no datasheets: the roster does not give it the role sign.",
-            hint="Have the owner give it: teds-provision registry role NAME sign",
+            "This station may not sign datasheets: it does not have the role 'sign' in the roster.",
+            hint="Ask the owner for it: teds-provision registry role NAME sign",
         )
     require_adopted(station)
     try:
@@ -80,7 +80,9 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
         return None
     key = station.credentials().key
     if not roster.has(request.signer, "line"):
-        return seal_answer(Answer(request.hash, refused="not-line", why="the sender has not the role line"), key)
+        return seal_answer(
+            Answer(request.hash, refused="not-line", why="the sender does not have the role 'line'"), key
+        )
     kept = station.plant.line.sign_request(request.hash, "in")
     if kept is not None and kept.answer is not None:
         return kept.answer
@@ -137,7 +139,7 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
     _require_room(station, job, request)
     known = station.nodes.get(request.uuid)
     if not jump and request.sequence > (known.sequence if known is not None else 0) + MOST_JUMP:
-        raise _Refused("sequence", f"sequence {request.sequence} is more than {MOST_JUMP} above the one known here")
+        raise _Refused("sequence", f"sequence {request.sequence} is more than {MOST_JUMP} ahead of the one known here")
     image = _built(station, job, request)
     with station.durable("signer"):
         meanwhile = station.plant.line.sign_request(request.hash, "in")
@@ -171,7 +173,7 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
 def _job_of(station: Station, request: SignRequest, jobs: Collection[str] | None) -> Job:
     row = station.plant.line.job(request.job)
     if row is None or (jobs is not None and request.job not in jobs):
-        raise _Refused("job", "this office does not work on that job")
+        raise _Refused("job", "this office is not working on that job")
     try:
         job = read_job(station, row.octets)
         require_open(station, job, for_station=request.signer)
@@ -180,7 +182,7 @@ def _job_of(station: Station, request: SignRequest, jobs: Collection[str] | None
     if job.office != station.identity.fingerprint:
         raise _Refused("job", "the job names another office")
     if job.boards and request.uuid not in job.boards:
-        raise _Refused("job", "the board is not in the list of the job")
+        raise _Refused("job", "the board is not on the job's list")
     return job
 
 
@@ -205,13 +207,13 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
     if kept is None:
         given, _, greatest = tables.count_units(job.id)
         if given >= job.total:
-            raise _Refused("full", f"all {job.total} units of the job are given")
+            raise _Refused("full", f"all {job.total} units of the job are assigned")
         return UnitRow(job.id, request.uuid, greatest + 1, utc_now())
     answers = sum(row.sequence is not None for row in tables.sign_requests(job.id, request.uuid, "in"))
     if station.identity.fingerprint not in job.stations:
         answers = max(answers, kept.attempts)  # pages told a home that a backup rebuilt; it has no requests of since
     if answers >= MOST_ANSWERS:
-        raise _Refused("full", f"the unit has {MOST_ANSWERS} answers already")
+        raise _Refused("full", f"the unit already has {MOST_ANSWERS} answers")
     return replace(kept, attempts=answers + 1)
 
 
@@ -234,7 +236,7 @@ def _built(station: Station, job: Job, request: SignRequest) -> Image:
     wrong = sorted(block for block in sent.keys() | blocks.keys() if sent.get(block) != blocks.get(block))
     if wrong:
         named = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in wrong[:5])
-        raise _Refused("differs", f"this office would make it otherwise: {named}")
+        raise _Refused("differs", f"this office would build it differently: {named}")
     _require_name(job, request)
     return image
 
@@ -247,20 +249,20 @@ def _require_name(job: Job, request: SignRequest) -> None:
         pattern = pattern.replace(re.escape(f"{{{field}}}"), what)
     pattern = re.sub(r"\\\{unit(?::0[1-9])?\\\}", r"[0-9]{1,10}", pattern)
     if request.name is None or not re.fullmatch(pattern, request.name):
-        raise _Refused("differs", f"the name {request.name!r} is not of the job's pattern")
+        raise _Refused("differs", f"the name {request.name!r} does not follow the job's pattern")
 
 
 def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int, Calibration]:
     octets, rule = request.calibration, job.calibration
     if rule.rule == "none":
         if octets is not None:
-            raise _Refused("job", "the job gives its boards no calibration")
+            raise _Refused("job", "the job does not allow a calibration")
         return {}
     if octets is None or len(octets) > _MAX_CALIBRATION:
-        raise _Refused("job", "the job asks for a calibration, and none came along")
+        raise _Refused("job", "the job requires a calibration, and the request has none")
     wanted = rule.wants(request.uuid)
     if rule.rule != "any" and hashlib.sha256(octets).hexdigest() != wanted:
-        raise _Refused("job", "the calibration is not the one that the job names")
+        raise _Refused("job", "the calibration is not the one the job specifies")
     found = read_calibrations(*_text_of(octets), profile)
     if rule.rule == "any":
         days = timedelta(days=rule.max_age_days or 0)
@@ -275,7 +277,7 @@ def _text_of(octets: bytes) -> tuple[str, str]:
     try:
         text = octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise BadData("The calibration is no UTF-8 text.") from error
+        raise BadData("The calibration is not UTF-8 text.") from error
     if text.lstrip()[:1] in ("{", "["):
         return text, "calibration.json"
     try:
@@ -291,7 +293,7 @@ def _profile(station: Station, job: Job) -> Profile:
     state = seen.st_mtime_ns, seen.st_ino, seen.st_size
     profile = _loaded(str(path), state, int(time.monotonic()), station.home)
     if digest_of_file(path) != job.profile_sha256:
-        raise PolicyRefused(f"The profile {path} changed while it was read.")
+        raise PolicyRefused(f"The profile {path} changed while it was being read.")
     return profile
 
 

@@ -46,7 +46,7 @@ def _to_the_second(moment: datetime) -> datetime:
 def draft_first(station: Station, name: str, days: timedelta = USUAL) -> Roster:
     """Roster 1 of a new registry, with this station alone; raises PolicyRefused where one was joined."""
     if station.plant.joined is not None:
-        raise PolicyRefused("This station belongs to a registry already.", hint="See: teds-provision registry status")
+        raise PolicyRefused("This station already belongs to a registry.", hint="See: teds-provision registry status")
     own = Member(station.name, station.point, station.identity.signature, frozenset(FIRST_ROLES))
     moment = _to_the_second(now())
     return Roster(str(uuid4()), name, 1, "", moment, moment + days, (own,))
@@ -58,7 +58,7 @@ def signed(station: Station, draft: Roster) -> Roster:
     if ca is None or ca.point != station.ca:
         raise NotFound(
             "The CA key is not in this vault.",
-            hint="Add --draft FILE, and sign that where the CA key is: registry sign FILE",
+            hint="Add --draft FILE, then sign the draft on the station with the CA key: registry sign FILE",
         )
     return open_roster(seal_roster(draft, ca), station.ca)
 
@@ -68,7 +68,8 @@ def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[To
     if roster.member(station.fingerprint) is None:
         raise PolicyRefused(
             f"The roster of {roster.name} does not name this station.",
-            hint="Give its owner a request: registry request --output FILE; there: registry add FILE --role …",
+            hint="Send its owner a request (registry request --output FILE); the owner then runs: registry add"
+            " FILE --role …",
         )
     station.unlock()
     with station.transaction():
@@ -108,22 +109,22 @@ def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Ros
     own = require_roster(station)
     if not verify(station.ca, station_key_message(request.point), request.certificate):
         raise PolicyRefused(
-            f"Station {request.name} is not certified by this owner's CA, so it cannot join.",
-            hint="A station without nodes of its own is made anew: init --request, trust ca sign, init --certificate",
+            f"Station {request.name} is not certified by this owner's CA and cannot join.",
+            hint="A station without nodes can be set up again: init --request, trust ca sign, init --certificate",
         )
     there = own.by_key.get(request.fingerprint)
     if isinstance(there, Removed):
         raise PolicyRefused(
-            f"{there.name} was removed with this key, and a removed key never comes back.",
-            hint="Make a new station on that machine: init in another --home",
+            f"{there.name} was removed with this key, and a removed key cannot return.",
+            hint="Create a new station on that machine: init in another --home",
         )
     member = Member(request.name, request.point, request.certificate, roles)
     if there is not None:
         if replace(there, signed=None) == member:
             return following(station)
-        raise PolicyRefused(f"{there.name} is a member already.", hint="Change its roles: registry role")
+        raise PolicyRefused(f"{there.name} is already a member.", hint="Change its roles: registry role")
     if any(one.name == request.name for one in own.members):
-        raise PolicyRefused(f"Another member is called {request.name!r}.", hint="Choose another name: --name")
+        raise PolicyRefused(f"There is already a member called {request.name!r}.", hint="Choose another name: --name")
     return following(station, members=(*own.members, member))
 
 
@@ -158,7 +159,8 @@ def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
     chain = station.plant.tables.chain(member.fingerprint)
     if last is None and why != "retired":
         raise UsageFailure(
-            f"Up to which page do you believe {member.name}?", hint="Add --last N; registry log shows its pages."
+            f"Which is the last page of {member.name} that you trust?",
+            hint="Add --last N; registry log lists its pages.",
         )
     place = chain.counted if last is None else page_place(station, member.fingerprint, last)
     removed = Removed(member.name, member.point, member.roles, why, place, member.signed)
@@ -176,7 +178,7 @@ def page_place(station: Station, of: str, n: int) -> Place:
     chain = station.plant.tables.chain(of)
     found = [hash for number, hash, _ in station.plant.tables.page_names(chain.chain) if number == n]
     if not found or n > chain.counted[0]:
-        raise NotFound(f"Page {n} of that station is not here, or does not count.", hint="See: registry status")
+        raise NotFound(f"Page {n} of that station is missing here or does not count.", hint="See: registry status")
     for number, hash, previous in station.plant.tables.page_names(chain.chain):
         if number == n + 1 and len(found) > 1 and previous in found:
             return n, previous
@@ -192,7 +194,7 @@ def shared(station: Station, share: Share) -> Roster:
         member = own.member(to)
         if member is None or "base" not in member.roles:
             raise PolicyRefused(
-                f"{own.name_of(to)} is no member with the role base, so it takes no keys.", hint="registry role"
+                f"{own.name_of(to)} does not have the role 'base', so it cannot receive keys.", hint="registry role"
             )
     return following(station, share=(*(one for one in own.share if one.what != share.what), share))
 
@@ -213,7 +215,7 @@ def require_member(roster: Roster, name: str) -> Member:
     found = roster.named(name)
     if not isinstance(found, Member):
         known = ", ".join(one.name for one in roster.members)
-        raise NotFound(f"{name!r} is no member of {roster.name}.", hint=f"Members: {known}.")
+        raise NotFound(f"{name!r} is not a member of {roster.name}.", hint=f"Members: {known}.")
     return found
 
 
@@ -233,7 +235,7 @@ def read_draft(octets: bytes, ca: bytes) -> Roster:
     """A draft out of a file; raises BadData."""
     draft = read_roster(load_exact(octets, "The draft"), ca)
     if json.loads(payload(draft.unsigned())) != json.loads(octets):
-        raise BadData("The draft holds what this version does not know.", hint="Sign it with the version that made it.")
+        raise BadData("The draft was written by a newer version of teds-provision.", hint="Sign it with that version.")
     return draft
 
 

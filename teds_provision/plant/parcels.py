@@ -157,13 +157,13 @@ class _Reader:
         """Why a bundle is not taken in without a question, "" where it is."""
         bundle, roster, me = plan.opened.bundle, self.roster, self.station.fingerprint
         if bundle.mode != "copy":
-            return "a move is a person's to take in"
+            return "a move needs confirmation"
         if self.now >= roster.expires:
             return "the roster has expired"
         if roster.member(bundle.sender) is None:
-            return "its sender is no member"
+            return "its sender is not a member"
         if bundle.ca != self.station.ca:
-            return "its nodes keep another CA"
+            return "its nodes belong to another CA"
         later = ""
         for page in pages(plan.taken):
             held = self._unproven_of(bundle.sender, [one.node.uuid for one in page])
@@ -253,7 +253,7 @@ class _Reader:
             raise error
         with self.station.durable(_COMMAND):
             self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, error.message))
-            self.station.audit("import", None, "parcel thrown away", parcel=parcel.id, why=error.message)
+            self.station.audit("import", None, "parcel discarded", parcel=parcel.id, why=error.message)
         return True
 
     def _row(self, parcel: Parcel, kind: ParcelKind) -> ParcelRow:

@@ -119,24 +119,25 @@ def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
     """
     parts = urlsplit(url)
     if parts.scheme not in ("postgresql", "postgres"):
-        raise UsageFailure("The registry is named as postgresql://HOST/DATABASE, or by --files DIR.")
+        raise UsageFailure("Give the registry as postgresql://HOST/DATABASE, or use --files DIR.")
     if parts.password is not None or "password" in parts.query:
         raise UsageFailure(
-            "The URL of a registry holds no password.", hint="The station has its own: registry request --output FILE"
+            "The URL of a registry must not contain a password.",
+            hint="The station logs in with its own key: registry request --output FILE",
         )
     if parts.username is not None:
-        raise UsageFailure("The URL of a registry names no user: each station logs in as itself.")
+        raise UsageFailure("The URL of a registry must not contain a user: each station logs in as itself.")
     require_driver()
     told: dict[str, Any]
     try:
         told = psycopg.conninfo.conninfo_to_dict(url)
     except psycopg.ProgrammingError as error:
-        raise UsageFailure(f"PostgreSQL's driver does not understand this URL: {_words(error)}") from error
+        raise UsageFailure(f"PostgreSQL's driver rejects this URL: {_words(error)}") from error
     unknown = sorted(set(told) - _FROM_URL)
     if unknown:
-        raise UsageFailure(f"The URL of a registry may not set {', '.join(unknown)}.", hint="Leave it away.")
+        raise UsageFailure(f"The URL of a registry may not set {', '.join(unknown)}.", hint="Remove it.")
     if not told.get("host") or not told.get("dbname"):
-        raise UsageFailure("The URL of a registry names host and database: postgresql://HOST/DATABASE")
+        raise UsageFailure("The URL of a registry needs a host and a database: postgresql://HOST/DATABASE")
     return told | {
         "user": schema.role_of(fingerprint),
         "password": scram.password(secret),
@@ -197,7 +198,9 @@ class Registry:
         rows = self._rows(_LOOK, ())
         meta = next((row for row in rows if row[0] == "meta"), None)
         if meta is None:
-            raise StoreFailure("The database holds no registry.", hint="Its keeper runs: registry sql | psql")
+            raise StoreFailure(
+                "The database does not contain a registry.", hint="Ask its administrator to run: registry sql | psql"
+            )
         if meta[2] > schema.VERSION:
             raise StoreFailure(
                 f"The database has schema {meta[2]}; this program knows {schema.VERSION}.",
@@ -413,7 +416,7 @@ def _shut(connection: psycopg.Connection[Any]) -> None:
 
 
 class _AlreadyThere(TedsProvisionError):
-    """A parcel of this id is there."""
+    """A parcel with this ID already exists."""
 
 
 def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
@@ -421,24 +424,31 @@ def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
     state, words = error.sqlstate, _words(error)
     match state:
         case "TE001":
-            return NotMember("The registry does not know this station as an open member.", hint="See: registry status")
+            return NotMember("The registry does not accept this station's login.", hint="See: registry status")
         case "TE002":
-            return Fork(f"The registry refuses a page: {words}", hint="See: registry status")
+            return Fork(f"The registry rejected a page: {words}", hint="See: registry status")
         case "TE003":
-            return StoreFailure(f"The registry refuses a page: {words}", hint="Run it again: registry sync")
+            return StoreFailure(f"The registry rejected a page: {words}", hint="Run it again: registry sync")
         case "TE004":
-            return PolicyRefused(f"The registry takes no more parcels: {words}.", hint="They go with a later sync.")
+            return PolicyRefused(
+                f"The registry accepts no more parcels: {words}.", hint="They are sent with a later sync."
+            )
         case "23505":
-            return _AlreadyThere("A parcel of this id is there.")
+            return _AlreadyThere("A parcel with this ID already exists.")
         case "53100" | "53200":
-            return RegistryFailure(f"The database is full: {words}", hint="Its administrator has to make room.")
+            return RegistryFailure(f"The database is full: {words}", hint="Its administrator must free some space.")
         case _ if state in _NO_SCHEMA:
-            return StoreFailure("The database holds no registry.", hint="Its keeper runs: registry sql | psql")
+            return StoreFailure(
+                "The database does not contain a registry.", hint="Ask its administrator to run: registry sql | psql"
+            )
         case "42501":
-            return StoreFailure(f"The database does not let a member do this: {words}", hint="Run again: registry sql")
+            return StoreFailure(
+                f"The database does not allow a member to do this: {words}",
+                hint="Ask its administrator to run again: registry sql | psql",
+            )
     if late:
-        return RegistryFailure("The registry did not answer in time.", hint="Everything else works without it.")
-    return RegistryFailure(f"The registry cannot be used: {words}", hint="Everything else works without it.")
+        return RegistryFailure("The registry did not answer in time.", hint="All other work can continue without it.")
+    return RegistryFailure(f"Cannot use the registry: {words}", hint="All other work can continue without it.")
 
 
 def _words(error: BaseException) -> str:

@@ -53,14 +53,15 @@ def require_registry(post: Post, registry: str) -> None:
     """Raise PolicyRefused where a database is of another registry than the roster that is to be joined."""
     there = post.registry()
     if there != registry:
-        raise PolicyRefused(f"{post.where} is of another registry ({there}) than the roster ({registry}).")
+        raise PolicyRefused(f"{post.where} belongs to another registry ({there}) than the roster ({registry}).")
 
 
 def _login(station: Station, url: str) -> dict[str, object]:
     kept = station.plant.login()
     if kept is None:
         raise NotMember(
-            "This station has no login at a database yet.",
-            hint="Make one: registry request --output FILE; the database's keeper runs: registry sql --member FILE",
+            "This station has no database login yet.",
+            hint="To get one: registry request --output FILE; the database's administrator then runs: registry"
+            " sql --member FILE | psql",
         )
     return postgres.parameters(url, station.fingerprint, kept[0])

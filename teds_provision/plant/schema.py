@@ -42,7 +42,7 @@ def member_sql(fingerprint: str, verifier: str) -> str:
     """The login of one station; run again it gives it the password of a newer request. Raises BadData."""
     role = role_of(fingerprint)
     if not is_verifier(verifier):
-        raise BadData("The request's login is no SCRAM-SHA-256 verifier.", hint="Make it again: registry request")
+        raise BadData("The request's login is not a SCRAM-SHA-256 verifier.", hint="Create it again: registry request")
     return f"""\
 begin;
 set local lock_timeout = '500ms';
@@ -70,7 +70,7 @@ select pg_terminate_backend(pid) from pg_stat_activity where usename = '{role}';
 def mend_sql(fingerprint: str, first: int) -> str:
     """Take off the rows of a station from number ``first`` on, which its key did not sign."""
     if first < 1:
-        raise BadData("Pages count from 1.")
+        raise BadData("Page numbers start at 1.")
     station = f"'\\x{role_of(fingerprint) and fingerprint}'"
     before = f"(select hash from registry.page p where p.station = {station} and p.n = {first - 1})"
     return f"""\

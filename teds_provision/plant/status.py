@@ -154,7 +154,7 @@ def resolve(station: Station, text: str) -> bytes:
             raise
     if len(found) > 1:
         raise UsageFailure(
-            f"{text!r} fits {len(found)} nodes: {', '.join(found[:5])}.", hint="Give more digits of the UUID."
+            f"{text!r} matches {len(found)} nodes: {', '.join(found[:5])}.", hint="Give more digits of the UUID."
         )
     return bytes.fromhex(found[0])
 

@@ -83,7 +83,7 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
             apply_claims(station)
             raise NotMember(
                 f"This station was removed from {roster.name} (roster {roster.version}).",
-                hint="A removed key never comes back: make a new station (init) and have it added.",
+                hint="A removed key cannot return: create a new station (init) and have it added.",
             )
         _own_head(station, post, roster, done, connected=connected)
         while close_page(station, roster) is not None:
@@ -106,7 +106,8 @@ def _rosters(station: Station, post: Post, done: Synced) -> list[tuple[Roster, s
     joined = station.plant.joined
     if joined is not None and post.registry() not in (None, joined.registry):
         raise PolicyRefused(
-            f"{post.where} is of another registry ({post.registry()}).", hint="Give the one that this station joined."
+            f"{post.where} belongs to another registry ({post.registry()}).",
+            hint="Use the one that this station joined.",
         )
     told = take_rosters(station, post.rosters())
     for roster, how, why in told:
@@ -148,13 +149,19 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
     found, junk = read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
     if junk and not post.everybody:
-        alarm(station, "junk", station.fingerprint, junk[0], f"{post.where} has pages that our key did not sign")
+        alarm(
+            station,
+            "junk",
+            station.fingerprint,
+            junk[0],
+            f"{post.where} has pages that this station's key did not sign",
+        )
         raise NotAuthentic(
             f"{post.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
-            hint=f"Take them off there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
+            hint=f"To delete them there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
         )
     if junk:
-        done.told.append(f"{post.where}: {len(junk)} files in this station's place that it did not sign; passed over")
+        done.told.append(f"{post.where}: {len(junk)} files in this station's folder that it did not sign; ignored")
     new = [page for page in found if (page.n, page.hash) not in known]
     if new and restored and _follows(chain, new):
         adopt(station, roster, new)
@@ -169,8 +176,9 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
         alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
         raise Fork(
             f"{post.where} has pages under this station's key that are not of this home, from number {first} on"
-            f" (home {homes}; here {station.plant.home}): a disk image was put back, or a copy of it is at work.",
-            hint="Look who has a copy; in doubt remove this station. Then: teds-provision registry resume",
+            f" (home {homes}; here {station.plant.home}): a disk image was restored, or a copy of this home is in use.",
+            hint="Find out who has a copy; if in doubt, have this station removed. Then: teds-provision"
+            " registry resume",
         )
     else:
         _require_resumed(station)
@@ -180,14 +188,15 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
             station.plant.end_restored()
         else:  # a stick that knows less than what this home joined by shows nothing: it would say a number twice
             done.told.append(
-                "this home came back from a backup: it says nothing new before registry sync with what it joined by"
+                "this home was restored from a backup and publishes nothing new until it has synced with its"
+                " own registry"
             )
     there = max((page.n for page in found), default=0)
     if connected and there < joined.acknowledged and not post.everybody:
         there = post.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
         alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why)
-        done.told.append(f"{post.where} was rolled back: {why}; it is filled again")
+        done.told.append(f"{post.where} was rolled back: {why}; it is being refilled")
 
 
 def _require_resumed(station: Station) -> None:
@@ -195,9 +204,10 @@ def _require_resumed(station: Station) -> None:
     found = [one for one in station.plant.tables.alarms() if one.code == "fork" and one.about == station.fingerprint]
     if found:
         raise Fork(
-            f"Pages under this station's key that are not of this home were found, from number {found[0].n} on, and"
-            " nobody has decided since.",
-            hint="Look who has a copy; in doubt remove this station. Then: teds-provision registry resume",
+            f"Pages under this station's key that this home did not write were found, from number {found[0].n}"
+            " on, and the decision is still open.",
+            hint="Find out who has a copy; if in doubt, have this station removed. Then: teds-provision"
+            " registry resume",
         )
 
 
@@ -260,7 +270,7 @@ def _know_unit(station: Station, uuid: bytes, said: event.Event, job: str, unit:
     kept = tables.unit(job, uuid)
     if kept is None and any(row.unit == unit for row in tables.units(job)):
         station.notice(
-            f"Unit {unit} of the job {job} was given twice: also to {uuid.hex()}, before this home was put back."
+            f"Unit {unit} of the job {job} was assigned twice: also to {uuid.hex()}, before this home was restored."
         )
         if said.act == "evidence":
             return
@@ -276,9 +286,10 @@ def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None
     for who, about, n, _ in station.plant.tables.heads():
         if about == station.fingerprint and n > newest and roster.member(who) is not None:
             raise PolicyRefused(
-                f"This home came back from a backup, and {roster.name_of(who)} has seen page {n} of it; {newest} is the"
-                " last one here.",
-                hint=f"Bring them: registry sync --files DIR that {roster.name_of(who)} filled; or registry resume",
+                f"This home was restored from a backup. {roster.name_of(who)} has seen its page {n}, but the"
+                f" last one here is {newest}.",
+                hint=f"Get the missing pages: registry sync --files DIR that {roster.name_of(who)} filled; or"
+                " registry resume",
             )
 
 
@@ -386,7 +397,7 @@ def read_pages(carried: Iterator[Carried], roster: Roster, station: str) -> tupl
         try:
             page = open_page(one.octets, roster.registry, roster.point_of)
             if page.station != station or page.n != one.n:
-                raise NotAuthentic("It lies in the place of another page.")
+                raise NotAuthentic("It is in the place of another page.")
             good.append(page)
         except NewerFormat:
             raise
@@ -435,7 +446,7 @@ def _fetch(station: Station, post: Post, roster: Roster, done: Synced) -> None:
             try:
                 page = open_page(carried.octets, roster.registry, roster.point_of)
                 if page.station != one or page.n != carried.n:
-                    raise NotAuthentic("It lies in the place of another page.")
+                    raise NotAuthentic("It is in the place of another page.")
             except NewerFormat as newer:
                 waits = newer.message
                 break
@@ -482,5 +493,5 @@ def hearsay(station: Station, roster: Roster, done: Synced) -> None:
                 done.told.append(f"{saw}; the last one here is {here}")
         elif not any((n, hash) == (number, named) for number, named, _ in station.plant.tables.page_names(chain.chain)):
             done.told.append(
-                f"{roster.name_of(who)} says that page {n} of {roster.name_of(about)} is another than the one here"
+                f"{roster.name_of(who)} reports a page {n} of {roster.name_of(about)} that differs from the one here"
             )

@@ -60,9 +60,9 @@ class Grounds:
         if self.pins is not None:
             pinned = self.pins.get(evidence.uuid)
             if not pinned:
-                found.append("its UUID is not in the list of pins")
+                found.append("its UUID is not in the pins file")
             elif not same_key(pinned, fingerprint(evidence.node)):
-                found.append("its key is not the one in the list of pins")
+                found.append("its key differs from the one in the pins file")
         return found
 
 
@@ -71,7 +71,7 @@ def _wrong_members(evidence: Evidence, roster: Roster) -> Iterator[str]:
     station = evidence.facts.station
     yield from _gone(roster, station, "its station")
     if roster.by_key.get(station) is not None and not roster.roles_of(station) - {"audit"}:
-        yield "its station has no role that works on boards"
+        yield "its station has no role for working on boards"
     if evidence.verdict != codec.PASSED:
         return
     try:
@@ -83,7 +83,7 @@ def _wrong_members(evidence: Evidence, roster: Roster) -> Iterator[str]:
         yield from _gone(roster, signer, "the station that signed the datasheet")
     found = roster.by_key.get(signer)
     if found is not None and "sign" not in found.roles and not (found.signed and found.signed[0]):
-        yield "the station that signed the datasheet has not the role sign"
+        yield "the station that signed the datasheet does not have the role 'sign'"
 
 
 def _gone(roster: Roster, station: str, what: str) -> Iterator[str]:

@@ -47,7 +47,7 @@ class Groups:
         if found is None:
             known = [group.name for group in self.all()]
             more = ", …" if len(known) > _SHOWN else ""
-            hint = f"Groups: {', '.join(known[:_SHOWN])}{more}." if known else f"Create it: {_CREATE}"
+            hint = f"Groups: {', '.join(known[:_SHOWN])}{more}." if known else f"To create it: {_CREATE}"
             raise NotFound(f"There is no group {name!r}.", hint=hint)
         return found
 
@@ -60,13 +60,13 @@ class Groups:
         forbidden = name in (ALL, *_NO_PATHS) or _LIKE_A_UUID.match(name)
         if forbidden or not name.strip() or not name.isprintable() or len(name) > LONGEST:
             raise UsageFailure(
-                f"{name!r} cannot be the name of a group.",
-                hint="Use up to 64 characters, not hex digits or dots alone; all means every node.",
+                f"{name!r} is not a valid group name.",
+                hint="Use up to 64 characters, not only hex digits or dots, and not 'all', which means every node.",
             )
         present = self._store.group(name)
         if present is not None and set(present.uuids) != set(uuids):
             raise UsageFailure(
-                f"There is a group {name!r} already.", hint=f"Add nodes to it: group add {quote(name)} UUID …"
+                f"Group {name!r} already exists.", hint=f"Add nodes to it: group add {quote(name)} UUID …"
             )
         if present is None:
             with self._store.together():
@@ -118,7 +118,7 @@ class Groups:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise Frozen(
-                    f"Group {name!r} is being measured: it stays as it is.", hint="End that measurement first."
+                    f"Group {name!r} is being measured and cannot be changed now.", hint="End that measurement first."
                 ) from None
             yield
         finally:

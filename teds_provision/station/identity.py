@@ -54,12 +54,14 @@ class StationIdentity:
     def _facts(self) -> StationRecord:
         facts = self._store.facts()
         if facts is None:
-            raise NotFound(f"There is no base station in {self._store.home} yet.", hint="Make one: teds-provision init")
+            raise NotFound(
+                f"There is no base station in {self._store.home} yet.", hint="To create one: teds-provision init"
+            )
         return facts
 
     def _required(self, value: bytes | None) -> bytes:
         if value is None:
-            raise NotFound(f"init was not finished in {self._store.home}.", hint="Finish it: teds-provision init")
+            raise NotFound(f"init was not finished in {self._store.home}.", hint="To finish it: teds-provision init")
         return value
 
     @property
@@ -123,7 +125,7 @@ class StationIdentity:
         """SIG104 of this owner's CA over another station's key; raises NotFound where the CA key is not here."""
         ca = self._vault().ca()
         if ca is None or ca.point != self.ca:
-            raise NotFound("The CA key is not in this vault.", hint="Do this where the CA key is kept.")
+            raise NotFound("The CA key is not in this vault.", hint="Run this on the station that has the CA key.")
         return ca.sign(keys.station_key_message(point))
 
     def certificate(self, ca: bytes, point: bytes) -> bytes | None:
@@ -151,7 +153,7 @@ class StationIdentity:
         if signature is None:
             raise PolicyRefused(
                 f"This station is not certified by the CA {keys.fingerprint(ca)[:16]}.",
-                hint="Have it signed where that CA key is kept: teds-provision trust ca sign REQUEST",
+                hint="Have it signed on the station with that CA key: teds-provision trust ca sign REQUEST",
             )
         return signature
 

@@ -109,7 +109,7 @@ def write_label(label: Label, path: Path) -> None:
     """
     suffix = path.suffix.lower()
     if suffix not in (".svg", ".png"):
-        raise UsageFailure(f"A label is written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
+        raise UsageFailure(f"Labels are written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
     rows = _modules(label.text)
     octets = _svg(label, rows).encode() if suffix == ".svg" else _png(label, rows)
     files.write_whole(path, octets, mode=0o644)

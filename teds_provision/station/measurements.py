@@ -93,7 +93,7 @@ class Measurements:
                 try:
                     stack.enter_context(self._mark(uuid, what))
                 except MarkTaken as taken:
-                    raise PolicyRefused(f"Node {uuid.hex()} is held by {taken.holder}.", hint="Try again.") from taken
+                    raise PolicyRefused(f"Node {uuid.hex()} is in use by {taken.holder}.", hint="Try again.") from taken
             yield
 
     def is_running(self, uuid: bytes) -> bool:
@@ -142,7 +142,8 @@ class Measurements:
         """
         if self.is_running(uuid):
             raise Frozen(
-                f"Node {uuid.hex()} is being measured: its frames stay as they are.", hint="End that measurement first."
+                f"Node {uuid.hex()} is being measured, so its frames cannot be changed now.",
+                hint="End that measurement first.",
             )
         if frame is None:
             self._store.remove_frame(uuid, channel)
@@ -157,7 +158,8 @@ class Measurements:
         """
         if self.is_running(uuid):
             raise Frozen(
-                f"Node {uuid.hex()} is being measured: its names stay as they are.", hint="End that measurement first."
+                f"Node {uuid.hex()} is being measured, so its names cannot be changed now.",
+                hint="End that measurement first.",
             )
         if name is None:
             self._store.remove_topic_name(uuid, channel)

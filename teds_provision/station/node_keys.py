@@ -161,7 +161,7 @@ class NodeKeys:
         except UnknownMaster:
             if self._identity.master in vault.masters():  # lost for good, and not only to a look at an earlier moment
                 raise
-        raise VaultChanged("Another command changed the master key in this moment.", hint="Run this again.")
+        raise VaultChanged("Another command has just changed the master key.", hint="Run this again.")
 
     def _unwrapped(self, record: KeyRecord, vault: Vault) -> bytes:
         context = node_key_context(self._store.id, record.uuid, record.epoch, record.slot)
@@ -311,7 +311,7 @@ class NodeKeys:
         return {uuid: mark.rotation for uuid, mark in marks.items() if mark.rotation is not None}
 
     def due_of_page(self, uuids: Sequence[bytes]) -> set[bytes]:
-        """Those of a page of nodes whose key has to be rotated."""
+        """Those of a page of nodes whose key must be rotated."""
         marks = self._store.marks_of(uuids)
         return {uuid for uuid, mark in marks.items() if mark.rotation is not None}
 

@@ -111,8 +111,8 @@ class Plant:
             return None
         if not self._seals.noted("roster", row.hash, row.mac):
             raise StoreChanged(
-                "Another program than this one changed the roster in the store; it is not believed.",
-                hint="Bring it again: teds-provision registry sync",
+                "The roster in the store was changed by another program and is not trusted.",
+                hint="To get it again: teds-provision registry sync",
             )
         if self._read is None or self._read[0] != row.hash:
             self._read = row.hash, roster.open_roster(row.octets, self._identity.ca)
@@ -136,8 +136,8 @@ class Plant:
         disputed = next((why for _, name, why in self.tables.conflicts(uuid) if name == "two keys"), None)
         if disputed is not None and not own_word and not self._store.keys(uuid):
             raise Conflict(
-                f"Stations of the plant know two keys of node {uuid.hex()}: {disputed}.",
-                hint=f"A keeper pins one, or you: whitelist add {uuid.hex()} --fingerprint F",
+                f"The plant's stations know two keys for node {uuid.hex()}: {disputed}.",
+                hint=f"A keeper must pin one of them, or you do: whitelist add {uuid.hex()} --fingerprint F",
             )
 
     def signer_rules(self) -> SignerRules | None:
@@ -214,7 +214,7 @@ class Plant:
             new_home(self._store.home)
         digits = read_limited(path, 64, "name of a home").decode("ascii", "replace").strip()
         if not document.is_form("digits", digits):
-            raise StoreFailure(f"{path} is damaged.", hint="Remove it: the next registry sync makes a new one.")
+            raise StoreFailure(f"{path} is damaged.", hint="Remove it; the next registry sync creates a new one.")
         return digits
 
     @property

@@ -202,7 +202,7 @@ class Policy:
         if self._keys.restored(uuid):
             raise PolicyRefused(
                 f"The key of node {uuid.hex()} was {self._keys.rotation_due(uuid)}.",
-                hint=f"Tap it (any command), or rotate it by your word: agree {uuid.hex()} --rotate --yes",
+                hint=f"Tap it (with any command), or confirm that it is still yours: agree {uuid.hex()} --rotate --yes",
             )
 
     def require_not_given_away(self, uuid: bytes) -> None:
@@ -214,7 +214,7 @@ class Policy:
         undo = f"Use it there, or: teds-provision handover undo {tombstone.handover_id}"
         back = "Use it there, or have it handed back (export-keys there, import-keys here)."
         raise PolicyRefused(
-            f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key rests here.",
+            f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key is no longer used here.",
             hint=undo if row is not None and row.state == "open" else back,
         )
 

@@ -88,7 +88,9 @@ class Seals:
     def check_entry(self, entry: WhitelistEntry | None) -> WhitelistEntry | None:
         """Return a whitelist entry; raises StoreChanged where its seal does not hold. Unchecked with a closed vault."""
         if entry is not None and self.active and not self._holds(entry.mac, "whitelist", _entry(entry)):
-            raise changed([f"the whitelist entry of {entry.uuid.hex()}"], "Take it off the whitelist, and add it anew.")
+            raise changed(
+                [f"the whitelist entry of {entry.uuid.hex()}"], "Remove it from the whitelist and add it again."
+            )
         return entry
 
     def check_point(self, node: NodeRecord | ExportFacts) -> None:
@@ -101,7 +103,9 @@ class Seals:
     def check_ca(self, uuid: bytes, ca: bytes, mac: bytes | None) -> None:
         """Raise StoreChanged where the CA that a node keeps is not the one that this station noted."""
         if self.active and not self._holds(mac, "ca", (uuid, ca)):
-            raise changed([f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree anew.")
+            raise changed(
+                [f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree on a new key."
+            )
 
     def trusted(self, record: TrustRecord) -> bool:
         """Whether a trusted key counts: its seal holds, or the vault is closed and nobody can say."""
@@ -182,10 +186,10 @@ class Seals:
         )
         if self.broken_trust:
             names = ", ".join(self.broken_trust[:_SHOWN])
-            self._tell(f"Trust in {names} was changed by another program than this one and does not count.")
+            self._tell(f"Trust in {names} was changed by another program and does not count.")
         strange = [name for name, mac, kind, values in self._decisions() if not self._holds(mac, kind, values)]
         if strange:
-            self._tell(f"Another program than this one noted {', '.join(strange[:_SHOWN])}: it does not count.")
+            self._tell(f"Another program added {', '.join(strange[:_SHOWN])}, which does not count.")
 
     def rewrap(self, vault: Vault) -> None:
         """Wrap the seal key under the vault's newest master key; the seals stay as they are."""
@@ -239,4 +243,4 @@ def _trust(record: TrustRecord) -> _Values:
 def changed(what: list[str], cure: str) -> StoreChanged:
     """The error for rows that another program changed."""
     shown = ", ".join(what[:_SHOWN]) + (f" and {len(what) - _SHOWN} more" if len(what) > _SHOWN else "")
-    return StoreChanged(f"Another program than this one changed {shown} in the store; it is not believed.", hint=cure)
+    return StoreChanged(f"{shown} in the store was changed by another program and is not trusted.", hint=cure)

@@ -345,13 +345,14 @@ class Station:
 
 def not_initialised(home: Path) -> NotFound:
     """The error for a home without a station."""
-    return NotFound(f"There is no base station in {home} yet.", hint="Make one: teds-provision init")
+    return NotFound(f"There is no base station in {home} yet.", hint="To create one: teds-provision init")
 
 
 def not_certified() -> NotFound:
     """The error for a station that asked for a certificate and has none yet."""
     return NotFound(
-        "This station waits for the certificate of its CA.", hint="Bring it: teds-provision init --certificate CERT"
+        "This station is waiting for its CA's certificate.",
+        hint="To install it: teds-provision init --certificate CERT",
     )
 
 
@@ -388,7 +389,9 @@ def initialise(
             vault, why = vaults.create_vault(home, station.id, keystore, known, tell=tell_once, **more)
             key, ca = vault.identity(), vault.ca()
             if ca is None:
-                raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")
+                raise NotFound(
+                    "The vault does not contain a CA key.", hint="Choose another keystore, or import the CA key."
+                )
             station.adopt(vault)
             with station.transaction():
                 where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind

@@ -73,9 +73,9 @@ class NotAdopted(PolicyRefused):
 def nobody_adopts(brought: Brought) -> None:
     """The answer where nobody can be asked: no. Raises NotAdopted."""
     raise NotAdopted(
-        f"Node {brought.image.uuid.hex()} brought a datasheet of its own, and nobody said that it may be signed.",
+        f"Node {brought.image.uuid.hex()} brought its own datasheet, and nobody has approved signing it.",
         brought,
-        hint="Look at it, then add --yes; or give the board a datasheet of yours: --profile.",
+        hint="Check it, then add --yes; or write your own datasheet: --profile.",
     )
 
 
@@ -91,17 +91,17 @@ def brought_by(station: Station, image: Image, *, name: str | None = None) -> Br
     uuid = image.uuid.hex()
     for (channel, code), octets in blocks.items():
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), octets):
-            raise _refused(uuid, f"the TEDS of access code {code} of channel {channel} is damaged, or no node holds it")
+            raise _refused(uuid, f"TEDS {code} of channel {channel} is damaged, or is one that no node can store")
     found = Image(image.uuid, blocks)
     sheet = Sheet.of(found)
     if not sheet.channels:
         raise BadData(
-            f"Node {uuid} brings no datasheet of its own: no TransducerChannel TEDS.",
-            hint="Give it one: provision --profile P.",
+            f"Node {uuid} has no datasheet of its own: no TransducerChannel TEDS.",
+            hint="To write one: provision --profile P.",
         )
     meant = stated_uuid(blocks)
     if meant is not None and meant != image.uuid:
-        raise _refused(uuid, f"it is that of node {meant.hex()}")
+        raise _refused(uuid, f"it belongs to node {meant.hex()}")
     for block, octets in blocks.items():
         for why in _strange_texts(block, octets):
             raise _refused(uuid, why)
@@ -126,7 +126,7 @@ def require_a_reason(station: Station, brought: Brought, reason: str | None) -> 
         raise NotAdopted(
             f"The board's own datasheet is refused: {brought.errors[0].rstrip('.')}{more}.",
             brought,
-            hint='Give it one of yours: --profile. Or, if it is right, say why: --accept-calibration "why".',
+            hint='Write your own: --profile. Or, if it is correct, give a reason: --accept-calibration "why".',
         )
     station.audit("accept-datasheet", brought.image.uuid, "accepted", why=reason, findings=list(brought.errors))
 
@@ -140,15 +140,15 @@ def _require_own_name(station: Station, uuid: bytes, name: str) -> None:
         others += [one.uuid for one in station.nodes.all() if one.uuid.hex().startswith(digits) and one.uuid != uuid]
     if others:
         raise PolicyRefused(
-            f"Node {uuid.hex()} calls itself {name!r}, and so node {others[0].hex()} is called.",
-            hint="Give this one another name: --name NAME.",
+            f"Node {uuid.hex()} calls itself {name!r}, but node {others[0].hex()} already has that name.",
+            hint="Choose another name: --name NAME.",
         )
 
 
 def _refused(uuid: str, why: str) -> BadData:
     return BadData(
         f"The datasheet that node {uuid} brought cannot be signed: {why}.",
-        hint="Give it one of yours: provision --profile P.",
+        hint="Write your own: provision --profile P.",
     )
 
 
@@ -158,7 +158,7 @@ def _strange_texts(block: BlockId, octets: bytes) -> Iterator[str]:
     where = f"{decoded.name} of channel {block[0]}" if block[0] else decoded.name
     for field in _leaves(decoded.fields):
         if isinstance(field.value, str) and not field.value.isprintable() and "-----BEGIN" not in field.value:
-            yield f"{field.name} in its {where} has characters that cannot be printed"
+            yield f"{field.name} in its {where} contains unprintable characters"
         elif field.name == "TCName":
             if not isinstance(field.value, str):
                 yield f"the name in its {where} is no text"
@@ -168,7 +168,7 @@ def _strange_texts(block: BlockId, octets: bytes) -> Iterator[str]:
         for text in decoded.text:
             letters = text.decode(errors="replace")
             if any(not one.isprintable() and one not in "\n\r\t" for one in letters):
-                yield f"a text in its {where} has characters that cannot be printed"
+                yield f"a text in its {where} contains unprintable characters"
 
 
 def _leaves(fields: tuple[Field, ...]) -> Iterator[Field]:

@@ -148,15 +148,15 @@ def unknown_key(station: Station, node: Conversation) -> PolicyRefused:
     """
     uuid = node.uuid.hex()
     elsewhere = agreed_elsewhere(station, node)
-    said = "the answer heard is that it knows none of the keys that are held here"
+    said = "it answers that it knows none of the keys held here"
     if elsewhere:
         return PolicyRefused(
             f"No session with node {uuid}: {said}; {elsewhere}.",
             hint=f"Use it at that station, or have the key handed over. To take it over, tap it: agree {uuid} --rotate",
         )
     return PolicyRefused(
-        f"No session with node {uuid}: {said}. Nobody signed that answer, so it proves nothing.",
-        hint=f"Try at the reader. Was it reset, or rotated elsewhere? Then tap it: agree {uuid} --rotate",
+        f"No session with node {uuid}: {said}. That answer is unsigned and proves nothing.",
+        hint=f"Try it on the reader. If it was reset or its key was rotated elsewhere, tap it: agree {uuid} --rotate",
     )
 
 
@@ -170,7 +170,7 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
     said = node.identity.epoch
     if said <= held:
         return ""
-    hint = f"it gives its key epoch as {said}, after {held} here: agreed elsewhere, at a tap (a hint, not proven)"
+    hint = f"it reports key epoch {said}, after {held} here: keyed elsewhere by tap (unverified)"
     try:
         octets = read_block(node, SECURITY)
         shown = security.decode(octets)
@@ -182,8 +182,8 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
         if shown.station_key in names:
             return f"{hint}; its datasheet is signed by {names[shown.station_key]} ({digits})"
         if any(station_signature_good(shown, ca) for ca in station.policy.trusted_cas(node.uuid)):
-            return f"{hint}; its datasheet is signed by station {digits}, which a CA of yours certified"
-    return f"{hint}; who did shows when that station signs its datasheet"
+            return f"{hint}; its datasheet is signed by station {digits}, which your CA certified"
+    return f"{hint}; which station did so will show once it signs the datasheet"
 
 
 def agree(
@@ -263,7 +263,10 @@ class _Word:
             raise unknown_key(station, node)
         if self.take_over is not None:
             uuid = node.uuid.hex()
-            self.take_over(f"Node {uuid} has a key that is not held here. Take it over and lock out whoever holds it?")
+            self.take_over(
+                f"Node {uuid} has a key that this station does not hold. Take the node over and lock"
+                " out the current holder?"
+            )
         elif not self.rotate:
             raise must_take_over(node.uuid)
         self.given = True
@@ -272,8 +275,8 @@ class _Word:
 def must_take_over(uuid: bytes) -> PolicyRefused:
     """The error where a node has another station's key, and nobody said that it is to be taken over."""
     return PolicyRefused(
-        f"Node {uuid.hex()} has a key that this station does not hold; a new one would lock out whoever holds it.",
-        hint=f"Have the key handed over (export-keys there), or take it over: agree {uuid.hex()} --rotate --yes",
+        f"Node {uuid.hex()} has a key that this station does not hold; a new key would lock out the current holder.",
+        hint=f"Have the key handed over (export-keys there), or take the node over: agree {uuid.hex()} --rotate --yes",
     )
 
 
@@ -284,7 +287,9 @@ def _new_key(
     new = who.state == NodeState.FACTORY
     if new:
         station.plant.require_undisputed(node.uuid)
-        station.plant.require_role("line", "keys no new node", "Key it at a station that has, and take it over")
+        station.plant.require_role(
+            "line", "cannot key new nodes", "Key it on a station that has this role, then have it handed over"
+        )
     pinned = _pin_for(entry, node, who)
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
@@ -332,7 +337,7 @@ def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> Whit
     if who.state == NodeState.FACTORY and node.wired:
         return replace(entry, fingerprint=who.fingerprint, assurance="bus")
     raise PolicyRefused(
-        f"The whitelist knows node {node.uuid.hex()} by UUID alone; only a tap can pin its key.",
+        f"Node {node.uuid.hex()} is whitelisted by UUID only; its key can only be pinned by tap.",
         hint="Tap it once (--via nfc), or add the fingerprint: whitelist add UUID --fingerprint F.",
     )
 
@@ -360,7 +365,8 @@ def _agree_anew(
         again = read_block(node, SECURITY)
         if fit_to_agree(again, uuid, entry.fingerprint).node_key != fit_to_agree(teds, uuid, None).node_key:
             raise NotAuthentic(
-                "The node showed one key and then another one.", hint="Two boards answer, or a copied tag. Look first."
+                "The node presented two different keys.",
+                hint="Either two boards are answering, or the tag is a copy. Check before you continue.",
             ) from None
         agreed = _request(station, node, entry, ca, again)
     key_id = agreed.key_id.hex()
@@ -382,8 +388,8 @@ def _agree_anew(
     identity = read_identity(node)
     if identity.epoch != agreed.epoch:  # a datasheet for the one would never fit the other
         raise NotAuthentic(
-            f"The node offered key epoch {agreed.epoch} and says {identity.epoch} in its session.",
-            hint="Its firmware counts epochs wrongly: node check names the rule.",
+            f"The node offered key epoch {agreed.epoch} but reports {identity.epoch} in its session.",
+            hint="Its firmware counts epochs incorrectly; node check shows the rule.",
         )
     place = node.contact.bus
 
@@ -465,5 +471,5 @@ def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
         proof = node.plain(command, "the proof of its reset")
     node.forget()
     if not verify(point, reset_message(node.uuid, epoch, challenge), proof):
-        raise NotAuthentic("The node's receipt of the reset does not verify; its keys are kept here.")
+        raise NotAuthentic("The node's reset receipt is not valid; its keys are kept here.")
     return ResetReceipt(epoch, challenge, proof)

@@ -312,7 +312,10 @@ class Boards:
     def _on_the_bus(self, port: Port) -> tuple[list[Contact], list[Contact]]:
         """All that answer, and those of them that are meant."""
         if not port.capabilities.many:
-            raise UsageFailure("--all is for a bus: a reader sees one node.", hint="Use --watch, tap after tap.")
+            raise UsageFailure(
+                "--all needs a bus: a reader sees one node at a time.",
+                hint="Use --watch to provision boards one tap after the other.",
+            )
         everyone = port.everyone(seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen)
         found = without_twins(everyone, self._reporter.notice)
         contacts = [contact for contact in found if self._is_meant(contact)]
@@ -344,9 +347,9 @@ class Boards:
             return
         uuids = [one.identity.uuid.hex() for one in found]
         raise NotWhitelisted(
-            f"{len(uuids)} node{'s' if len(uuids) > 1 else ''} answered, and none is on the whitelist: "
+            f"{len(uuids)} node{'s' if len(uuids) > 1 else ''} answered, but none is on the whitelist: "
             f"{', '.join(uuids[:_SHOWN])}{', …' if len(uuids) > _SHOWN else ''}.",
-            hint=f"Add them (teds-provision whitelist add {uuids[0]}), or name them in a sheet: --batch FILE.",
+            hint=f"Add them (teds-provision whitelist add {uuids[0]}), or list them in a sheet: --batch FILE.",
         )
 
     def _is_meant(self, contact: Contact) -> bool:
@@ -360,7 +363,7 @@ class Boards:
         if self.line is not None and self.line.only_verify:
             return listed
         if not listed or self.progress is not None:
-            self._station.notice(f"Left alone: node {uuid.hex()} is not {'in the sheet' if listed else 'whitelisted'}.")
+            self._station.notice(f"Skipped: node {uuid.hex()} is not {'in the sheet' if listed else 'whitelisted'}.")
             return False
         judged = verdict_of(self._station, uuid)
         verified = judged is not None and judged.verified.verdict == "authentic"
@@ -441,13 +444,13 @@ class Boards:
             busy = {row.number for uuid, row in self._rows.items() if uuid != who.uuid}
             row = self.progress.row_for(who.uuid, who.fingerprint, busy=busy)
             if row is None:
-                raise PolicyRefused(f"No row of the sheet is left for board {who.uuid.hex()}.", hint="Lay it aside.")
+                raise PolicyRefused(f"The sheet has no row left for board {who.uuid.hex()}.", hint="Set it aside.")
             self._rows[who.uuid] = row
             if row.fingerprint is not None and not who.fingerprint.startswith(row.fingerprint):
                 raise OtherKey(
                     f"Board {who.uuid.hex()} holds the key {who.fingerprint[:32]}; row {row.number} of the sheet "
                     f"says {row.fingerprint[:32]}.",
-                    hint="Compare the label of this board; it may be another one under the same UUID.",
+                    hint="Compare this board's label; it may be another board with the same UUID.",
                 )
             try:
                 named_for(self._station, who.uuid, row.prepared)
@@ -473,18 +476,23 @@ def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) ->
         return None
     sheet = read_sheet(station, request.sheet, order)
     if request.everyone and any(row.by_order for row in sheet.rows):
-        raise UsageFailure("On a bus there is no order of taps.", hint="Give each row its uuid or fingerprint.")
+        raise UsageFailure(
+            "On a bus, rows cannot follow the order of taps.", hint="Give each row its uuid or fingerprint."
+        )
     return Progress(station.home, sheet)
 
 
 def _require_consistent(request: ProvisionRequest, links: LinkSettings) -> None:
     if request.node is not None and request.several:
         raise UsageFailure(
-            "A node is named, and many are asked for.", hint="Name the node, or say --watch, --batch or --all."
+            "A single node cannot be combined with --all, --watch or --batch.",
+            hint="Give either the node or one of these options.",
         )
     if request.everyone and request.watch:
-        raise UsageFailure("--all takes what is on the bus now, --watch what comes.", hint="Use one of them.")
+        raise UsageFailure(
+            "--all provisions the nodes that are on the bus now, --watch those that arrive.", hint="Use one of them."
+        )
     if request.report is not None and request.sheet is None:
-        raise UsageFailure("A report is that of a sheet.", hint="Add --batch FILE.")
+        raise UsageFailure("--report requires a sheet.", hint="Add --batch FILE.")
     if len(links.places) > 1 and not (request.watch or request.sheet is not None):
-        raise UsageFailure("Several readers are for --watch.", hint="Add --watch, or name one reader.")
+        raise UsageFailure("Several readers require --watch.", hint="Add --watch, or give one reader.")

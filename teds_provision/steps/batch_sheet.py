@@ -107,7 +107,7 @@ class BatchTotals:
             told = f"{told} {self.worst.message}"
         kind = type(self.worst) if self.worst is not None else PolicyRefused
         known = kind if kind.__init__ is TedsProvisionError.__init__ else PolicyRefused
-        return known(told, hint="Run the same command again: it carries on with what is left.")
+        return known(told, hint="Run the same command again to continue with the rest.")
 
 
 def worse(one: TedsProvisionError | None, other: TedsProvisionError | None) -> TedsProvisionError | None:
@@ -180,7 +180,7 @@ class BatchSheet:
             for warning in row.prepared.warnings:
                 found.setdefault(warning, []).append(row.number)
             if row.lacks_calibration:
-                found.setdefault("the type asks for a calibration, and none is named.", []).append(row.number)
+                found.setdefault("the type requires a calibration, but the sheet gives none.", []).append(row.number)
         return tuple(f"Row{'s' if len(rows) > 1 else ''} {_numbers(rows)}: {why}" for why, rows in found.items())
 
 
@@ -195,9 +195,9 @@ def read_sheet(station: Station, path: Path, order: BuildOrder) -> BatchSheet:
         mistakes = [f"{path.name}:{_numbers(lines)}: {why}" for why, lines in reading.mistakes.items()]
         shown = "; ".join(mistakes[:_SHOWN])
         more = f"; and {len(mistakes) - _SHOWN} more" if len(mistakes) > _SHOWN else ""
-        raise BadData(f"{shown}{more}.", hint="Nothing was provisioned. Mend the sheet and run the same command again.")
+        raise BadData(f"{shown}{more}.", hint="Nothing was provisioned. Fix the sheet and run the same command again.")
     if not reading.rows:
-        raise BadData(f"{path} has no row.", hint=f"A header ({', '.join(COLUMNS)}) and a line per board.")
+        raise BadData(f"{path} has no rows.", hint=f"It needs a header ({', '.join(COLUMNS)}) and one line per board.")
     return BatchSheet(path, tuple(reading.rows))
 
 
@@ -241,14 +241,14 @@ class _Reading:
                     self.wrong(table.line_num, f"there are more than {MAX_ROWS} rows")
                     return
         except csv.Error as error:
-            self.wrong(table.line_num, f"this is no CSV: {error}")
+            self.wrong(table.line_num, f"this is not CSV: {error}")
 
     def _header_is_good(self, header: Sequence[str]) -> bool:
         for name in header:
             if name not in COLUMNS:
                 self.wrong(1, f"there is no column {name!r}; columns are {', '.join(COLUMNS)}")
             elif header.count(name) > 1:
-                self.wrong(1, f"the column {name!r} is there twice")
+                self.wrong(1, f"the column {name!r} appears twice")
         return not self.mistakes
 
     def _row(self, line: int, header: Sequence[str], cells: Sequence[str]) -> None:
@@ -266,7 +266,7 @@ class _Reading:
             name = prepared.order.name
             others = [other for other in self.station.nodes.all_named(name) if other != bytes.fromhex(uuid)]
             if others:
-                self.wrong(line, f"node {others[0].hex()} has the name {name!r} already")
+                self.wrong(line, f"node {others[0].hex()} already has the name {name!r}")
         if self.count == before and prepared is not None:
             digest = hashlib.sha256("\0".join(cells).encode()).hexdigest()
             number = len(self.rows) + 1
@@ -291,7 +291,7 @@ class _Reading:
         digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
         if form.fullmatch(digits):
             return digits
-        self.wrong(line, f"{what}: {rule} are needed, here is {text[:48]!a}")
+        self.wrong(line, f"{what}: expected {rule}, not {text[:48]!a}")
         return None
 
     def _once(self, line: int, what: str, value: str) -> None:
@@ -299,7 +299,7 @@ class _Reading:
             return
         other = self._seen.setdefault((what, value), line)
         if other != line and not (what == "name" and ("{uuid}" in value or "{n}" in value)):
-            self.wrong(line, f"the {what} {value} stands in line {other} too")
+            self.wrong(line, f"the {what} {value} is already in line {other}")
 
     def _order(self, line: int, values: dict[str, str]) -> Prepared | None:
         file = values.get("calibration") or None
@@ -462,8 +462,8 @@ class Progress:
             attempted = self.rows[row.number]
             if row.by_order and attempted.uuid not in (before, uuid.hex()):
                 raise NodeBusy(
-                    f"Row {row.number} was given to board {attempted.uuid} by another run of this sheet.",
-                    hint="Tap this board again: it gets the next row.",
+                    f"Row {row.number} was assigned to board {attempted.uuid} by another run of this sheet.",
+                    hint="Tap this board again to use the next row.",
                 )
             attempted.uuid = uuid.hex()
             self._write()
@@ -499,7 +499,7 @@ class Progress:
         """Note that no board came in time for the rows that nobody tried, if there are any."""
         if self.untried:
             missed = ", ".join(str(row.number) for row in self.untried[:10])
-            self.worst = worse(self.worst, NoNode(f"No board came within {seconds:.0f} s for row {missed}."))
+            self.worst = worse(self.worst, NoNode(f"No board was tapped within {seconds:.0f} s for row {missed}."))
 
     def totals(self) -> BatchTotals:
         """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""
@@ -558,7 +558,7 @@ def check_report(path: Path | None) -> None:
     if path.suffix.lower() not in (".csv", ".html", ".htm"):
         raise UsageFailure(f"{path.name} is neither CSV nor HTML.", hint="Name it FILE.csv or FILE.html.")
     if not path.parent.is_dir():
-        raise NotFound(f"There is no folder {path.parent} for the report.", hint="Make it, or name another place.")
+        raise NotFound(f"There is no folder {path.parent} for the report.", hint="Create it, or choose another path.")
 
 
 def write_report(path: Path, progress: Progress, about: About) -> None:

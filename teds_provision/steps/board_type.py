@@ -62,9 +62,9 @@ def refuse(uuid: bytes, differences: tuple[str, ...]) -> None:
     """The answer where nobody can be asked: no. Raises WrongBoard."""
     more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
     raise WrongBoard(
-        f"Board {uuid.hex()} is of another type: {differences[0].rstrip('.')}{more}. Nothing was written.",
+        f"Board {uuid.hex()} is of a different type: {differences[0].rstrip('.')}{more}. Nothing was written.",
         differences,
-        hint="Take the right board, or the right profile; if it shall become another type: --retype",
+        hint="Use the right board or the right profile. To change the board's type: --retype",
     )
 
 
@@ -120,7 +120,7 @@ def further(has: Mapping[BlockId, bytes], wanted: Image) -> tuple[str, ...]:
 
 def _between(number: int, own: _Says | None, wanted: _Says) -> Iterator[str]:
     if own is None:
-        yield f"Channel {number} is not there."
+        yield f"Channel {number} is missing."
         return
     if None not in (own.kind, wanted.kind) and own.kind != wanted.kind:
         yield f"Channel {number} is {_kind(own.kind)}, not {_kind(wanted.kind)}."
@@ -198,12 +198,13 @@ def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead
 
 _OF_OPERATE: Final = {
     Reason.DIGEST_MISMATCH: (
-        "The board's hardware does not bear its datasheet on {}: kind, form or length of a value is another one there",
-        "It is of another type than its datasheet, or that was written meanwhile: verify UUID, then provision it anew.",
+        "The board's hardware does not match its datasheet on {}: the kind, format or length of a value differs",
+        "Its type differs from its datasheet, or the datasheet has just been rewritten. Run verify UUID, then"
+        " provision it again.",
     ),
     Reason.FAULT: (
         "The node cannot measure with {} now: its hardware reports a fault, or it has too little power",
-        "Look at its self-test and its battery: mode UUID.",
+        "Check its self-test and battery: mode UUID.",
     ),
 }
 
@@ -239,7 +240,7 @@ def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = No
     except (NodeRefused, BadData) as error:  # busy, a fault: the datasheet stands, and a person is told
         return Borne(found, warnings=(f"No reading was taken: {error.message}",))
     bad = [str(one["channel"]) for one in samples if not one["valid"]]
-    warnings = (f"The reading of channel {', '.join(bad)} is not valid.",) if bad else ()
+    warnings = (f"The reading of channel {', '.join(bad)} is invalid.",) if bad else ()
     return Borne(found, samples, warnings)
 
 
@@ -251,9 +252,9 @@ def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
             return True
         if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):  # 4: a sensor there where an actuator is meant
             raise WrongBoard(
-                f"Channel {channel.number} ({channel.name or 'no name'}) of the board does not bear this datasheet: "
-                "its hardware is of another kind, or gives values of another form.",
-                hint="The board is of another type. Provision it by the profile of its own type.",
+                f"Channel {channel.number} ({channel.name or 'no name'}) of the board does not match this"
+                " datasheet: its hardware is of a different kind, or delivers values in a different format.",
+                hint="The board is of a different type. Provision it with the profile of its own type.",
             ) from refusal
         return None
     return None  # it claimed something for no time at all: no firmware of this profile

@@ -116,12 +116,12 @@ def for_several(order: BuildOrder) -> BuildOrder:
     if order.name is not None and not order.has_pattern:
         raise UsageFailure(
             f"Every node would get the name {order.name!r}.",
-            hint="Put {uuid} or {n} into --name, or say which board gets which in a sheet: --batch FILE.",
+            hint="Use {uuid} or {n} in --name, or list the boards in a sheet: --batch FILE.",
         )
     if order.calibration is not None:
         raise UsageFailure(
             f"Every node would get the calibration {order.calibration}: it belongs to one sensor.",
-            hint="Say which board gets which in a sheet: --batch FILE.",
+            hint="List the boards in a sheet: --batch FILE.",
         )
     return order
 
@@ -135,7 +135,8 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
     if order.adopt:
         if order.profile is not None or order.calibration is not None or order.drop_calibration:
             raise UsageFailure(
-                "--adopt signs the datasheet that the board brought.", hint="Leave --profile and --calibration out."
+                "--adopt signs the datasheet that the board brought, so it takes no profile or calibration.",
+                hint="Omit --profile and --calibration.",
             )
         return Prepared(order)
     wanted = _absolute_profile(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
@@ -185,8 +186,8 @@ def require_free_name(station: Station, uuid: bytes, name: str) -> None:
     others = [other for other in station.nodes.all_named(name) if other != uuid]
     if others:
         raise PolicyRefused(
-            f"Node {others[0].hex()} has the name {name!r} already.",
-            hint="Give this one another name; {uuid} or {n} in --name makes each its own.",
+            f"Node {others[0].hex()} already has the name {name!r}.",
+            hint="Choose another name; {uuid} or {n} in --name makes names unique.",
         )
 
 
@@ -240,7 +241,7 @@ def compose(
     before = record.profile_digest if record is not None and record.profile == wanted else None
     changed = order.profile is None and before is not None and before != digest
     if changed:
-        warnings += (f"The profile {wanted} is not what it was when this node's datasheet was made.",)
+        warnings += (f"Profile {wanted} has changed since this node's datasheet was built.",)
     told = merged((*passed, *warnings, *made.warnings))
     return Composed(profile, wanted, kept, calibrations, made.blocks, told, digest, changed)
 
@@ -288,7 +289,8 @@ def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile
         if why:
             raise CalibrationMisfit(
                 f"The calibration of channel {number} that the node has does not fit: {why}.",
-                hint="Give this channel's own: --calibration FILE; or leave it without one: --no-calibration.",
+                hint="Give this channel a calibration (--calibration FILE), or drop the existing one"
+                " (--no-calibration).",
             )
 
 
@@ -337,7 +339,7 @@ def guard(
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
         raise PolicyRefused(
             f"The calibration is refused: {errors[0]}{more}.",
-            hint='Mend it; or, if it is right, say why: --accept-calibration "why".',
+            hint='Fix it; or, if it is correct, give a reason: --accept-calibration "why".',
         )
     if errors and record:
         station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
@@ -466,9 +468,9 @@ def nobody(uuid: bytes, changes: tuple[Change, ...]) -> None:
     shown = " ".join(change.text for change in changes[:3])
     more = f" And {len(changes) - 3} more." if len(changes) > 3 else ""
     raise NotNamed(
-        f"Node {uuid.hex()} has another datasheet, and this command does not name what would change: {shown}{more}",
+        f"Node {uuid.hex()} has a different datasheet, and this command does not name what would change: {shown}{more}",
         changes,
-        hint="Name it (--profile, --name, --calibration), or drop what lies ready: teds-provision draft drop UUID.",
+        hint="Name it (--profile, --name, --calibration), or drop the draft: teds-provision draft drop UUID.",
     )
 
 
@@ -506,7 +508,7 @@ def build(
     try:
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
     except NotFound:
-        warnings += ("The node's key is not known yet: the Security TEDS is added when it was identified.",)
+        warnings += ("The node's key is not known yet: the Security TEDS is added once it is identified.",)
     built = Built(image, plan.profile.name, merged(warnings), plan.calibrations)
     if not keep_draft:
         return built

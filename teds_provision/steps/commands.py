@@ -112,11 +112,11 @@ def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes |
         return station.nodes.resolve(text)
     except NotFound:
         if path.is_dir():
-            raise NotFound(f"{text} is a folder, and no node is known by that name.") from None
+            raise NotFound(f"{text} is a folder, and no node has that name.") from None
         if path.exists():
-            raise NotFound(f"{text} is no regular file, and no node is known by that name.") from None
+            raise NotFound(f"{text} is not a regular file, and no node has that name.") from None
         if path.suffix or len(path.parts) > 1:
-            raise NotFound(f"There is no file {text}, and no node is known by that name.") from None
+            raise NotFound(f"There is no file {text}, and no node with that name.") from None
         raise
 
 
@@ -126,7 +126,7 @@ def read_image_file(path: Path) -> Image:
         image = Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
     except BadData as error:
         raise BadData(
-            f"{path} is no TEDS image: {error.message}", hint=error.hint or "Images come from build, sign and read."
+            f"{path} is not a TEDS image: {error.message}", hint=error.hint or "Images come from build, sign and read."
         ) from error
     return security.require_our_wire(image)
 
@@ -305,7 +305,7 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
     if node.contact.address is not None:
         node.forget()  # a link is one pair of addresses: this session ended with the old one
     elif node.sealed and read_identity(node).can_address != address:
-        raise Garbled("The node took the new CAN address and still shows the old one.")
+        raise Garbled("The node accepted the new CAN address but still reports the old one.")
     with station.durable("address"):
         station.nodes.remember(node.uuid, can_address=address)
         station.audit("address", node.uuid, "done", address=address)
@@ -417,7 +417,9 @@ def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, di
     else:
         wanted = known_image(station, uuid)
     if wanted is None:
-        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint="build and sign it first, or give --image.")
+        raise NotFound(
+            f"Nothing has been built for node {uuid.hex()}.", hint="build and sign it first, or give --image."
+        )
     name = own_name(station, wanted, profile)
     if name is not None:
         facts["name"] = name
@@ -427,7 +429,7 @@ def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, di
     if wanted.uuid != uuid:
         raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
     if wanted.security is None:
-        raise BadData("The image holds no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
+        raise BadData("The image has no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
     return wanted, facts
 
 
@@ -457,7 +459,7 @@ def write_at(
     if dry_run:
         return WriteDone(wanted, None)
     if jump is not None:
-        jump("The sequence of this node is then used up that far, for good. Write it?")
+        jump("This uses up the node's sequence numbers up to that point, permanently. Write it?")
     with at_node(station, links.after_agreeing(), uuid, reporter, writes="write") as visit:
         visit.session()
         if not retyped:
@@ -512,7 +514,7 @@ def sign_at(
     found = node_or_image(station, what)
     image = found if isinstance(found, Image) else None
     if image is not None and output is None and not dry_run:
-        raise UsageFailure("Signing an image file needs a place for the result.", hint="Add --output IMAGE.")
+        raise UsageFailure("Signing an image file requires an output file.", hint="Add --output IMAGE.")
     uuid = image.uuid if image is not None else station.nodes.resolve(what)
     order = SignOrder(uuid, image, accept_calibration, dry_run)
     if not dry_run:
@@ -539,7 +541,9 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     known = known_image(station, uuid)
     image = order.image or (draft.image if draft is not None else known)
     if image is None or not image.unsigned_blocks():
-        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
+        raise NotFound(
+            f"Nothing has been built for node {uuid.hex()}.", hint=f"To build it: teds-provision build {uuid.hex()}"
+        )
     present = _last_known(station, uuid, known, order.image) if node is None else _read_now(station, node, order)
     image, has = present.completing(image), present.image
     keys = known_node_keys(station, uuid, has or image)
@@ -606,8 +610,8 @@ def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image 
     highest = max(sequence, record.sequence if record else 0)
     if highest and brought.sequence > highest + SEQUENCE_WINDOW:
         raise PolicyRefused(
-            f"The image says sequence {brought.sequence}; the last one known here is {highest}.",
-            hint="Nobody vouches for that. Meet the node: sign IMAGE --read-node",
+            f"The image has sequence {brought.sequence}; the last one known here is {highest}.",
+            hint="That number is unverified. Check it against the node: sign IMAGE --read-node",
         )
     return _Present(known, epoch, max(sequence, brought.sequence))
 
@@ -690,7 +694,7 @@ def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
         if record.sequence == sequence:
             return record
     listed = ", ".join(str(record.sequence) for record in known) or "none"
-    raise NotFound(f"Node {uuid.hex()} had no datasheet of sequence {sequence}.", hint=f"Known are: {listed}.")
+    raise NotFound(f"Node {uuid.hex()} never had a datasheet with sequence {sequence}.", hint=f"Known are: {listed}.")
 
 
 def bring_back(

@@ -64,12 +64,12 @@ def plan_sheet(
     station.policy.require_whitelisted(node.uuid)
     for (channel, code), teds in blocks.items():
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
-            raise BadData(f"No node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.")
+            raise BadData(f"TEDS {code} of channel {channel} is damaged, or is one that no node can store.")
     meant = stated_uuid(blocks)
     if meant is not None and meant != node.uuid:
         raise BadData(
-            f"This datasheet is of node {meant.hex()}, not of {node.uuid.hex()}.",
-            hint="Take the UUID out of its Meta-TEDS (or write zeros) to use it for this one.",
+            f"This datasheet belongs to node {meant.hex()}, not to {node.uuid.hex()}.",
+            hint="To use it for this node, remove the UUID from its Meta-TEDS (or set it to zeros).",
         )
     if not node.sealed:
         require_session(station, node)

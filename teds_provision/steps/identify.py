@@ -50,7 +50,7 @@ def prove(node: Conversation, point: bytes) -> None:
     proof = node.ask(security_command(Function.PROVE, challenge), "to prove its key")
     if not verify(point, prove_message(node.uuid, challenge), proof):
         raise NotAuthentic(
-            f"The node does not hold the key {fingerprint(point)[:16]} that it shows.",
+            f"The node cannot prove that it holds the key {fingerprint(point)[:16]}, which it presents.",
             hint="This may be a copied tag. Do not use it.",
         )
 
@@ -126,7 +126,7 @@ def examine(station: Station, node: Conversation) -> Identified:
     shown = security.decode(octets)
     point = shown.node_key
     if not node_key_good(node.uuid, point, shown.node_key_signature):
-        raise NotAuthentic(f"The key that the node shows is not signed for UUID {node.uuid.hex()} (field 102).")
+        raise NotAuthentic(f"The key that the node presents is not signed for UUID {node.uuid.hex()} (field 102).")
     prove(node, point)
     with station.reading():
         station.pins.check(node.uuid, point)

@@ -145,7 +145,7 @@ def fits_of(
         sheet = teds.sheet.Sheet.of(image) if image is not None else None
         for requirement in asked:
             if sheet is None or not sheet.channels:
-                unknown = teds.fits.Fit(None, "", "skipped", "its datasheet is not known here.")
+                unknown = teds.fits.Fit(None, "", "skipped", "its datasheet is unknown here.")
                 yield NodeFit(uuid, requirement, unknown)
             else:
                 yield from (NodeFit(uuid, requirement, fit) for fit in teds.fits.judge(requirement, sheet, now))

@@ -396,7 +396,9 @@ class _Run:
             borne = bears(self.node, written.on_node, units)
             step.result = DONE if borne.asked else SKIPPED
             good = sum(bool(one) for one in borne.channels.values())
-            step.detail = f"{good} of {len(borne.channels)} channels bear it" if borne.asked else "it does not measure"
+            step.detail = (
+                f"{good} of {len(borne.channels)} channels match the hardware" if borne.asked else "it does not measure"
+            )
         return borne
 
     def _verify(self, who: Identified, written: Written) -> Verified:

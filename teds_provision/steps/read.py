@@ -50,7 +50,7 @@ def read_block(node: Conversation, block: BlockId, *, until: float | None = None
         if again == octets:
             return octets
         octets = again
-    raise Garbled(f"TEDS {block[1]} of channel {block[0]} reads differently each time: the link is noisy.")
+    raise Garbled(f"TEDS {block[1]} of channel {block[0]} reads differently each time; the link is noisy.")
 
 
 def _whole(octets: bytes) -> bool:
@@ -67,15 +67,19 @@ def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes
     until = time.monotonic() + READING_SECONDS if until is None else until
     while True:
         if time.monotonic() > until:
-            raise Garbled(f"The node hands out its TEDS too slowly: not done after {READING_SECONDS:.0f} s.")
+            raise Garbled(f"The node delivers its TEDS too slowly: not finished after {READING_SECONDS:.0f} s.")
         segment = _read_segment(node, block, len(octets))
         octets += segment
         total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
         if not segment or len(octets) >= total:
             return bytes(octets)
         if total > largest:
-            said = f"TEDS {block[1]} of channel {block[0]} claims {total} octets; {largest} is the most read."
-            raise BadData(said) if node.sealed else Garbled(f"{said} Nobody vouches for that: it came in no session.")
+            said = f"TEDS {block[1]} of channel {block[0]} claims {total} octets; at most {largest} are read."
+            raise (
+                BadData(said)
+                if node.sealed
+                else Garbled(f"{said} That is unverified: it was received outside a session.")
+            )
 
 
 def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:
@@ -86,7 +90,7 @@ def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:
         payload = _ask_despite_noise(node, command, what)
         if len(payload) >= 4 and int.from_bytes(payload[:4], "big") == offset:
             return payload[4:]
-    raise Garbled(f"The node read TEDS {access_code} of channel {channel} from another offset than was asked.")
+    raise Garbled(f"The node read TEDS {access_code} of channel {channel} from a different offset than requested.")
 
 
 def _ask_despite_noise(node: Conversation, command: Command, what: str) -> bytes:
@@ -154,13 +158,13 @@ def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Im
             what = f"to read TEDS {code} of channel {channel}"
             payload = sent(read_teds(channel, code, len(octets)), what)
             if len(payload) < 4 or int.from_bytes(payload[:4], "big") != len(octets):
-                raise Garbled(f"The node read TEDS {code} of channel {channel} from another offset than was asked.")
+                raise Garbled(f"The node read TEDS {code} of channel {channel} from a different offset than requested.")
             if len(payload) == 4:
                 break
             octets += payload[4:]
             total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
             if total > largest or sum(map(len, blocks.values())) + total > LARGEST_IMAGE:
-                raise BadData(f"TEDS {code} of channel {channel} claims {total} octets: too many.")
+                raise BadData(f"TEDS {code} of channel {channel} claims {total} octets, which is too many.")
             if len(octets) < total:
                 yield
         blocks[channel, code] = bytes(octets)
@@ -171,7 +175,7 @@ def read_identity(node: Conversation) -> Identity:
     """Ask Identify again, inside the session where one is open (then it is authentic)."""
     identity = Identity.decode(node.ask(IDENTIFY, "to identify itself"))
     if identity.uuid != node.uuid:
-        raise Garbled(f"The node called itself {node.uuid.hex()} before and {identity.uuid.hex()} now.")
+        raise Garbled(f"The node gave its UUID as {node.uuid.hex()} before and gives {identity.uuid.hex()} now.")
     if node.sealed:
         node.proven = identity
     return identity

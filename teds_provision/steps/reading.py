@@ -36,7 +36,7 @@ from teds_provision.teds.image import SECURITY, Image
 
 Origin = Literal["session", "plain", "kept"]
 _DIGEST = 35  # octets: channel u16, access code u8, SHA-256
-_IN_SESSION = "opened under the key that is held here"
+_IN_SESSION = "opened with the key held here"
 
 
 @dataclass(frozen=True)
@@ -176,9 +176,9 @@ def _judged(station: Judging, row: NodeReading, *, keyed: bool) -> NodeVerdict:
     signers = Signers(row.node_key, row.node_key_signature, row.station_key, row.station_key_signature)
     checks = judge(station, row.uuid, _read(row.checks), signers, digests_of(row).get(SECURITY))
     if row.station_key is None and all(check.result != "failed" for check in checks):  # a row of no reading of ours
-        checks.append(Check("signed", "failed", "nobody is named who signed it"))
+        checks.append(Check("signed", "failed", "it does not say who signed it"))
     if not any(check.name == "session" for check in checks):
-        why = "its datasheet was last read in no session" if keyed else ""
+        why = "its datasheet was last read outside a session" if keyed else ""
         checks.append(session(_IN_SESSION if row.in_session else "", why))
     if not row.whole:
         checks = [check._replace(kept=True) if check.name in ABOUT_THE_REST else check for check in checks]

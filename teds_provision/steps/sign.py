@@ -123,14 +123,16 @@ def sign(
             number = _sequence_if_the_same(station, keys, image, octets, epoch)
             if number is not None and (octets == on_node or number > node_sequence):
                 return Signed(image.with_block(SECURITY, octets), number, reused=True)
-    station.plant.require_role("sign", "signs no datasheet", "Have it signed by one that has: sign --by OFFICE")
+    station.plant.require_role(
+        "sign", "cannot sign datasheets", "Have a station sign it that has this role: sign --by OFFICE"
+    )
     credentials = station.credentials(keys.uuid)  # may ask for the passphrase: not while the store is held
     with station.durable("sign", more_follows=write_follows):
         known = station.nodes.get(keys.uuid)
         # The store knows of signatures that never reached the node, the node of those by other stations.
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
         if number > LAST_SEQUENCE:
-            raise PolicyRefused("The sequence of this node is used up.")
+            raise PolicyRefused("This node has no sequence numbers left.")
         unsigned = unsigned_datasheet(
             keys,
             credentials.key.point,
@@ -177,5 +179,5 @@ def _now() -> bytes:
     """TimeInstance of now: u32 s, u32 ns, UTC; raises TedsProvisionError where no u32 holds it."""
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
     if not 0 <= seconds < 1 << 32:
-        raise TedsProvisionError("The clock of this machine says what cannot be.", hint="Set it; see: doctor")
+        raise TedsProvisionError("This machine's clock is wrong.", hint="Set it; see: teds-provision doctor")
     return seconds.to_bytes(4, "big") + nanoseconds.to_bytes(4, "big")

@@ -330,10 +330,10 @@ ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed"
 def _octets(image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
     checks, shown = [_form(image)], proofs.shown
     if shown is None:
-        return [*checks, Check("signed", "failed", "the image holds no Security TEDS")]
+        return [*checks, Check("signed", "failed", "the image has no Security TEDS")]
     if isinstance(shown, NotCanonical):
         ours = security.has_profile_version(image.blocks[SECURITY])
-        why = shown.message if ours else "the Security TEDS is not of this profile: shown, never trusted"
+        why = shown.message if ours else "the Security TEDS does not follow this profile: shown, never trusted"
         return [*checks, Check("canonical form", "failed", why)]
     checks += [Check("canonical form", "passed"), _algorithms(shown)]
     if not proofs.node_key:
@@ -369,14 +369,15 @@ def session(opened: str, why: str) -> Check:
         return Check(_SESSION, "passed", opened)
     if why:
         return Check(_SESSION, "failed", why)
-    return Check(_SESSION, "skipped", "no key of this node is held here")
+    return Check(_SESSION, "skipped", "this station holds no key of this node")
 
 
 def unproven(uuid: bytes, why: str) -> Unproven:
     """The error (exit 5) where a key of the node is held and neither a session nor its signature vouches for it."""
     return Unproven(
-        f"Nothing is proven of node {uuid.hex()}: {why}.",
-        hint="What came without a session may be a recording. Try at the reader; to take a node over: agree --rotate",
+        f"Nothing could be proven about node {uuid.hex()}: {why}.",
+        hint="Data received outside a session may be a replay. Try it on the reader; to take a node over: agree"
+        " --rotate",
     )
 
 
@@ -387,8 +388,8 @@ def require_authentic(verified: Verified) -> None:
     failed = {check.name: check for check in reversed(verified.checks) if check.result == "failed"}
     if verified.verdict == "unproven" and _PAGES in failed:
         raise Unproven(
-            f"Nothing is proven of the datasheet of node {verified.uuid.hex()}: {failed[_PAGES].why}.",
-            hint="Bring them: teds-provision registry sync",
+            f"Nothing could be proven about the datasheet of node {verified.uuid.hex()}: {failed[_PAGES].why}.",
+            hint="To get them: teds-provision registry sync",
         )
     if verified.verdict == "unproven":
         raise unproven(verified.uuid, failed[_SESSION].why)
@@ -403,12 +404,12 @@ def _check(name: str, holds: bool, why: str, good: str = "") -> Check:
 def _form(image: Image) -> Check:
     bad = [block for block in image if not datasheet.passes_own_check(block, image.blocks[block])]
     why = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in bad)
-    return _check("form", not bad, f"Length, checksum or class is wrong: {why}", f"{len(image.blocks)} TEDS")
+    return _check("form", not bad, f"length, checksum or class is wrong: {why}", f"{len(image.blocks)} TEDS")
 
 
 def _algorithms(shown: SecurityTeds) -> Check:
     wrong = [number for number, value in security.OUR_VALUES.items() if shown.values[number] != value]
-    why = "weak or unknown choice in field " + ", ".join(map(str, wrong))
+    why = "weak or unknown algorithm in field " + ", ".join(map(str, wrong))
     if other := security.other_wire(shown):
         why = f"it names {other}"
     return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
@@ -425,7 +426,7 @@ def _pinned(station: Judging, uuid: bytes, node_key: bytes) -> Check:
     return Check(name, "passed", f"{fingerprint(node_key)[:16]}, {pinned}")
 
 
-_FILE_ALONE = "a file does not say what its node has now"
+_FILE_ALONE = "a file does not show the node's current state"
 
 
 def _epoch(shown: SecurityTeds, known: Known | None) -> Check:
@@ -433,7 +434,7 @@ def _epoch(shown: SecurityTeds, known: Known | None) -> Check:
     if known is None:
         return Check(name, "skipped", _FILE_ALONE)
     if known.identity is not None and shown.key_epoch > known.identity.epoch:
-        why = f"signed for epoch {shown.key_epoch}, the node is at {known.identity.epoch}"
+        why = f"signed for epoch {shown.key_epoch}, but the node is at {known.identity.epoch}"
         return Check(name, "failed", why)
     why = f"signed for epoch {shown.key_epoch}, older than the {known.key_epoch} that this station saw"
     return _check(name, shown.key_epoch >= known.key_epoch, why, str(shown.key_epoch))
@@ -445,7 +446,7 @@ def _sequence(shown: SecurityTeds, known: Known | None) -> Check:
         return Check(name, "skipped", _FILE_ALONE)
     if known.identity is not None and shown.sequence < known.identity.sequence:
         own = known.identity.sequence
-        why = f"sequence {shown.sequence} is older than the node's own {own}: an old datasheet was put back"
+        why = f"sequence {shown.sequence} is older than the node's own {own}: an old datasheet was restored"
         return Check(name, "failed", why)
     why = f"sequence {shown.sequence} is older than the {known.sequence} that this station saw on the node"
     return _check(name, shown.sequence >= known.sequence, why, str(shown.sequence))
@@ -470,7 +471,7 @@ def _station(station: Judging, signers: Signers, certifier: bytes | None) -> Che
     return _check(
         "signing station",
         certifier is not None or key in station.policy.trusted_stations(),
-        f"station {digits} is not trusted here, nor certified by a trusted CA",
+        f"station {digits} is neither trusted here nor certified by a trusted CA",
         digits,
     )
 
@@ -496,17 +497,17 @@ def _certificate(station: Judging, signers: Signers, certifier: bytes | None) ->
     if certifier is not None:
         return Check(name, "passed", f"CA {fingerprint(certifier)[:16]}")
     if signers.station_key == station.point or signers.station_key not in station.policy.trusted_stations():
-        return Check(name, "failed", "field 104 does not verify under any trusted CA")
-    return Check(name, "skipped", "the station is trusted itself; its CA is not known here")
+        return Check(name, "failed", "field 104 matches no trusted CA")
+    return Check(name, "skipped", "the station itself is trusted; its CA is not known here")
 
 
-_CHANGED = "field 100 does not verify: the datasheet was changed, or is another node's"
+_CHANGED = "field 100 does not verify: the datasheet was changed or belongs to another node"
 
 
 def _blocks(image: Image, shown: SecurityTeds) -> Check:
     found = datasheet.digests(image.blocks)
     wrong = [block for block, digest in shown.signed_blocks.items() if found.get(block) != digest]
-    why = ", ".join(f"TEDS {code} of channel {channel} is absent or changed" for channel, code in wrong)
+    why = ", ".join(f"TEDS {code} of channel {channel} is missing or changed" for channel, code in wrong)
     return _check("signed TEDS", not wrong, why, f"{len(shown.signed_blocks)} digests")
 
 

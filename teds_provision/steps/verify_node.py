@@ -88,7 +88,7 @@ def open_or_say_why(station: Station, node: Conversation) -> str:
         return _why(refusal)
     if held is None and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
         elsewhere = agreed_elsewhere(station, node)
-        return "the node opens no session under any key that is held here" + (elsewhere and f"; {elsewhere}")
+        return "the node does not open a session with any key held here" + (elsewhere and f"; {elsewhere}")
     return ""
 
 
@@ -152,11 +152,11 @@ def vouched(node: Conversation, point: bytes, why: str) -> Check:
     ``why`` is what :func:`open_or_say_why` said; the check has failed where a key is held and neither came about.
     """
     if node.sealed:
-        return session("opened under the key that is held here", "")
+        return session("opened with the key held here", "")
     if why and node.identity.state == NodeState.FACTORY:
         try:
             proof_of_reset(node, point)
         except (NotAuthentic, NodeRefused, LinkFailure):
-            return session("", f"{why}, and it does not prove that it was reset")
-        return session("the node signed that it was reset: the key that is held here is gone from it", "")
+            return session("", f"{why}, and it did not prove that it was reset")
+        return session("the node signed that it was reset: it no longer has the key held here", "")
     return session("", why)

@@ -88,20 +88,20 @@ class _Reading:
         if len(digits) == length and re.fullmatch("[0-9a-f]+", digits):
             return digits
         shown = ascii(text[:48]) if text else "nothing"
-        self.wrong(line, what, f"{length} hex digits are needed, here is {shown}")
+        self.wrong(line, what, f"expected {length} hex digits, not {shown}")
         return None
 
     def _fingerprint(self, line: int, text: str) -> str | None:
         digits = read_fingerprint(text)
         if digits is None:
-            self.wrong(line, "fingerprint", f"32 to 64 hex digits are needed, here is {text[:80]!a}")
+            self.wrong(line, "fingerprint", f"expected 32 to 64 hex digits, not {text[:80]!a}")
         return digits
 
     def _join(self, entry: ListedNode) -> None:
         known = self.entries.get(entry.uuid)
         pins = [one.fingerprint for one in (known, entry) if one is not None and one.fingerprint]
         if known is not None and len(pins) == 2 and not same_key(*pins):
-            self.wrong(entry.line, "fingerprint", f"the same UUID has another key in line {known.line}")
+            self.wrong(entry.line, "fingerprint", f"line {known.line} has the same UUID with another key")
             return
         if known is not None:
             entry = ListedNode(known.line, known.uuid, max(pins, key=len, default=None), known.name or entry.name)
@@ -124,7 +124,7 @@ def read_whitelist(path: Path, form: str | None = None) -> list[ListedNode]:
     """
     text = read_text(path, MAX_FILE_OCTETS, "whitelist")
     if not text.strip():
-        raise BadData(f"{path} is empty: it lists no node.", hint="Give XML, CSV (a line of column names) or JSON.")
+        raise BadData(f"{path} is empty.", hint="Supported: XML, CSV (with column names in line 1) and JSON.")
     form = form or _form_of(path, text)
     reading = _Reading(str(path))
     readers: dict[str, Callable[[str, _Reading], None]] = {"xml": _read_xml, "csv": _read_csv, "json": _read_json}
@@ -134,7 +134,7 @@ def read_whitelist(path: Path, form: str | None = None) -> list[ListedNode]:
         more = len(reading.mistakes) - _SHOWN_MISTAKES
         raise BadData(
             f"{shown}{f'; and {more} more' if more > 0 else ''}.",
-            hint="Mend these lines and import again; nothing was imported.",
+            hint="Nothing was imported. Fix these lines and import again.",
         )
     return list(reading.entries.values())
 
@@ -220,7 +220,7 @@ def _read_xml(text: str, reading: _Reading) -> None:
         parser.parse(io.StringIO(text))
     except DefusedXmlException as error:
         raise BadData(
-            f"{reading.file}: the XML has a DTD or entities, which are not read.", hint="Remove the DOCTYPE."
+            f"{reading.file}: the XML has a DTD or entities, which are not allowed.", hint="Remove the DOCTYPE."
         ) from error
     except SAXParseException as error:
         raise BadData(f"{reading.file}:{error.getLineNumber()}: this is not XML: {error.getMessage()}.") from error
@@ -333,12 +333,12 @@ def _read_json(text: str, reading: _Reading) -> None:
     value = load_json(text, "the whitelist", octets=MAX_FILE_OCTETS, file=reading.file)
     listed = value.get("whitelist") if isinstance(value, dict) else value
     if not isinstance(listed, list):
-        raise BadData(f'{reading.file}:1: whitelist: a list is needed, or an object with "whitelist": […].')
+        raise BadData(f'{reading.file}:1: whitelist: expected a list, or an object with "whitelist": […].')
     for line, item in _with_lines(text, inside=isinstance(value, dict)):
         if isinstance(item, str):
             reading.add(line, {"uuid": item})
         elif not isinstance(item, dict):
-            reading.wrong(line, "entry", "an object or a UUID as a string is needed")
+            reading.wrong(line, "entry", "expected an object, or a UUID as a string")
         else:
             _add_object(line, item, reading)
 
@@ -348,7 +348,7 @@ def _add_object(line: int, item: dict[str, Any], reading: _Reading) -> None:
     for key, value in item.items():
         name = _field_name(key)
         if name in FIELDS and not isinstance(value, str | None):
-            reading.wrong(line, name, "a string is needed")
+            reading.wrong(line, name, "expected a string")
             return
         if name in FIELDS and value is not None:
             values[name] = value
@@ -403,7 +403,7 @@ def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPl
     uuids = [entry.uuid for entry in listed if entry.uuid in revoked]
     if uuids:
         shown = ", ".join(f"{uuid.hex()} ({revoked[uuid]})" for uuid in uuids[:_SHOWN])
-        raise PolicyRefused(f"Revoked nodes are not whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
+        raise PolicyRefused(f"Revoked nodes cannot be whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[ListedNode, str]] = []
     new = 0
@@ -505,7 +505,7 @@ def form_of(path: Path, form: str | None) -> str:
     if form is not None or suffix in FORMATS:
         return form or suffix
     if suffix:
-        raise UsageFailure(f"{path.name} does not say which format is meant.", hint="Add --format xml, csv or json.")
+        raise UsageFailure(f"Cannot tell the format from the name {path.name}.", hint="Add --format xml, csv or json.")
     return "xml"
 
 

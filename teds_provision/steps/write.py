@@ -46,7 +46,7 @@ Low = Callable[[str], object]
 def wait_for_charge(question: str) -> None:
     """The answer where nobody was asked: no. Raises PolicyRefused."""
     raise PolicyRefused(
-        question.removesuffix(" Write it?"), hint="Charge it first (leave it on the reader), or write it with --yes."
+        question.removesuffix(" Write it?"), hint="Charge it first (leave it on the reader), or add --yes."
     )
 
 
@@ -92,7 +92,7 @@ def write(
                     keep(station, node, has, by="write", known=known)
             return Written(0, time.monotonic() - started, has)
     identity = node.proven or read_identity(node)
-    _require_newer(signed, identity, jump=jump)
+    _require_newer(signed, identity, jump=jump, again=_again(station, image.uuid))
     _require_charge(node, low)
     octets = 0
     for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
@@ -160,8 +160,8 @@ def _conclude(
     if differing:
         channel, access_code = differing[0]
         raise NotAuthentic(
-            f"The node gives back another TEDS {access_code} of channel {channel} than was written.",
-            hint="Try again; if it stays, the board's flash is broken.",
+            f"TEDS {access_code} of channel {channel} reads back differently from what was written.",
+            hint="Try again. If the error persists, the board's flash is defective.",
         )
 
 
@@ -169,8 +169,8 @@ def _require_charge(node: Conversation, low: Low) -> None:
     percent = _percent(node)
     if percent is not None and percent < LEAST_PERCENT:
         low(
-            f"The battery of node {node.uuid.hex()} is at {percent} %: a write may be cut short, and would have to be "
-            "begun anew. Write it?"
+            f"The battery of node {node.uuid.hex()} is at {percent} %: the write may fail halfway and have to"
+            " be repeated. Write it?"
         )
 
 
@@ -187,22 +187,30 @@ def _percent(node: Conversation) -> int | None:
     return power.level if power.flags & PowerFlag.BATTERY else None
 
 
-def _require_newer(signed: SecurityTeds, identity: Identity, *, jump: bool) -> None:
+def _again(station: Station, uuid: bytes) -> str:
+    """How this station gets the image signed against the node as it is now."""
+    roster = station.plant.roster
+    if roster is not None and not roster.has(station.fingerprint, "sign"):
+        return f"Have it signed again: teds-provision sign {uuid.hex()} --by OFFICE --job ID"
+    return f"Sign it again for the node as it is now: teds-provision sign {uuid.hex()} --read-node"
+
+
+def _require_newer(signed: SecurityTeds, identity: Identity, *, jump: bool, again: str) -> None:
     if signed.sequence <= identity.sequence:
         raise PolicyRefused(
-            f"The image has sequence {signed.sequence}; the node is at {identity.sequence} already.",
-            hint="Sign again against the node: teds-provision sign UUID --read-node",
+            f"The image has sequence {signed.sequence}; the node is already at {identity.sequence}.",
+            hint=again,
         )
     if signed.key_epoch != identity.epoch:
         raise PolicyRefused(
             f"The image was signed for key epoch {signed.key_epoch}; the node is at {identity.epoch}.",
-            hint="Sign again for this key: teds-provision sign UUID --read-node",
+            hint=again,
         )
     if signed.sequence > identity.sequence + SEQUENCE_WINDOW and not jump:
         raise PolicyRefused(
-            f"The image has sequence {signed.sequence}, far ahead of the node's {identity.sequence}: somebody may have"
-            " lied about this node.",
-            hint="Sign anew (sign UUID --read-node), or if you know why: write UUID --sequence-jump --yes",
+            f"The image has sequence {signed.sequence}, far ahead of the node's {identity.sequence}: earlier"
+            " data about this node may have been forged.",
+            hint=f"{again}. Or, if you know why: write UUID --sequence-jump --yes",
         )
 
 

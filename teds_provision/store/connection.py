@@ -94,8 +94,8 @@ def is_no_place_to_write(failure: StoreFailure) -> bool:
 def too_old(what: str, version: int) -> StoreFailure:
     """The error for a store, or the store in a backup (``what``), of a schema before KeyAgreement 2."""
     return StoreFailure(
-        f"{what} is of schema {version}, from before KeyAgreement 2; no node agrees that way any more.",
-        hint="Nothing of it was released. Choose another --home, run init there, and provision the nodes anew.",
+        f"{what} is of schema {version}, from before KeyAgreement 2, which nodes no longer support.",
+        hint="That version was never released. Choose another --home, run init there, and provision the nodes again.",
     )
 
 
@@ -313,7 +313,7 @@ class Connection:
 
     def _conclude(self, block: Transaction) -> None:
         if self._spoilt and not block.spoilt and (block.apart or block.level == 0):
-            raise StoreFailure("A part of this change failed, so all of it was undone.", hint="Run it again.")
+            raise StoreFailure("Part of this change failed, so all of it was undone.", hint="Run it again.")
         if block.level == 0:
             self.execute("COMMIT")
             if self._added and not block.later:  # the log, and all that was written to it before, is on the disk

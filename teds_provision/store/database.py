@@ -64,7 +64,9 @@ def prepare_home(home: Path, *, create: bool) -> None:
     if create and not private and not any(home.iterdir()):
         home.chmod(0o700)
     elif status.st_mode & 0o022:
-        raise StoreFailure(f"Others may write in {home}.", hint=f"Run: chmod 700 {home}, or choose another --home.")
+        raise StoreFailure(
+            f"Other users can write to {home}.", hint=f"Run: chmod 700 {home}, or choose another --home."
+        )
 
 
 def prepare_file(path: Path, *, create: bool) -> None:
@@ -88,8 +90,8 @@ def _require_own(file: Path) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
-        what = "a link" if stat.S_ISLNK(status.st_mode) else "not this user's own file"
-        raise StoreFailure(f"{file} is {what}.", hint="Somebody put it there: look at it, and move it away.")
+        what = "a link" if stat.S_ISLNK(status.st_mode) else "not owned by this user"
+        raise StoreFailure(f"{file} is {what}.", hint="It was put there by somebody else: check it and move it away.")
 
 
 PAGE = 500
@@ -303,7 +305,7 @@ def open_copy(path: Path) -> sqlite3.Connection:
             last = error
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-    raise last or OSError(f"There is no place for a copy of {path}.")
+    raise last or OSError(f"There is no space for a copy of {path}.")
 
 
 def _places() -> Iterator[str]:

@@ -123,10 +123,10 @@ class StoreLock(_HeldFile):
                 return
             waited = time.monotonic() - began
             if waited >= self._wait:
-                hint = "Wait until it has ended, or end it."
-                raise StoreLocked(f"The store is held by {_holder(descriptor)}.", hint=hint)
+                hint = "Wait for it to finish, or stop it."
+                raise StoreLocked(f"The store is locked by {_holder(descriptor)}.", hint=hint)
             if not told and waited >= _POLL_SECONDS and self._notice is not None:
-                self._notice(f"Waiting for the store, held by {_holder(descriptor)}.")
+                self._notice(f"Waiting for the store, locked by {_holder(descriptor)}.")
                 told = True
             time.sleep(pause)
             # a durable step of another command takes milliseconds, and others wait for its end as well
@@ -158,7 +158,7 @@ class Mark(_HeldFile):
             fcntl.flock(descriptor, (fcntl.LOCK_SH if self._shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = _holder(descriptor)
-            raise MarkTaken(f"It is held by {holder}.", holder) from None
+            raise MarkTaken(f"It is locked by {holder}.", holder) from None
         self.left_behind = bool(os.pread(descriptor, 1, 0))
         with suppress(OSError):  # as above
             os.ftruncate(descriptor, 0)
@@ -190,7 +190,7 @@ class MarkTaken(StoreLocked):
     """Somebody else holds a :class:`Mark`; ``holder`` names the process."""
 
     def __init__(self, message: str, holder: str) -> None:
-        super().__init__(message, hint="Wait until it has ended, or end it.")
+        super().__init__(message, hint="Wait for it to finish, or stop it.")
         self.holder = holder
 
 
@@ -270,10 +270,10 @@ class NodeTurn(_HeldFile):
                 return
             if time.monotonic() >= until:
                 raise NodeBusy(
-                    f"Another command of this station works on node {self._uuid.hex()}.",
-                    hint="Wait until it has ended, or end it.",
+                    f"Another command of this station is using node {self._uuid.hex()}.",
+                    hint="Wait for it to finish, or stop it.",
                 )
             if not told and self._notice is not None:
-                self._notice(f"Waiting: another command works on node {self._uuid.hex()}.")
+                self._notice(f"Waiting: another command is using node {self._uuid.hex()}.")
                 told = True
             time.sleep(_POLL_SECONDS)

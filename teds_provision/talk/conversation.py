@@ -39,7 +39,7 @@ _OPENING = "to open a session"
 _MEANING = {
     Reason.UNKNOWN_COMMAND: "it does not know the command",
     Reason.WRONG_STATE: "its state does not allow that now",
-    Reason.NOT_PERMITTED: "that is not permitted here (a tap or a session is needed)",
+    Reason.NOT_PERMITTED: "this is not permitted here (a tap or a session is needed)",
     Reason.BAD_FORM: "length, checksum or form is wrong",
     Reason.BAD_SIGNATURE: "a signature does not verify",
     Reason.DIGEST_MISMATCH: "a TEDS does not match its signed digest",
@@ -64,15 +64,15 @@ _MEANING = {
 _CURE = {
     Reason.UNTRUSTED_STATION: "Have this station signed by that CA, or reset the node by hand (button held 5 s).",
     Reason.NOT_PERMITTED: "Tap the node on the NFC reader (--via nfc), or reset it by hand.",
-    Reason.UNKNOWN_KEY: "Try at the reader. If another station rotated the key: tap it, agree UUID --rotate.",
+    Reason.UNKNOWN_KEY: "Try it on the reader. If another station rotated the key, tap the node: agree UUID --rotate.",
     Reason.STALE_SEQUENCE: "Sign again against the node: sign UUID --read-node.",
     Reason.WRONG_EPOCH: "Sign again after the key agreement: sign UUID --read-node.",
     Reason.TOO_LARGE: "Use a smaller calibration table, or a node with more flash.",
-    Reason.DOES_NOT_FIT: "Ask for a lower rate, more samples in a message, or CAN FD; NFC and BLE do not offer all.",
-    Reason.NO_ROOM: "Let another measurement of this node end first.",
-    Reason.BUSY: "Try again in a moment; mode UUID says which station claims what.",
-    Reason.FAULT: "Look at its power and self-test: sample UUID, mode UUID.",
-    Reason.FLASH_FAILURE: "Try again; if it stays, the board is broken.",
+    Reason.DOES_NOT_FIT: "Use a lower rate or CAN FD; NFC and BLE do not support everything.",
+    Reason.NO_ROOM: "End another measurement of this node first.",
+    Reason.BUSY: "Try again in a moment; mode UUID shows which station claims what.",
+    Reason.FAULT: "Check its power and self-test: sample UUID, mode UUID.",
+    Reason.FLASH_FAILURE: "Try again. If the error persists, the board is defective.",
 }
 
 

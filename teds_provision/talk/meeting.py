@@ -150,7 +150,7 @@ def _no_link(station: Station, uuid: bytes, error: NoReader) -> NoReader:
     last = f" It was last met on a CAN bus, at address 0x{known.can_address:02X}." if known and met else ""
     return NoReader(
         f"No link to node {uuid.hex()} is named, and no NFC reader can be used: {error.message}",
-        hint=f"Name where it is: --can socketcan:can0, --ble hci0 or --nfc usb; or once, in config.toml.{last}",
+        hint=f"Give its link: --can socketcan:can0, --ble hci0 or --nfc usb; or set it once in config.toml.{last}",
     )
 
 
@@ -219,8 +219,9 @@ def refuse_twins(contacts: list[Contact]) -> list[Contact]:
         if twin is not contact:
             raise AddressConflict(
                 f"Node {contact.identity.uuid.hex()} answers at 0x{twin.address or 0:02x} and at "
-                f"0x{contact.address or 0:02x}: one of the two is not it.",
-                hint="Take one of them off the bus, or name it by node=ADDRESS in --can: its key shows which is real.",
+                f"0x{contact.address or 0:02x}: one of them is an impostor.",
+                hint="Disconnect one of them, or select one by node=ADDRESS in --can: its key shows which one"
+                " is genuine.",
             )
     return contacts
 
@@ -238,7 +239,7 @@ def the_one(station: Station, contacts: list[Contact]) -> Contact:
     raise UsageFailure(
         f"{len(contacts)} nodes answer on the bus{', ' if which else ''}{which}: {listed}"
         f"{', …' if len(meant) > _SHOWN else ''}.",
-        hint="Name one by its UUID, or by node=ADDRESS in --can.",
+        hint="Select one by its UUID, or by node=ADDRESS in --can.",
     )
 
 

@@ -260,7 +260,7 @@ def _term(text: str) -> Term:
     try:
         value = float(match[3])
     except ValueError as error:
-        raise BadData(f'"{match[3]}" in "{text.strip()[:60]}" is no number.') from error
+        raise BadData(f'"{match[3]}" in "{text.strip()[:60]}" is not a number.') from error
     if not math.isfinite(value):
         raise BadData(f'"{match[3]}" in "{text.strip()[:60]}" is too large.')
     unit = parse_unit((match[4] or "1").strip())

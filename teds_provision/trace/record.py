@@ -87,7 +87,7 @@ def read_lines(octets: bytes) -> Iterator[Record]:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if not row.endswith(b"\n"):
                 return
-            raise BadData(f"Line {number} of the trace is no record: {error}.") from error
+            raise BadData(f"Line {number} of the trace is not a valid record: {error}.") from error
 
 
 def _record(row: dict[str, Any]) -> Record:

@@ -34,7 +34,7 @@ def open_trace(path: Path, tell: Callable[[str], None]) -> Recorder:
         raise NotFound(f"There is no folder {path.parent}.") from None
     except OSError as error:
         raise StoreFailure(
-            f"The trace {path} cannot be written: {error.strerror}.", hint="Name another file with --trace."
+            f"The trace {path} cannot be written: {error.strerror}.", hint="Choose another file for --trace."
         ) from error
     return Recorder(path, descriptor, tell)
 
@@ -129,7 +129,7 @@ def read_trace(path: Path) -> Iterator[Record]:
         if reading is not None:
             octets += file.read(_MOST_OCTETS)
     if len(octets) > _MOST_OCTETS:
-        raise BadData(f"{path} is larger than {_MOST_OCTETS} octets: that is no trace.")
+        raise BadData(f"{path} is larger than {_MOST_OCTETS} octets, which is too large for a trace.")
     if reading is not None:
         return reading(octets)
-    raise BadData(f"{path} is no trace.", hint="Traces are what --trace FILE wrote, or pcapng with CAN frames.")
+    raise BadData(f"{path} is not a trace.", hint="Supported: files written by --trace, or pcapng with CAN frames.")

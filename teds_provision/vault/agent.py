@@ -63,7 +63,7 @@ def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
     Raises VaultFailure where this system has no such sockets, or the process does not come up.
     """
     if not hasattr(socket, "SO_PEERCRED"):
-        raise VaultFailure("This system does not say who is at the other end of a socket: unlock needs Linux.")
+        raise VaultFailure("unlock requires Linux: this system does not identify the peer of a socket.")
     lock(home)
     package = Path(__file__).parents[2]
     # -P and an appended folder: neither the folder that the user is in, nor ours, comes before Python's own modules.
@@ -88,7 +88,7 @@ def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
     if ready != b"ready\n":
         process.kill()
         process.wait()
-        raise VaultFailure(f"The vault cannot be held open: {SOCKET} in {home} does not come up.")
+        raise VaultFailure(f"The vault cannot be kept open: {SOCKET} in {home} does not come up.")
 
 
 def _ask(home: Path, request: bytes) -> bytes:

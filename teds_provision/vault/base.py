@@ -14,6 +14,8 @@ Ask = Callable[[str, bool], str]
 """``ask(prompt, confirm)`` returns a passphrase or PIN; raises where nobody can be asked."""
 
 SERVICE = "teds-provision"
+LAST_ATTEMPT = "last attempt before it locks"
+"""Part of the prompt for a PIN when one wrong attempt locks the token: only a person may spend that one."""
 
 
 class Vault(Protocol):

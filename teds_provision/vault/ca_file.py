@@ -56,16 +56,18 @@ def read_ca(path: Path, passphrase: str) -> bytes:
 
     pem = read_limited(path, _MAX_OCTETS, "CA key", failure=VaultFailure)
     if _LABEL.encode() not in pem:
-        raise VaultFailure(f"{path} holds no encrypted private key in PEM.", hint="Give the file of the CA's export.")
+        raise VaultFailure(
+            f"{path} contains no encrypted private key in PEM format.", hint="Give the file that trust ca export wrote."
+        )
     _check_costs(path, pem)
     try:
         key = load_pem_private_key(pem, passphrase.encode("utf-8", "surrogateescape"))
     except (ValueError, TypeError):  # a wrong passphrase and a damaged file look alike
         raise WrongPassphrase(f"The passphrase does not open {path} (or it is damaged).", hint="Try again.") from None
     except Exception as error:  # the library names unsupported ciphers and curves by many classes
-        raise VaultFailure(f"{path} holds a key of a kind that this tool does not read.") from error
+        raise VaultFailure(f"{path} contains an unsupported kind of key.") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(key.curve, ec.SECP256R1):
-        raise VaultFailure(f"{path} holds no P-256 key.", hint="Give the file of the CA's export.")
+        raise VaultFailure(f"{path} contains no P-256 key.", hint="Give the file that trust ca export wrote.")
     return key.private_numbers().private_value.to_bytes(32, "big")
 
 
@@ -80,8 +82,8 @@ def _check_costs(path: Path, pem: bytes) -> None:
     rounds = _rounds(der[place + len(_PBKDF2) :]) if _PBES2 in der and place >= 0 else 0
     if not 0 < rounds <= MAX_ROUNDS:
         raise VaultFailure(
-            f"{path} is sealed in a way that this tool does not open.",
-            hint=f"Seal it with PBES2 and PBKDF2 of at most {MAX_ROUNDS:,} rounds: openssl pkcs8 -topk8 -v2 aes256",
+            f"{path} is encrypted in an unsupported way.",
+            hint=f"Encrypt it with PBES2 and PBKDF2 of at most {MAX_ROUNDS:,} rounds: openssl pkcs8 -topk8 -v2 aes256",
         )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 from teds_provision.errors import UsageFailure, VaultChanged, VaultFailure, WrongPassphrase
 from teds_provision.lazy import late
 from teds_provision.vault import agent
-from teds_provision.vault.base import Ask, Vault
+from teds_provision.vault.base import LAST_ATTEMPT, Ask, Vault
 from teds_provision.vault.hardening import harden
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
@@ -133,21 +133,21 @@ def _create(
     if keystore is not None and keystore.startswith("pkcs11:"):
         return pkcs11.Pkcs11Vault.create(
             home, store_id, keystore, ask, restored=restored, with_ca=with_ca
-        ), "the token was asked for"
+        ), "as requested"
     if keystore == "keyring":
-        return keyring_vault.KeyringVault.create(store_id, restored=restored), "the keyring was asked for"
+        return keyring_vault.KeyringVault.create(store_id, restored=restored), "as requested"
     if keystore == "file":
         vault = file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored)
-        return vault, "the passphrase file was asked for"
+        return vault, "as requested"
     if keystore is not None:
-        raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")
+        raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
     if (home / file_vault.FILE_NAME).exists():
         vault = file_vault.FileVault.create(home, store_id, ask, restored=restored)
-        return vault, "the passphrase file is already there"
+        return vault, "the passphrase file already exists"
     try:
-        return keyring_vault.KeyringVault.create(store_id, restored=restored), "a keyring works here"
+        return keyring_vault.KeyringVault.create(store_id, restored=restored), "an OS keyring is available"
     except VaultFailure as failure:
-        why = f"no keyring can be used: {failure.message}"
+        why = f"no OS keyring: {failure.message[:1].lower()}{failure.message[1:].rstrip('.')}"
     return file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
 
 
@@ -165,13 +165,13 @@ def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool
                 agent.lock(home)
                 raise
         return pkcs11.Pkcs11Vault.open(home, store_id, keystore, ask)
-    raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")
+    raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
 
 
 def _holding(pin: bytes, ask: Ask) -> Ask:
     """Give the PIN that is held, unless the token has one try left: that is for a person."""
 
     def give(prompt: str, confirm: bool) -> str:
-        return ask(prompt, confirm) if "the last try" in prompt else pin.decode()
+        return ask(prompt, confirm) if LAST_ATTEMPT in prompt else pin.decode()
 
     return give

@@ -121,7 +121,7 @@ class FileVault(SoftwareVault):
 
 def _another_passphrase() -> VaultChanged:
     return VaultChanged(
-        "Another command has set a new passphrase since this one asked; this one changed nothing.",
+        "Another command has changed the passphrase in the meantime; this one changed nothing.",
         hint="Run it again with the new passphrase.",
     )
 
@@ -132,7 +132,7 @@ def _material(plaintext: bytes) -> Material:
 
 def _require_store(content: dict[str, Any], store_id: str, path: Path) -> None:
     if content.get("store") != store_id:
-        raise VaultFailure(f"{path} belongs to another store.", hint="Restore the backup that holds both.")
+        raise VaultFailure(f"{path} belongs to another store.", hint="Restore a backup that contains both.")
 
 
 def _context(store_id: str) -> bytes:

@@ -91,14 +91,14 @@ class KeyringVault(SoftwareVault):
     def new_passphrase(self, ask: Ask) -> Callable[[], None]:
         """Refuse: the keyring asks for its own passphrase. Raises VaultFailure always."""
         raise VaultFailure(
-            f"The keyring has a passphrase of its own ({self.description}).",
+            f"The keyring has its own passphrase ({self.description}).",
             hint="Change it with the keyring's own program (Seahorse, KWallet manager, Keychain Access, passwd).",
         )
 
     def _load(self) -> Material:
         line = _get(self._name(), self._backend, self._entry)
         if line is None:
-            raise VaultFailure("The keyring has no entry for this station any more.", hint=_NO_ENTRY)
+            raise VaultFailure("The keyring no longer has an entry for this station.", hint=_NO_ENTRY)
         return Material.decode(line)
 
     def _save(self, material: Material) -> None:
@@ -128,7 +128,7 @@ def _viable() -> Iterator[tuple[str, KeyringBackend]]:
     configured = _configured()
     if configured not in (None, _CHAINER):
         if configured not in ALLOWED:
-            raise NoKeyring(f"The configured keyring {configured} may not hold a secret.", hint=_INSTEAD)
+            raise NoKeyring(f"The configured keyring {configured} is not suitable for secrets.", hint=_INSTEAD)
         names = [str(configured)]
     else:
         names = _candidates()
@@ -145,7 +145,7 @@ def _viable() -> Iterator[tuple[str, KeyringBackend]]:
             found = True
             yield name, backend
     if not found:
-        raise NoKeyring("This machine has no keyring that may hold a secret.", hint=_INSTEAD)
+        raise NoKeyring("This machine has no keyring that is suitable for secrets.", hint=_INSTEAD)
 
 
 def _candidates() -> list[str]:
@@ -190,7 +190,7 @@ def _set(name: str, backend: KeyringBackend, entry: str, line: str) -> None:
     _call(name, lambda: backend.set_password(SERVICE, entry, line))
     read = _get(name, backend, entry)
     if read is None or not secrets.compare_digest(read.encode(), line.encode()):
-        raise VaultFailure(f"The keyring ({ALLOWED[name]}) did not keep what it was given.", hint=_INSTEAD)
+        raise VaultFailure(f"The keyring ({ALLOWED[name]}) did not store the secret.", hint=_INSTEAD)
 
 
 def _get(name: str, backend: KeyringBackend, entry: str) -> str | None:
@@ -208,9 +208,9 @@ def _fail(name: str, error: Exception) -> NoReturn:
     from keyring.errors import InitError, KeyringLocked, NoKeyringError
 
     if isinstance(error, NoKeyringError):
-        raise NoKeyring("This machine has no keyring that may hold a secret.", hint=_INSTEAD) from error
+        raise NoKeyring("This machine has no keyring that is suitable for secrets.", hint=_INSTEAD) from error
     if isinstance(error, KeyringLocked | InitError):
-        raise VaultFailure(f"The keyring is locked, and nobody unlocked it ({ALLOWED[name]}).", hint=_UNLOCK) from error
+        raise VaultFailure(f"The keyring is locked and was not unlocked ({ALLOWED[name]}).", hint=_UNLOCK) from error
     raise VaultFailure(
         f"The keyring failed ({ALLOWED[name]}: {type(error).__name__}).", hint="Check that its service runs."
     ) from error

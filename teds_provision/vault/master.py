@@ -120,10 +120,10 @@ class Material:
             ca = None if content["ca"] is None else _octets(content["ca"])
             material = cls(_octets(content["identity"]), ca, MasterKeys(masters))
         except (ValueError, KeyError, TypeError, AttributeError, binascii.Error):
-            raise VaultFailure("The vault holds something that is not a station's keys.", hint=_DAMAGED) from None
+            raise VaultFailure("The vault contains something other than a station's keys.", hint=_DAMAGED) from None
         secrets = [material.identity, *masters.values(), *([] if ca is None else [ca])]
         if not masters or any(len(secret) != _SECRET_OCTETS for secret in secrets):
-            raise VaultFailure("The vault holds a station's keys in a damaged form.", hint=_DAMAGED)
+            raise VaultFailure("The station's keys in the vault are damaged.", hint=_DAMAGED)
         return material
 
 

@@ -79,7 +79,7 @@ class SealingKey:
                 "This Python's OpenSSL has no Argon2id.", hint="Install the wheel of cryptography from PyPI."
             ) from error
         except MemoryError as error:
-            raise VaultFailure(f"There is no memory for Argon2id ({costs.memory_kib} KiB).") from error
+            raise VaultFailure(f"Not enough memory for Argon2id ({costs.memory_kib} KiB).") from error
 
     def seal(self, plaintext: bytes, *, context: bytes) -> dict[str, Any]:
         """Return a JSON object that holds ``plaintext``, sealed and bound to ``context``."""
@@ -116,7 +116,7 @@ def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tup
     if opened is None:
         raise WrongPassphrase(
             "The passphrase does not open the sealed file, or the file was changed.",
-            hint="Try again; mind the keyboard layout.",
+            hint="Try again, and check the keyboard layout.",
         )
     return opened, key
 
@@ -140,7 +140,7 @@ def _parts(sealed: Mapping[str, Any]) -> tuple[Costs, bytes, bytes, bytes]:
     if not (
         known and costs.bounded() and 8 <= len(salt) <= 64 and len(nonce) == _NONCE_OCTETS and len(ciphertext) > 16
     ):
-        raise VaultFailure("What should be sealed under a passphrase is damaged.", hint="Restore a backup of it.")
+        raise VaultFailure("The data encrypted under a passphrase is damaged.", hint="Restore a backup of it.")
     return costs, salt, nonce, ciphertext
 
 

@@ -110,13 +110,13 @@ class Pkcs11Vault:
         """Refuse: a key made in a token never leaves it. Raises VaultFailure always."""
         raise VaultFailure(
             "The CA key is in the token and cannot leave it.",
-            hint="Keep the token itself away, or make the CA in another home with --keystore file.",
+            hint="Keep the token itself offline, or create the CA in another home with --keystore file.",
         )
 
     def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
         """Refuse: a key from a file was in the clear somewhere. Raises VaultFailure always."""
         raise VaultFailure(
-            "A CA key from a file cannot be put into a token.", hint="Use --keystore file in another home."
+            "A CA key from a file cannot be imported into a token.", hint="Use --keystore file in another home."
         )
 
     def drop_ca(self) -> bool:
@@ -165,7 +165,7 @@ class Pkcs11Vault:
             content, members = _load(self._home, self._store_id, self._session)
         if content.pins != self._content.pins:
             raise VaultChanged(
-                "Another command has set a new PIN since this one asked; this one changed nothing.",
+                "Another command has changed the PIN in the meantime; this one changed nothing.",
                 hint="Run it again with the new PIN.",
             )
         self._content, self._members = content, members
@@ -325,11 +325,11 @@ def _held(session: TokenSession, described: Any, role: str) -> TokenKey:
     if key is None:
         raise VaultFailure(
             f"The token {session.label!r} does not hold the {role} key {label!r}.",
-            hint="Plug in the token that was used at init; a key that was deleted there cannot be had back.",
+            hint="Plug in the token that was used at init; a key deleted there cannot be recovered.",
         )
     if key.point.hex() != point:
         raise VaultFailure(
-            f"The {role} key {label!r} in the token {session.label!r} is another one than at init.",
+            f"The {role} key {label!r} in the token {session.label!r} is not the one from init.",
             hint="Plug in the token that was used at init.",
         )
     return key
@@ -398,7 +398,7 @@ def _wait(descriptor: int) -> None:
         except BlockingIOError:
             if time.monotonic() > until:
                 raise VaultFailure(
-                    "Another teds-provision has been using the token for long.", hint="Wait for it, or end it."
+                    "Another teds-provision process is using the token.", hint="Wait for it to finish, or stop it."
                 ) from None
             time.sleep(_POLL_SECONDS)
         else:
@@ -420,5 +420,5 @@ def _folder() -> Path:
         said = error.strerror if isinstance(error, OSError) else error
         raise VaultFailure(
             f"The folder {parent / f'teds-provision-{user}'} cannot be used: {said}.",
-            hint="Remove it and run it again.",
+            hint="Remove it and run the command again.",
         ) from error

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from teds_provision.errors import BadData, VaultFailure, WrongPassphrase
 from teds_provision.lazy import how_to_install
 from teds_provision.protocol.keys import fingerprint, normalise_signature, public_key
-from teds_provision.vault.base import Ask
+from teds_provision.vault.base import LAST_ATTEMPT, Ask
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class TokenSession:
         guarded(lambda: self._generate(label, identifier), retry=False)
         key = self.find(label=label, identifier=identifier)
         if key is None:
-            raise VaultFailure("The token made a key and does not show it.", hint="Look at it with pkcs11-tool -O.")
+            raise VaultFailure("The token created a key but does not show it.", hint="Inspect it with pkcs11-tool -O.")
         return key
 
     def destroy(self, key: TokenKey) -> None:
@@ -133,7 +133,7 @@ class TokenSession:
             ) from None
         except (exceptions.PinInvalid, exceptions.PinLenRange):
             raise VaultFailure(
-                f"The token {self.label!r} does not take this as a new PIN.", hint="Mind its length and its characters."
+                f"The token {self.label!r} does not accept this as a new PIN.", hint="Check its length and characters."
             ) from None
         except exceptions.PKCS11Error as error:
             raise _failure(error) from error
@@ -180,14 +180,15 @@ class TokenSession:
             return None
         if len(found) > 1:
             raise VaultFailure(
-                f"{len(found)} keys of the token {self.label!r} fit.", hint="Name one by object= and id= in the URI."
+                f"{len(found)} keys of the token {self.label!r} match.",
+                hint="Select one by object= and id= in the URI.",
             )
         key = found[0]
         assert isinstance(key, TokenObject)
         if not key[Attribute.SENSITIVE] or key[Attribute.EXTRACTABLE]:
             raise VaultFailure(
-                f"The key {key.label!r} may leave the token {self.label!r}, so it is not used.",
-                hint="Let teds-provision make one: name no object or id, or new ones.",
+                f"The key {key.label!r} can leave the token {self.label!r}, so it is not used.",
+                hint="Let teds-provision create one: give no object or id, or new ones.",
             )
         return TokenKey(key, self._point(key), key.label, key.id)
 
@@ -210,7 +211,7 @@ class TokenSession:
             return point
         raise VaultFailure(
             f"The token {self.label!r} shows no public key beside {key.label!r}.",
-            hint="Load the public key with the same label and id, with the tool of the token's maker.",
+            hint="Load the public key with the same label and id, using the vendor's tool.",
         )
 
 
@@ -238,7 +239,7 @@ def find_token(uri: Pkcs11Uri) -> Token:
             f"There is no {uri} here.", hint="Plug it in; pkcs11-tool --module MODULE -L (opensc) lists the tokens."
         )
     if len(tokens) > 1:
-        raise VaultFailure(f"{len(tokens)} tokens fit the URI.", hint="Add serial= or slot-id= to it.")
+        raise VaultFailure(f"{len(tokens)} tokens match the URI.", hint="Add serial= or slot-id= to it.")
     if tokens[0].flags & pkcs11.TokenFlag.USER_PIN_LOCKED:
         raise _locked(uri)
     return tokens[0]
@@ -263,7 +264,7 @@ def log_in(token: Token, uri: Pkcs11Uri, pin: str | None, *, write: bool) -> Tok
             raise _locked(uri) from None
         raise WrongPassphrase(
             f"The PIN of the {uri} is wrong. {_tries(flags)}",
-            hint="Run it again with the right PIN; nothing is retried.",
+            hint="Run it again with the right PIN; it is not retried automatically.",
         ) from None
     except exceptions.PinLocked:
         raise _locked(uri) from None
@@ -280,7 +281,7 @@ def ask_pin(token: Token, uri: Pkcs11Uri, ask: Ask) -> str | None:
 
     if token.flags & TokenFlag.PROTECTED_AUTHENTICATION_PATH:
         return None
-    last = " (the last try before it locks)" if token.flags & TokenFlag.USER_PIN_FINAL_TRY else ""
+    last = f" ({LAST_ATTEMPT})" if token.flags & TokenFlag.USER_PIN_FINAL_TRY else ""
     return ask(f"PIN of the {uri}{last}", False)
 
 
@@ -317,15 +318,15 @@ def _tries(flags: int) -> str:
     from pkcs11 import TokenFlag
 
     if flags & TokenFlag.USER_PIN_FINAL_TRY:
-        return "One try is left before the token locks."
+        return "One attempt is left before the token locks."
     if flags & TokenFlag.USER_PIN_COUNT_LOW:
-        return "The token has counted a wrong try and does not say how many are left."
-    return "The token does not say how many tries are left."
+        return "The token has counted a wrong attempt and does not say how many are left."
+    return "The token does not say how many attempts are left."
 
 
 def _locked(uri: Pkcs11Uri) -> VaultFailure:
     return VaultFailure(
-        f"The PIN of the {uri} is locked after too many wrong tries: none is left.",
+        f"The PIN of the {uri} is locked after too many wrong attempts.",
         hint="Set a new PIN with the security officer's PIN, with the token's own tool.",
     )
 

@@ -34,13 +34,13 @@ class Pkcs11Uri:
         """
         scheme, colon, rest = text.partition(":")
         if scheme.lower() != "pkcs11" or not colon:
-            raise UsageFailure("A token is named by a URI that starts with pkcs11:.", hint=_EXAMPLE)
+            raise UsageFailure("A token is given as a URI that starts with pkcs11:.", hint=_EXAMPLE)
         path, _, query = rest.partition("?")
         found = _attributes(path, ";") | {f"?{name}": value for name, value in _attributes(query, "&").items()}
         _refuse(found)
         module = found.pop("?module-path", None)
         if module is None:
-            raise UsageFailure("The PKCS #11 URI names no module (module-path).", hint=_EXAMPLE)
+            raise UsageFailure("The PKCS #11 URI has no module-path.", hint=_EXAMPLE)
         unknown = ", ".join(name.removeprefix("?") for name in found.keys() - _PATH)
         if unknown:
             raise UsageFailure(f"This tool does not know the PKCS #11 URI attribute {unknown}.", hint=_EXAMPLE)
@@ -78,17 +78,17 @@ def _refuse(found: dict[str, bytes]) -> None:
     if any(name.removeprefix("?") in _SECRETS for name in found):
         raise UsageFailure(
             "A PKCS #11 URI may not hold a PIN or say where one lies.",
-            hint="Leave pin-value and pin-source out: the PIN is asked for, or read with --passphrase-fd.",
+            hint="Remove pin-value and pin-source: you are asked for the PIN, or pass it with --passphrase-fd.",
         )
     if "?module-name" in found:
-        raise UsageFailure("Name the module by its path (module-path), not by module-name.", hint=_EXAMPLE)
+        raise UsageFailure("Use module-path, not module-name.", hint=_EXAMPLE)
 
 
 def _number(name: str, octets: bytes | None) -> int | None:
     if octets is None:
         return None
     if not octets.isdigit():
-        raise UsageFailure(f"The {name} of the PKCS #11 URI is no number.")
+        raise UsageFailure(f"The {name} of the PKCS #11 URI is not a number.")
     return int(octets)
 
 

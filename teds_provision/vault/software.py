@@ -55,7 +55,9 @@ class SoftwareVault(ABC):
         Raises VaultFailure: no CA key here, weak passphrase, the file exists or cannot be written.
         """
         if self._material.ca is None:
-            raise VaultFailure("This vault holds no CA key.", hint="It was exported and dropped, or never made here.")
+            raise VaultFailure(
+                "This vault does not contain a CA key.", hint="It was exported and dropped, or never created here."
+            )
         ca_file.write_ca(path, self._material.ca, passphrase)
 
     def drop_ca(self) -> bool:
@@ -74,7 +76,7 @@ class SoftwareVault(ABC):
         secret = ca_file.read_ca(path, passphrase)
         self.refresh()
         if self._material.ca not in (None, secret):
-            raise VaultFailure("This vault holds another CA key.", hint="Export and drop that one first.")
+            raise VaultFailure("This vault contains a different CA key.", hint="Export and drop that one first.")
         if self._material.ca is None:
             self._replace(self._material.with_ca(secret))
         return SoftwareKey.from_secret(secret)

@@ -66,7 +66,7 @@ def test_a_backup_that_does_not_open_again_is_not_kept(
     station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("teds_provision.backup.sealed_file.MAX_OCTETS", 1000)
-    with pytest.raises(StoreFailure, match="does not open again"):
+    with pytest.raises(StoreFailure, match="cannot be opened"):
         back_up(station, tmp_path / "b")
     assert list(tmp_path.glob("*b")) == []
     assert station.audit_log.check().count == 1 + 1  # init and ready

@@ -151,7 +151,7 @@ def test_a_reply_that_is_torn_each_time_is_the_nodes_fault(station: Station, via
     class Torn(FaultyLink):
         def exchange(self, frame: bytes) -> bytes:
             if frame[2:4] == bytes([128, 99]):
-                raise Garbled("The node asks for the same pieces again and again.")
+                raise Garbled("The node keeps asking for the same pieces.")
             return super().exchange(frame)
 
     report = check_node(station, talk(board := Board(), Torn(board, via=via)))
@@ -278,7 +278,7 @@ def test_a_node_that_falls_silent_loses_no_report(station: Station, via: str) ->
     def hangs(board: Board, octets: bytes, reference: faulty.Next) -> bytes:
         if board.max_message == 0 or octets[2:] == bytes([1, 1, 0, 1, 128]):
             board.max_message = 0
-            raise NodeSilent("The node does not answer any more.")
+            raise NodeSilent("The node no longer answers.")
         return reference(octets)
 
     report = checked(station, Board(), fault=hangs, via=via)

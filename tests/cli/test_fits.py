@@ -51,7 +51,7 @@ def test_each_known_node_is_judged_by_its_datasheet(known: Path) -> None:
         "channel": None,
         "name": "",
         "result": "skipped",
-        "why": "its datasheet is not known here.",
+        "why": "its datasheet is unknown here.",
     }
 
 

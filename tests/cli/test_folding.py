@@ -32,12 +32,19 @@ def terminal(columns: int) -> Iterator[TextIO]:
 
 def test_an_error_and_its_hint_are_broken_between_words(home: Path) -> None:
     """A word in the middle of a line went on in the next one."""
-    words = ("provision", "--watch", "--name", "the same name for every board", "--profile", "load-cell")
+    words = (
+        "provision",
+        "--watch",
+        "--name",
+        "the same name for every board of this long watch",
+        "--profile",
+        "load-cell",
+    )
     lines = on_terminal(home, *words, columns=COLUMNS).screen.splitlines()
     assert lines[0].startswith("Error: Every node would get the name")
     assert len(lines) > 2, lines
     assert max(map(len, lines)) <= COLUMNS, lines
-    assert "Put {uuid} or {n} into --name, or say which board gets which in a sheet: --batch FILE." in " ".join(
+    assert "Use {uuid} or {n} in --name, or list the boards in a sheet: --batch FILE." in " ".join(
         line.strip() for line in lines
     )
 

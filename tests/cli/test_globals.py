@@ -97,7 +97,7 @@ def test_a_mistyped_command_is_usage_with_the_nearest_one(tmp_path: Path) -> Non
         (["nodes", "--nonsense"], 2, "usage"),
         (["sign", ONE], 6, "not-whitelisted"),
         (["agree", ONE], 6, "not-whitelisted"),
-        (["backup", "b"], 7, "wrong-passphrase"),
+        (["backup", "b"], 7, "no-passphrase"),
         (["doctor", "--can", "nonsense"], 5, ""),
     ],
 )

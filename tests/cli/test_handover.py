@@ -388,7 +388,7 @@ BAD: dict[str, tuple[Callable[[Forger], bytes], int, str]] = {
     "a private key": (lambda f: to_pem(f.receiver).encode().replace(b"PUBLIC", b"PRIVATE"), 8, ""),
     "nested JSON": (_bomb, 8, ""),
     "a move to two": (lambda f: f.members(mode="move", to=[*f.good.to, "ab" * 32]), 6, "exactly one receiver"),
-    "no signature of the CA": (lambda f: f.sealed(station_signatures={}), 6, "brings no signature of the CA"),
+    "no signature by CA": (lambda f: f.sealed(station_signatures={}), 6, "has no signature by CA"),
     "a wrong signature of the CA": (
         lambda f: f.members(station_signatures={f.good.to[0]: base64url(f.sender.sign(b"no")).decode()}), 4,
         "does not verify"),
@@ -411,7 +411,7 @@ def test_a_replayed_id(homes: Homes, forger: Forger) -> None:
     homes.run(homes.south, "import-keys", forger.file(forger.sealed()), "--yes")
     (homes.folder / "bad.jwe.receipt").unlink()
     path = forger.file(forger.sealed(nodes=(forger.node(3),)))
-    assert "replayed or forged" in homes.refused(6, "import-keys", path, "--yes")["message"]
+    assert "a replay or a forgery" in homes.refused(6, "import-keys", path, "--yes")["message"]
 
 
 def test_an_older_epoch(homes: Homes, forger: Forger) -> None:

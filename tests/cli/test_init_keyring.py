@@ -52,7 +52,7 @@ say(made=made, again=again, doctor=doctor, backup=backup)
 """,
     )
     (code, made), (_, again) = said["made"], said["again"]
-    assert (code, made["keystore"], made["why"]) == (0, "keyring", "a keyring works here")
+    assert (code, made["keystore"], made["why"]) == (0, "keyring", "an OS keyring is available")
     assert again == made
     results = {check["name"]: check["result"] for check in said["doctor"][1]["checks"]}
     assert (said["doctor"][0], results["keyring"], results["vault"]) == (0, "ok", "ok")

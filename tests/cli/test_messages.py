@@ -33,7 +33,7 @@ UUID = "8d4d9da65281f7000000"
         (["verify", "none.json"], 3, "There is no file none.json", ""),
         (["sign", "none.json"], 3, "There is no file none.json", ""),
         (["show", "none.json"], 3, "There is no file", ""),
-        (["verify", "hello.txt"], 8, "hello.txt is no TEDS image", "build, sign and read"),
+        (["verify", "hello.txt"], 8, "hello.txt is not a TEDS image", "build, sign and read"),
         (["show", "hello.txt"], 8, "hello.txt holds no TEDS", "Intel HEX"),
         (["import-keys", "hello.txt"], 8, "hello.txt is not a handover bundle", "export-keys"),
         (["import-keys", "some.json"], 8, "some.json is not a handover bundle", "export-keys"),
@@ -41,15 +41,15 @@ UUID = "8d4d9da65281f7000000"
         (["identify", "--timeout", "abc"], 2, "'abc' is not a number of seconds", ""),
         (["identify", "--nfc", "tty:NONE7:pn532", "--timeout", "1"], 5, "serial line tty:NONE7", "ls /dev/ttyUSB*"),
         (["provision", "--report", "x.pdf", "--batch", "hello.txt"], 2, "neither CSV nor HTML", "FILE.html"),
-        (["provision", "--batch", "hello.txt"], 8, "hello.txt:1: there is no column 'hello'", "Mend the sheet"),
+        (["provision", "--batch", "hello.txt"], 8, "hello.txt:1: there is no column 'hello'", "Fix the sheet"),
         (["provision", "--name", "", "-p", "load-cell"], 2, "A name has 1 to 120 octets", ""),
         (["provision", "--name", "a\nb", "-p", "load-cell"], 2, "A name is one line of printable characters", ""),
         (["handover", "receipt", "hello.txt"], 8, "hello.txt is not a receipt", "import-keys"),
-        (["whitelist", "import", "empty"], 8, "empty is empty: it lists no node", "CSV"),
-        (["verify", "empty"], 8, "empty is no TEDS image: The TEDS image is empty", "build, sign and read"),
-        (["verify", "octets"], 8, "octets is no TEDS image: The TEDS image is no text", "build, sign and read"),
+        (["whitelist", "import", "empty"], 8, "empty is empty.", "CSV"),
+        (["verify", "empty"], 8, "empty is not a TEDS image: The TEDS image is empty", "build, sign and read"),
+        (["verify", "octets"], 8, "octets is not a TEDS image: The TEDS image is not text", "build, sign and read"),
         (["sign", "folder"], 3, "folder is a folder", ""),
-        (["verify", "/dev/null"], 3, "/dev/null is no regular file", ""),
+        (["verify", "/dev/null"], 3, "/dev/null is not a regular file", ""),
         (["nodes", "--due", "soon"], 2, "'soon' is not a whole number", ""),
         (["write", "8d4d", "--from", "last"], 2, "'last' is not a whole number", ""),
         (["init", "--name", "another"], 2, "already holds a station", "--name"),
@@ -81,7 +81,7 @@ def test_a_second_init_that_asks_for_the_same_shows_it(home: Path) -> None:
 
 def test_a_kernel_without_can_is_called_that(monkeypatch: pytest.MonkeyPatch) -> None:
     for number, said, cure in (
-        (errno.EAFNOSUPPORT, "This kernel has no CAN.", "modprobe can_raw"),
+        (errno.EAFNOSUPPORT, "This kernel has no CAN support.", "modprobe can_raw"),
         (errno.ENODEV, "There is no CAN interface can7.", "ip -brief link"),
     ):
 
@@ -108,7 +108,7 @@ def test_another_board_on_the_reader_is_named(tmp_path: Path) -> None:
         port.close()
     finally:
         desk.clear()
-    assert f"Node {node.uuid} lies on the reader" in told.value.message
+    assert f"Node {node.uuid} is on the reader" in told.value.message
     assert "flat" not in told.value.hint
 
 

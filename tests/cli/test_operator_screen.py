@@ -104,7 +104,7 @@ def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> Non
 
 def test_the_worst_board_of_many_fits_on_24_lines_with_its_cause_and_cure() -> None:
     terminal = Terminal(Batch(passed=48, next_row=row(1)))
-    error = NodeSilent("The node does not answer any more. " * 9, hint="Put it back, and hold it flat.")
+    error = NodeSilent("The node no longer answers. " * 9, hint="Put it back, and hold it flat.")
     for number in range(1, 8):
         terminal.screen.ended(failed(number, error))
     lines = terminal.lines

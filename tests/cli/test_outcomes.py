@@ -103,11 +103,11 @@ def test_a_step_that_ended_with_its_board_is_not_shown_while_the_next_one_is_wai
     reporter = LiveReporter(App())
     reporter.started("whitelist")
     reporter.notice(Notice("node-left", "Node 8d4d was taken off the reader."))
-    reporter.notice(Notice("waiting", "Hold a node to the reader."))
+    reporter.notice(Notice("waiting", "Place a node on the reader."))
     shown = reporter._render()
     reporter.close()
     assert isinstance(shown, Spinner)
-    assert str(shown.text) == "Hold a node to the reader."
+    assert str(shown.text) == "Place a node on the reader."
 
 
 @pytest.mark.parametrize("ended", [KeyboardInterrupt, click.Abort])

@@ -158,7 +158,7 @@ def test_pcscd_is_a_trouble_only_beside_a_reader(system: System) -> None:
     assert [finding.result for finding in look(system, "nfc readers")] == ["skipped", "ok"]
     plug_in(system, 0x072F, 0x2200, driver="usbfs")
     reader, pcscd = look(system, "nfc readers")
-    assert "held by another program" in reader.why
+    assert "in use by another program" in reader.why
     assert (pcscd.result, "systemctl stop pcscd" in pcscd.fix) == ("warning", True)
 
 
@@ -181,7 +181,7 @@ def test_serial_ports_are_listed(system: System) -> None:
     ("path", "words"),
     [
         ("udp:10.0.0.1:54321", "loopback"),
-        ("nonsense", "not the path of a reader"),
+        ("nonsense", "is not a reader"),
         ("tty:NONE7:pn532", ""),
     ],
 )
@@ -265,7 +265,7 @@ def test_a_clock_that_went_back_is_told(stationed: System, monkeypatch: pytest.M
     with Store.open(stationed.home) as store:
         store.audit.append("test", None, "done")
     (clock,) = look(stationed, "clock")
-    assert (clock.result, "before the last entry" in clock.why) == ("failed", True)
+    assert (clock.result, "before the last audit log entry" in clock.why) == ("failed", True)
 
 
 @pytest.mark.parametrize(("ahead", "result"), [(0, "ok"), (86_000, "warning")])
@@ -330,9 +330,11 @@ def test_who_holds_the_store_is_named(stationed: System) -> None:
     with StoreLock(stationed.home, command="provision"):
         lock = next(one for one in look(stationed, "store") if one.name == "lock")
     assert lock.result == "warning"
-    assert re.fullmatch(rf"The store is held by pid {os.getpid()} \(provision\) since [0-9T:-]+Z\.", lock.why), lock.why
+    assert re.fullmatch(rf"The store is locked by pid {os.getpid()} \(provision\) since [0-9T:-]+Z\.", lock.why), (
+        lock.why
+    )
     lock = next(one for one in look(stationed, "store") if one.name == "lock")
-    assert (lock.result, lock.why) == ("ok", "Nobody holds the store.")
+    assert (lock.result, lock.why) == ("ok", "The store is not locked.")
 
 
 def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: System) -> None:
@@ -445,7 +447,7 @@ def test_what_waits_for_somebody_is_told(stationed: System) -> None:
     said = [finding.why for finding in look(stationed, "nodes")]
     counts = [why.split()[0] for why in said]
     assert counts == ["3", "2", "1", "1", "1"]
-    for why, word in zip(said, ("ended", "name", "not written", "never verified", "rotated"), strict=True):
+    for why, word in zip(said, ("expired", "name", "not written", "never verified", "rotated"), strict=True):
         assert word in why
 
 

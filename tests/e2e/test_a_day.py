@@ -281,7 +281,7 @@ def test_every_whitelisted_node_of_a_bus_is_brought_up_at_once(desk: Desk, stati
     assert list(station.run(*words).json) == ["totals"], "the finished ones are left alone"
 
 
-@pytest.mark.needs("a datasheet of its own")
+@pytest.mark.needs("its own datasheet")
 def test_of_many_on_a_bus_each_line_names_its_node_and_one_without_the_calibration_of_its_type_does_not_pass(
     desk: Desk, station: Station
 ) -> None:

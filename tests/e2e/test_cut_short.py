@@ -178,7 +178,7 @@ def test_ctrl_c_ends_at_once_and_loses_nothing(station: Station, node: Node, mom
 def test_ctrl_c_while_waiting_for_a_node(station: Station, node: Node) -> None:
     before = station.tables()
     command = start(station, "nfc")
-    command.wait_for("Hold the node")
+    command.wait_for("Place the node")
     command.signal(signal.SIGINT)
     assert command.end(40).code == 130, "and not after the 55 s for which it waits"
     assert station.tables() == before

@@ -68,3 +68,6 @@ def test_an_empty_bus_is_told_with_the_time_that_was_listened(station: Station) 
     said = station.run("identify", "--can", bus, "--timeout", "1.5")
     assert f"No node answered on {bus.partition(chr(63))[0]} within 1.5 s" in said.err
     assert "up to 0 s" not in said.err
+    hint = said.err.partition("→ ")[2]
+    assert "bit rate" in hint
+    assert "identify" not in hint, "that is what was just run"

@@ -95,7 +95,7 @@ def test_a_file_that_is_there_is_refused_before_anything_is_waited_for(desk: Des
     station, file = desk.station(), tmp_path / "t.trace"
     file.write_text("mine")
     said = station.refuses("identify", *desk.links.over("nfc"), "--trace", file, code=2)
-    assert "exists already" in said["message"]
+    assert "already exists" in said["message"]
     assert file.read_text() == "mine"
     said = station.refuses("identify", *desk.links.over("nfc"), "--trace", tmp_path / "no" / "t", code=3)
     assert "folder" in said["message"]

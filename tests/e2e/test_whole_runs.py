@@ -214,7 +214,7 @@ def test_a_fresh_home_needs_only_init(desk: Desk, tmp_path: Path) -> None:
     assert (told["uuid"], told["verdict"], told["state"]) == (node.uuid, "authentic", "provisioned")
 
 
-@pytest.mark.needs("a datasheet of its own")
+@pytest.mark.needs("its own datasheet")
 def test_the_summary_tells_limits_and_readings_in_one_unit(station: Station, desk: Desk, tmp_path: Path) -> None:
     node = desk.node("hand", type_="gripper").start()
     file = tmp_path / "hand.csv"

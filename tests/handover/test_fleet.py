@@ -88,9 +88,9 @@ def test_until_it_is_certified_a_station_does_nothing(tmp_path: Path) -> None:
     home = tmp_path / "east"
     first = request(home, "east")
     assert read_request(request(home, "other name")) == read_request(first)
-    with pytest.raises(NotFound, match="waits for the certificate"):
+    with pytest.raises(NotFound, match="waiting for its CA's certificate"):
         Station.open(home, ask=ask)
-    with pytest.raises(NotFound, match="waits for the certificate"):
+    with pytest.raises(NotFound, match="waiting for its CA's certificate"):
         initialise(home, name=None, keystore="file", ask=ask)
 
 
@@ -113,7 +113,7 @@ def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
     provisioned(one, board)
     other.pins.put(WhitelistEntry(board.uuid))
     before, asked = board.state, list[str]()
-    with talk(board) as node, pytest.raises(PolicyRefused, match="lock out whoever holds it"):
+    with talk(board) as node, pytest.raises(PolicyRefused, match="lock out the current holder"):
         agree(other, node, identify(other, node))
 
     def no(question: str) -> None:
@@ -122,7 +122,7 @@ def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
     for rotate in (False, True):
         with talk(board) as node, pytest.raises(PolicyRefused, match="You said no"):
             agree(other, node, identify(other, node), rotate=rotate, take_over=no)
-    with pytest.raises(PolicyRefused, match="lock out whoever holds it"):
+    with pytest.raises(PolicyRefused, match="lock out the current holder"):
         provisioned(other, board)
     assert (board.state, other.keys.held(board.uuid)) == (before, False)
     with talk(board) as node:
@@ -142,7 +142,7 @@ def test_a_node_that_calls_itself_new_and_shows_a_signed_datasheet_is_not_taken_
     before = board.state
     with talk(board) as node:
         who = replace(identify(other, node), state=NodeState.FACTORY)  # Identify is a hint: anyone may have sent it
-        with pytest.raises(PolicyRefused, match="lock out whoever holds it"):
+        with pytest.raises(PolicyRefused, match="lock out the current holder"):
             agree(other, node, who)
     assert (board.state, other.keys.held(board.uuid)) == (before, False)
 
@@ -170,12 +170,15 @@ def test_the_station_that_was_locked_out_is_told_of_a_tap_elsewhere_and_then_who
     other.pins.put(WhitelistEntry(board.uuid))
     with talk(board) as node:
         agree(other, node, identify(other, node), rotate=True)
-    for words in ("epoch as 2, after 1 here: agreed elsewhere, at a tap", "who did shows when that station signs"):
+    for words in (
+        "epoch 2, after 1 here: keyed elsewhere by tap",
+        "which station did so will show once it signs",
+    ):
         with pytest.raises(PolicyRefused, match=words):
             session(one, board)
         assert words in why_unproven(one, board)
     assert provisioned(other, board).verified.verdict == "authentic"
-    signed = f"signed by station {other.fingerprint[:16]}, which a CA of yours certified"
+    signed = f"signed by station {other.fingerprint[:16]}, which your CA certified"
     with pytest.raises(PolicyRefused, match=signed):
         session(one, board)
     trust(one, other)
@@ -341,6 +344,6 @@ def test_the_ca_key_is_kept_away_and_brought_back(tmp_path: Path, owner: Station
     fleet.import_ca(owner, owner.vault, path, "a long enough passphrase")
     assert fleet.require_ca(owner).point == owner.ca
     other = make_station(tmp_path / "other", "other")
-    with pytest.raises(PolicyRefused, match="another CA key"):
+    with pytest.raises(PolicyRefused, match="a CA key other than"):
         fleet.import_ca(other, other.vault, path, "a long enough passphrase")
     other.close()

@@ -135,7 +135,7 @@ def test_a_far_jump_of_the_sequence_needs_a_persons_word(pair: Pair) -> None:
 def test_a_station_that_never_had_the_node_lifts_no_tombstone(pair: Pair, west: Station, mode: Mode) -> None:
     before = node_of(pair.board)
     pair.take(pair.export("move")[0])
-    with pytest.raises(PolicyRefused, match="alone can move it back"):
+    with pytest.raises(PolicyRefused, match="only that station can move it back"):
         plan_import(pair.north, forged(west, pair.north, before, mode=mode))
     with pytest.raises(PolicyRefused, match="was moved"):
         session(pair.north, pair.board)
@@ -149,7 +149,7 @@ def test_a_node_that_comes_back_is_rotated_and_the_plan_says_so(pair: Pair) -> N
     export_bundle(pair.south, plan, back)
     shown = plan_import(pair.north, back.read_bytes())
     assert isinstance(shown, ImportPlan)
-    assert shown.nodes[0].notes == ("it comes back: its key is rotated at the first contact",)
+    assert shown.nodes[0].notes == ("it is returning: its key is rotated at the first contact",)
     import_bundle(pair.north, shown)
     assert pair.north.keys.rotation_due(pair.board.uuid) is not None
     assert session(pair.north, pair.board) == 3
@@ -234,7 +234,7 @@ def test_trust_that_is_removed_ends_with_all_that_hung_on_it(pair: Pair) -> None
     assert shown.bans == (pair.board.uuid,)
     assert remove(pair.south, north) == shown
     assert pair.north.ca not in pair.south.policy.trusted_cas(pair.board.uuid)
-    assert "trusted no more" in (pair.south.keys.rotation_due(pair.board.uuid) or "")
+    assert "no longer trusted" in (pair.south.keys.rotation_due(pair.board.uuid) or "")
     assert pair.south.policy.revocation(pair.board.uuid) is None
     trust(pair.south, pair.north)
     assert pair.north.ca not in pair.south.policy.trusted_cas(pair.board.uuid)  # a person compared a station, not a CA

@@ -172,7 +172,7 @@ def test_a_move_under_way_is_not_sealed_again_with_a_node_that_was_revoked_or_fo
     if revoked:
         pair.north.policy.deny(RevocationRecord(pair.board.uuid, None, "lost", "a statement"))
     pair.north.keys.remove(pair.board.uuid)
-    with pytest.raises(PolicyRefused, match="is revoked" if revoked else "no key of it is held here") as refused:
+    with pytest.raises(PolicyRefused, match="is revoked" if revoked else "this station holds no key for it") as refused:
         plan_export(pair.north, ExportOrder((pair.south.name,), None, "move"))
     assert "handover undo" in (refused.value.hint or "")
 

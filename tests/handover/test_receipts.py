@@ -95,11 +95,11 @@ def test_an_undone_move_that_was_imported_all_the_same(pair: Pair) -> None:
 
 def test_what_cannot_be_undone(pair: Pair) -> None:
     _, copied = pair.export("copy")
-    with pytest.raises(PolicyRefused, match="copy cannot be taken back"):
+    with pytest.raises(PolicyRefused, match="copy cannot be undone"):
         undo(pair.north, find_handover(pair.north, copied.plan.id))
     path, moved = pair.export("move")
     close(pair.north, pair.take(path).receipt)
-    with pytest.raises(PolicyRefused, match="receipt of this move came"):
+    with pytest.raises(PolicyRefused, match="receipt of this move has arrived"):
         undo(pair.north, find_handover(pair.north, moved.plan.id))
     with pytest.raises(NotFound):
         find_handover(pair.north, "ffffffff")

@@ -65,7 +65,7 @@ def test_a_topic_drives_an_actuator_until_it_falls_silent(bench: Bench, master: 
     until(lambda: (process.read(0.1), process.out.count('"safe": true') > before)[1])
     too_far = publish(master, rate, 5.0)
     try:
-        running.wait_for("beyond the limits")
+        running.wait_for("exceeds the limits")
     finally:
         too_far.kill()
         too_far.wait()

@@ -97,7 +97,7 @@ def measured_together(hall: Hall, file: Path) -> dict[str, Seen]:
 
 def _all_told(text: str, forgetful: str) -> bool:
     """Whether what takes its time has happened: one is lost, the lying clock told, the forgetful one is back."""
-    told = all(words in text for words in ("No message of the node came", "its clock lies", "not authentic"))
+    told = all(words in text for words in ("No message from the node", "its clock is inconsistent", "not authentic"))
     return told and states(of_node(text, forgetful)).count("running") >= 2
 
 
@@ -183,7 +183,7 @@ def test_a_node_whose_samples_fall_behind_is_not_believed(seen: dict[str, Seen])
 @pytest.mark.parametrize("fault", ["jumping_clock", "backward_clock"])
 def test_a_clock_that_contradicts_itself_is_told_and_its_data_claim_no_bound(seen: dict[str, Seen], fault: str) -> None:
     one = seen[fault]
-    assert "its clock lies" in one.told
+    assert "its clock is inconsistent" in one.told
     assert one.data[-1]["clock_error"] is None, "data of a clock that lies are marked (operation.md section 5)"
     assert seen["good"].data[-1]["clock_error"] is not None
 
@@ -223,7 +223,7 @@ def test_what_the_node_calls_invalid_has_no_value(seen: dict[str, Seen]) -> None
 def test_a_node_that_falls_silent_is_lost_and_told(seen: dict[str, Seen]) -> None:
     one = seen["falls_silent"]
     assert "lost" in one.states
-    assert "No message of the node came" in one.told
+    assert "No message from the node" in one.told
 
 
 def test_a_node_that_lost_its_sessions_is_measured_on(seen: dict[str, Seen]) -> None:

@@ -36,10 +36,10 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
         (("measure", g, "--to", tmp_path / "no" / "run.csv", "--duration", "1"), 3, "its folder is not there"),
         (("measure", g, "--require", nothing), 8, "asks for nothing"),
         (("set", g, "x", "1"), 2, "not a channel number"),
-        (("set", g, "1", "-0.5"), 6, "beyond the limits"),  # a value, and no option
+        (("set", g, "1", "-0.5"), 6, "exceeds the limits"),  # a value, and no option
         (("set", g, "1", "0.05", "--hodl", "3"), 2, "--hodl"),
-        (("set", g, "2", "1", "--hold", "0.1"), 8, "no actuator"),
-        (("set", g, "1", "1", "--unit", "kelvin"), 8, "no unit of channel 1"),
+        (("set", g, "2", "1", "--hold", "0.1"), 8, "not an actuator"),
+        (("set", g, "1", "1", "--unit", "kelvin"), 8, "not a unit for channel 1"),
         (("sample", g, "x"), 2, "not a channel number"),
     ]
     wrong = []
@@ -67,9 +67,9 @@ def test_a_broker_that_is_not_there_is_told_and_what_it_cost(hall: Hall) -> None
     lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place, code=5)
     told = next(line for line in lines if line["event"] == "sink")
     assert (told["state"], told["sink"]) == ("waiting", place)
-    assert "nobody listens at 127.0.0.1" in told["why"]
+    assert "nothing is listening at 127.0.0.1" in told["why"]
     assert lines[-1]["error"]["code"] == "link"
-    assert "took nothing: nobody listens at 127.0.0.1" in lines[-1]["error"]["message"]
+    assert "accepted nothing: nothing is listening at 127.0.0.1" in lines[-1]["error"]["message"]
     [sink] = lines[-1]["sinks"]
     assert (sink["written"], sink["dropped"] > 0) == (0, True)
     assert of(lines, channel=2), "the measurement goes on"

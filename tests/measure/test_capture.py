@@ -65,7 +65,7 @@ def test_a_restless_sensor_and_one_at_the_wrap_of_its_raw_values_give_no_point(
     hall: Hall, angle: Shaft, tmp_path: Path
 ) -> None:
     file = tmp_path / "joint.csv"
-    for far, said in ((5, "raw values begin anew"), (4000, "too restless")):
+    for far, said in ((5, "wrap of its raw values"), (4000, "not steady")):
         about = 0 if far == 5 else 20_000
         running = hall.station.start(
             *("--json", "calibrate", "capture", "angle", 1, "--reference", 0, "--to", file, "--can", hall.can)

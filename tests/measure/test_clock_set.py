@@ -77,7 +77,7 @@ def notes(path: Path) -> list[str]:
             return [one.metadata["note"] for one in make_reader(file).iter_metadata() if one.name == "note"]
     if path.suffix == ".jsonl":
         return [line["why"] for line in events(path.read_text()) if line["event"] == "note"]
-    return [line for line in path.read_text().splitlines() if "clock was put" in line]
+    return [line for line in path.read_text().splitlines() if "clock was set" in line]
 
 
 def wait_for_data(running: Running, more: int = 5) -> None:
@@ -132,7 +132,7 @@ def test_the_daemon_follows_it_too(hall: Hall, clock: SystemClock, tmp_path: Pat
         asked.request("POST", "/measurements", {"uuids": [hall.nodes["a"].uuid], "rate": 20, "sinks": ["mine.csv"]})
         until(lambda: asked.node(hall.nodes["a"].uuid)["channels"][0]["last"], "no value comes")
         clock.put(0.0)
-        running.wait_for("The system's clock was put forward by 3600.0")
+        running.wait_for("The system clock was set forward by 3600.0")
 
         def right() -> bool:
             return abs(asked.node(hall.nodes["a"].uuid)["channels"][0]["last"]["time"] - time.time()) < 5

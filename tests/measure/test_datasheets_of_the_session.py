@@ -99,7 +99,7 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
         assert line["unit"] == ""
         assert line["uncertainty"] is None
     assert len({raw for line in of(lines) for raw in line["raw"]}) > 1
-    assert any("nobody has signed the datasheet" in line.get("why", "") for line in lines)
+    assert any("the datasheet is unsigned" in line.get("why", "") for line in lines)
     text = file.read_text().splitlines()
     rows = list(csv.DictReader(line for line in text if not line.startswith("#")))
     assert {row["note"] for row in rows} == {"unsigned datasheet"}
@@ -154,7 +154,7 @@ def test_a_teds_that_was_changed_in_flash_ends_the_measurement_that_began_by_the
         (listed,) = hall.station.ask("nodes", node.uuid)["nodes"]
         assert (listed["verdict"], listed["reading"]["by"]) == ("not authentic", "measure")
         refused = hall.station.refuses("sample", node.uuid, "--can", node.bus, code=4)
-        assert "TEDS 5 of channel 1 is absent or changed" in refused["message"]
+        assert "TEDS 5 of channel 1 is missing or changed" in refused["message"]
     finally:
         flash = FlashFile(hall.folder / "g")
         flash.commit(replace(flash.load(), blocks=state.blocks))

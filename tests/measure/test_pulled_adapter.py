@@ -86,7 +86,7 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
 
 
 def test_a_pulled_adapter_is_told_as_itself_before_anything_is_asked_over_it(hall: Hall) -> None:
-    """`measure` said: No message of the node came.
+    """`measure` said: No message from the node came.
 
     With a lease of 60 s, and the datasheet read later, nothing is asked over the bus for 20 s: silence shows first.
     """
@@ -102,4 +102,4 @@ def test_a_pulled_adapter_is_told_as_itself_before_anything_is_asked_over_it(hal
     running.signal(signal.SIGINT)
     told = [one["why"] for one in events(running.end().out) if one["event"] == "status" and one["state"] == "lost"]
     assert "The CAN bus slcan:" in told[0], told
-    assert not any("No message of the node" in why for why in told), told
+    assert not any("No message from the node" in why for why in told), told

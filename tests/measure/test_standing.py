@@ -52,7 +52,7 @@ def unlisted(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize(
-    ("decide", "why"), [(moved, "was moved to station"), (forgotten, "not held here any more"), (revoked, "lost")]
+    ("decide", "why"), [(moved, "was moved to station"), (forgotten, "no longer held here"), (revoked, "lost")]
 )
 def test_a_node_that_was_moved_forgotten_or_revoked_is_measured_no_more(
     pair: Pair, measuring: Station, decide: Callable[[Pair], None], why: str

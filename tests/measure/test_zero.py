@@ -134,7 +134,7 @@ def test_a_sensor_that_turns_is_refused(hall: Hall, angle: Shaft) -> None:
                 break
     refused = running.end()
     assert refused.code == 6
-    assert "too restless" in refused.json["error"]["message"]
+    assert "not steady" in refused.json["error"]["message"]
     assert angle.calibration() == had
 
 
@@ -143,7 +143,7 @@ def test_a_sensor_that_turns_is_refused(hall: Hall, angle: Shaft) -> None:
     [
         (["angle", 2], 8, "no channel 2"),
         (["angle", 1, "--value", "nan"], 2, "finite"),
-        (["angle", 1, "--value", 1, "--unit", "N"], 8, "no unit of channel"),
+        (["angle", 1, "--value", 1, "--unit", "N"], 8, "not a unit for channel"),
         (["nobody", 1], 3, "nobody"),
     ],
 )
@@ -155,9 +155,9 @@ def test_what_cannot_be_meant_is_refused(hall: Hall, angle: Shaft, words: list[o
 def test_limits_are_kept_and_the_guard_is_in_force(hall: Hall) -> None:
     load = Shaft(hall, "load").start()
     load.turn("force", 8_388_608 + 2000)
-    assert "beyond the limits" in hall.ask("calibrate", "zero", "load", 1, "--value", 501, code=6)["error"]["message"]
+    assert "exceeds the limits" in hall.ask("calibrate", "zero", "load", 1, "--value", 501, code=6)["error"]["message"]
     kilo = hall.ask("calibrate", "zero", "load", 1, "--value", 0.6, "--unit", "kN", code=6)["error"]["message"]
-    assert kilo == "0.6 kN is beyond the limits of channel 1, -0.5 kN to 0.5 kN."
+    assert kilo == "0.6 kN exceeds the limits of channel 1, -0.5 kN to 0.5 kN."
     small = hall.ask("calibrate", "zero", "load", 1)
     assert small["before"] == pytest.approx(2000 / 8_388_608 * 998, abs=1e-3)
     assert small["after"] == pytest.approx(0, abs=1e-3)
@@ -245,7 +245,7 @@ def test_while_somebody_else_measures_it_nothing_is_signed(hall: Hall, angle: Sh
     running = hall.begin("angle", "--rate", 20)
     running.wait_for('"event":"data"')
     refused = hall.ask("calibrate", "zero", "angle", 1, code=6)["error"]
-    assert "is measured from source address" in refused["message"]
+    assert "is being measured by another station" in refused["message"]
     running.signal(2)
     assert running.end().code == 0
     assert hall.ask("calibrate", "zero", "angle", 1)["sequence"] == sequence + 1

@@ -94,7 +94,7 @@ def test_a_hostile_one_is_refused_once_and_told(desk: Desk) -> None:
         until(lambda: asked.request("GET", f"/nodes/{node.uuid}/provision", None)["state"] == "failed")
     assert [one["state"] for one in events(service, "node", node.uuid)].count("not adopted") == 1
     refused = service.station.refuses("provision", node.uuid, "--adopt", "--yes", *desk.links.over("can"), code=8)
-    assert "cannot be printed" in refused["message"]
+    assert "unprintable" in refused["message"]
     service.end()
 
 
@@ -118,7 +118,7 @@ def test_a_node_without_a_key_is_not_measured_and_the_reason_is_that(desk: Desk)
         until(lambda: known(service, node) and verdict(asked.node(node.uuid)) is not None)
         with pytest.raises(ApiError) as refused:
             asked.request("POST", "/measurements", {"uuids": [node.uuid]})
-        assert "no key of it is held" in str(refused.value)
+        assert "holds no key for it" in str(refused.value)
     service.end()
 
 
@@ -142,6 +142,8 @@ def test_unverified_ones_are_measured_calibrated_and_everything_says_so(desk: De
             for row in asked.request("GET", "/names")["names"]
             if row["uuid"] == node.uuid and row["channel"]
         ] == [channel["topic"]]
+        listed = desk.station().ask("names", "list")["names"]
+        assert [row["topic"] for row in listed if row["uuid"] == node.uuid] == [channel["topic"]]
         joined = [one for one in events(service, "measurement", node.uuid) if one["state"] == "joined"]
         assert [one["id"] for one in joined] == ["unverified"]
 

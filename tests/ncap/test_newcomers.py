@@ -335,6 +335,19 @@ def test_an_expression_on_a_running_station_takes_in_whom_it_means(lab: Lab) -> 
     station.ask("group", "delete", "arm")
 
 
+def test_a_type_that_nobody_knows_is_told_while_its_measurement_waits(lab: Lab) -> None:
+    lab.service.start()
+    said = lab.service.station.run("ncap", "measure", "type:load-cel")
+    assert said.code == 0, "a node of that type may come from another station"
+    assert "no profile and no known node is called 'load-cel'" in said.err
+    with lab.service.client() as asked:
+        [one] = until(lambda: [one for one in asked.measurements() if one["why"]])
+        assert (one["state"], one["why"]) == ("waiting", "no profile and no known node is called 'load-cel'")
+        asked.end_measurement(one["id"])
+    assert "load-cell" not in lab.service.station.run("ncap", "measure", "type:load-cell").err
+    lab.service.end()
+
+
 def test_a_measurement_whose_nodes_are_anothers_says_so(lab: Lab) -> None:
     left, right = lab.nodes
     lab.start()

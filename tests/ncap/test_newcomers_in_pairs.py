@@ -94,7 +94,7 @@ def test_a_node_whose_other_teds_was_changed_is_found_out_behind_its_measurement
     lab.comes(left)
     lab.power(right)
     until(lambda: "left" in lab.states(right) or lab.states(right)[-1:] == ["waiting"])
-    assert any("not the one that it is measured by" in why for _, why in whys(lab, right)), whys(lab, right)
+    assert any("not the one used for the measurement" in why for _, why in whys(lab, right)), whys(lab, right)
     with lab.service.client() as asked:
         until(lambda: asked.node(right.uuid)["verdict"]["verdict"] == "not authentic")
     right.kill()
@@ -149,7 +149,7 @@ def test_a_station_that_is_killed_while_a_node_is_let_go_leaves_it_to_its_writer
         assert writer.stdout.readline() == "True\n"
         lab.service.kill()
         lab.start()
-        until(lambda: ("waiting", "a command of this station works on it") in whys(lab, right))
+        until(lambda: ("waiting", "a command of this station is using it") in whys(lab, right))
         lab.comes(left)
         assert "joined" not in lab.states(right)
         writer.communicate("")

@@ -152,7 +152,7 @@ def test_a_classic_bus_takes_a_kilohertz_of_two_streams_and_loses_nothing(scene:
         counts = receiver.counts
         assert (counts.bad, counts.junk, counts.late, counts.unasked) == (0, 0, 0, 0)
         if counts.lost:  # nothing else may be missing: a node that a busy machine let wait for too long says so
-            process.wait_for("could not leave in time")
+            process.wait_for("could not be sent in time")
     finally:
         hub.close()
 
@@ -309,7 +309,7 @@ def test_a_simulation_brings_its_own_time_and_its_end_is_survived(scene: Scene, 
     assert first.valid
     pid = next(iter(_children(process.process.pid)))
     os.kill(pid, signal.SIGTERM)
-    process.wait_for("no value is valid")
+    process.wait_for("all values are invalid")
     assert not Sampled.decode(station.send(sample([1])), 2).valid
 
 

@@ -108,7 +108,7 @@ def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) ->
     [
         ("", "no row"),
         ("t,angle\n", "no row"),
-        ("angle\n1\n", "named t"),
+        ("angle\n1\n", "no column t"),
         ("t,angel\n0,1\n", "'angel'"),
         ("t,angle,raw:angle\n0,1,1\n", "two columns"),
         ("t,angle\n0,1\n1\n", "line 3"),

@@ -73,12 +73,12 @@ def test_from_an_empty_home_to_a_moving_plot(browser: Browser, fresh: Lab) -> No
 
 def test_everything_that_is_trusted_is_measured_by_one_button(browser: Browser, lab: Lab) -> None:
     with opened(browser, lab, route="measure") as page:
-        page.get_by_role("button", name="Measure everything that is trusted").click()
-        card = page.locator(".group", has=page.get_by_role("heading", name="Everything that is trusted"))
+        page.get_by_role("button", name="Measure all trusted nodes").click()
+        card = page.locator(".group", has=page.get_by_role("heading", name="All trusted nodes"))
         card.get_by_text(re.compile(r"\d+ nodes? measured: .*hand")).wait_for()
         assert [one["match"] for one in lab.measurements()] == ["all"]
         card.get_by_role("button", name="Stop").click()
-        page.get_by_role("button", name="Measure everything that is trusted").wait_for()
+        page.get_by_role("button", name="Measure all trusted nodes").wait_for()
         assert lab.measurements() == []
 
 
@@ -172,7 +172,7 @@ def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(br
         # Beyond the limits of the datasheet.
         value.fill("500")
         hold.click()
-        page.get_by_role("alert").filter(has_text="beyond the limits").wait_for()
+        page.get_by_role("alert").filter(has_text="exceeds the limits").wait_for()
 
 
 @pytest.mark.realtime

@@ -82,7 +82,7 @@ def test_a_job_shows_its_yield_its_seconds_and_its_failures(browser: Browser, li
         assert "node-silent" in own.get_by_role("group", name="Failures").inner_text()
         steps = own.get_by_role("group", name="Seconds, median and worst").inner_text()
         assert all(step in steps for step in ("agree", "sign", "write", "verify"))
-        assert "Nothing was tried yet." in panel.get_by_role("region", name=f"{EAST}, three angles").inner_text()
+        assert "No attempts yet." in panel.get_by_role("region", name=f"{EAST}, three angles").inner_text()
         assert panel.get_by_text("<b>later</b>").count() == 1
         assert own.locator(".share").first.evaluate("one => one.clientHeight") == 10
         assert page.get_by_text("No links.").is_hidden()

@@ -201,7 +201,7 @@ def test_what_describes_itself_is_shown_unverified_and_signed_by_a_button(browse
     with opened(browser, fresh, route=f"nodes/{node.uuid}/datasheet") as page:
         page.get_by_text("Unverified", exact=True).first.wait_for()
         page.get_by_role("heading", name="shaft 40 mm", exact=True).wait_for()
-        brought = page.get_by_role("group", name="Datasheet of the board itself")
+        brought = page.get_by_role("group", name="The board's own datasheet")
         brought.get_by_text("nobody has signed it").wait_for()
         brought.get_by_role("button", name="Sign this datasheet").click()
         page.get_by_text("This node is ready.").wait_for()

@@ -42,7 +42,7 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         for station in (south, north):
             plant.sync.sync(station, FilesPost(stick))
         plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", told=[])
-        north.keys.demand_rotation(bytes(10), f"{leaving.WHY}west (lost) has had this key")
+        north.keys.demand_rotation(bytes(10), f"{leaving.WHY}west (lost) has held this key")
         north.plant.tables.put_alarm(
             Alarm("rolled-back", south.fingerprint, 3, "page 3 was there, and now 1 is the last")
         )
@@ -60,4 +60,4 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         found.get_by_text("held by bench (epoch 2)").wait_for()
         assert "two keys" in found.inner_text()
         panel.get_by_role("searchbox", name="Who holds a node").fill("nothing like it")
-        found.get_by_text("No station says anything of such a node.").wait_for()
+        found.get_by_text("No station reports such a node.").wait_for()

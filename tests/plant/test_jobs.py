@@ -109,7 +109,7 @@ def test_one_board_too_many_is_refused_and_stays_what_it_is(owner: Station) -> N
         ({"not_before": NOW + timedelta(hours=1), "ends": NOW + timedelta(hours=2)}, "it begins"),
         ({"not_before": NOW - timedelta(hours=2), "ends": NOW - timedelta(minutes=5)}, "it ended"),
         ({"stations": {"0" * 64: 3}}, "not for this station"),
-        ({"profile_sha256": "0" * 64}, "not the one of the job"),
+        ({"profile_sha256": "0" * 64}, "not the one in the job"),
     ],
 )
 def test_what_can_be_refused_before_a_tap_is(owner: Station, changes: dict[str, Any], why: str) -> None:
@@ -157,7 +157,7 @@ def test_a_board_that_is_not_listed_or_has_another_key_costs_no_unit(owner: Stat
     line = line_of(owner, count=None, boards={one.uuid: fingerprint(one.key.point), other.uuid: "0" * 64})
     with pytest.raises(OtherKey):
         build(line, other)
-    with pytest.raises(PolicyRefused, match="not in the list"):
+    with pytest.raises(PolicyRefused, match="not on the job's list"):
         build(line, board(3))
     assert units(line) == []
     build(line, one)
@@ -197,7 +197,7 @@ def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Statio
     with pytest.raises(NotFound, match="no file"):
         build(line, two)
     (folder / f"{two.uuid.hex()}.csv").write_text("raw, value\n0, 0\n16384, 6.28\n")
-    with pytest.raises(PolicyRefused, match="not the one that the job names"):
+    with pytest.raises(PolicyRefused, match="not the one the job specifies"):
         build(line, two)
     assert units(line) == []
     build(line, one)
@@ -223,11 +223,11 @@ def test_a_calibration_that_is_rewritten_while_it_is_read_is_not_used(
         return prepare(*given, **more)
 
     monkeypatch.setattr(line_module, "prepare", rewritten)
-    with pytest.raises(PolicyRefused, match="changed while it was read"):
+    with pytest.raises(PolicyRefused, match="changed while it was being read"):
         build(line, one)
     outside = LineRun(owner, None, BuildOrder(profile=ANGLE, calibration=file))
     file.write_text(TABLE)
-    with pytest.raises(PolicyRefused, match="changed while it was read"):
+    with pytest.raises(PolicyRefused, match="changed while it was being read"):
         build(outside, one)
     assert units(line) == []
     assert one.state.state == NodeState.FACTORY
@@ -259,7 +259,7 @@ def test_a_profile_that_is_edited_beside_a_job_makes_no_board_of_it(tmp_path: Pa
     line = line_of(owner, tmp_path, calibration=any_date, profile_sha256=digest_of_file(own))
     build(line, boards[0])
     own.write_text(own.read_text() + "\n# edited\n")
-    with pytest.raises(PolicyRefused, match="not the one of the job"):
+    with pytest.raises(PolicyRefused, match="not the one in the job"):
         build(line, boards[1])
     assert len(units(line)) == 1
     assert boards[1].state.state == NodeState.FACTORY
@@ -284,7 +284,7 @@ def test_a_job_is_a_keepers_word_and_its_id_means_one_job(tmp_path: Path, owner:
     job = take_job(owner, document)
     assert take_job(owner, document).hash == job.hash
     twin = seal_job(replace(job, title="another"), owner.credentials().key)
-    with pytest.raises(PolicyRefused, match="Another job"):
+    with pytest.raises(PolicyRefused, match="A different job"):
         take_job(owner, twin)
     with pytest.raises(NotAuthentic):
         take_job(owner, seal_job(replace(job, id="11111111-2222-4333-8444-555555555555"), SoftwareKey(5)))
@@ -411,7 +411,7 @@ def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> No
     build(line, one)
     said: list[str] = []
     Scans(["nonsense\n", "\n"], said.append).listen()
-    assert said == ["This is no label of a board: nonsense"]
+    assert said == ["This is not a board label: nonsense"]
 
 
 def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path) -> None:
@@ -432,7 +432,7 @@ def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path
     assert "its station is not in the roster" in first.faults(document)
     assert faults() == []
     plant.change(owning.with_roles(plant.north, "west", frozenset({"audit"}), (0, "")))
-    assert "its station has no role that works on boards" in faults()
+    assert "its station has no role for working on boards" in faults()
     plant.change(owning.without(plant.north, "west", "stolen", 0))
     assert "its station was removed: stolen" in faults()
     plant.close()

@@ -93,7 +93,7 @@ def test_who_has_a_copy_rotates_it_a_day_later(scene: Scene) -> None:
     assert scene.marks(scene.south) == []
     later(scene.south, 25)
     assert scene.marks(scene.south) == [uuid]
-    assert scene.south.keys.rotation_due(uuid) == "registry: west (lost) has had this key"
+    assert scene.south.keys.rotation_due(uuid) == "registry: west (lost) has held this key"
 
 
 def test_a_clock_that_was_ahead_does_not_keep_anybody_from_looking_again(scene: Scene) -> None:
@@ -180,7 +180,7 @@ def test_a_running_measurement_ends_for_a_thief_alone(scene: Scene, why: Why, cu
     scene.remove(scene.south, why)
     assert scene.marks(scene.north) == [uuid]
     if cut:
-        with pytest.raises(KeyStolen, match=r"stolen: south has had this key"):
+        with pytest.raises(KeyStolen, match=r"stolen: south has held this key"):
             standing.require()
     standing.require()
     NodeStanding(measuring, uuid).require()  # a session that began since is not ended again
@@ -199,4 +199,4 @@ def test_a_key_that_was_due_for_somebody_else_is_cut_off_when_one_is_stolen(scen
     assert scene.north.keys.stolen(uuid) is None
     scene.remove(scene.south, "stolen")
     later(scene.north, 50)
-    assert scene.north.keys.stolen(uuid) == "registry: stolen: south has had this key"
+    assert scene.north.keys.stolen(uuid) == "registry: stolen: south has held this key"

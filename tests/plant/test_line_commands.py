@@ -261,6 +261,13 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
     west.ask("write", other.uuid, "--image", tmp_path / "signed.json", *nfc(desk))
     done = west.provision("nfc", "--job", job, "--files", stick)
     assert (done["verdict"], done["attempt"]) == ("authentic", 2)
+    west.ask("agree", other.uuid, "--rotate", "--yes", *nfc(desk))
+    stale = west.refuses("write", other.uuid, "--image", tmp_path / "signed.json", *nfc(desk), code=6)
+    assert "--by OFFICE" in stale["hint"], "this station may not sign it itself"
+    shown = owner.run("job", "status", made["id"]).out
+    assert "west: nothing received yet" in shown, "0 units only means that its pages are not here"
+    west.ask("evidence", "export", tmp_path / "proof")
+    assert "nothing received" not in owner.run("job", "status", made["id"], tmp_path / "proof").out
 
 
 @pytest.mark.system

@@ -225,7 +225,7 @@ def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_s
         back = homes["backup"]
         back.plant.begin_restored()
         line, third = LineRun(back, job), board(3)
-        with pytest.raises(PolicyRefused, match="came back from a backup"):
+        with pytest.raises(PolicyRefused, match="was restored from a backup"):
             build(line, third)
         assert units(line) == [(1, 1, 1)]
         sync(back, FilesPost(plant.stick))
@@ -241,7 +241,7 @@ def test_an_office_out_of_an_old_backup_answers_nobody_before_it_knows_its_pages
     plant = Plant(tmp_path)
     plant.north.unlock()
     plant.north.plant.begin_restored()
-    with pytest.raises(PolicyRefused, match="came back from a backup"):
+    with pytest.raises(PolicyRefused, match="was restored from a backup"):
         answer(plant.north, b"")
     plant.sync(plant.north)
     assert answer(plant.north, b"") is None

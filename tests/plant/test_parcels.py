@@ -188,7 +188,7 @@ def test_a_move_waits_for_a_person_whatever_the_roster_shares(plant: Plant) -> N
         order = outgoing.ExportOrder(("south",), (board.uuid,), "move")
         parcels.send_export(station, outgoing.plan_export(station, order), now())
     sync(plant, "west", "south")
-    assert waits(plant["south"]) == ["a move is a person's to take in"]
+    assert waits(plant["south"]) == ["a move needs confirmation"]
 
 
 def test_what_comes_before_its_senders_pages_waits_one_sync_then_for_a_person(plant: Plant) -> None:

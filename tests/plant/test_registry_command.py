@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from teds_provision import plant
+from teds_provision.store import Store
+from teds_provision.store.tables.plant import PageRow
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, call, spawn
 from tests.plant.stations import certified, owner
@@ -132,6 +135,36 @@ def test_the_doctor_sees_the_registry_and_none_where_none_was_joined(desk: Desk)
     assert any("never" in why for _, why in found("south"))
     desk.sync("south")
     assert {result for result, _ in found("south")} == {"ok"}
+
+
+def test_the_doctor_says_whose_clock_is_wrong_until_that_station_dates_a_page_well(desk: Desk) -> None:
+    joined(desk)
+    desk.sync("west", "south")
+    west = str(desk.ask("west", "init")["fingerprint"])
+    soon = f"{datetime.now(UTC) + timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}"
+
+    def found(created: str) -> list[str]:
+        """What is said once west has made one page more, and dated it so."""
+        with Store.open(desk.folder / "south") as store, store.transaction():
+            chain = store.chain(west)
+            n = 1 + max((number for number, *_ in store.page_times(chain.chain, 1)), default=0)
+            store.add_page(chain.chain, PageRow(n, f"{n:064x}", "", created, "", b"", b"{}", bytes(64)))
+        checks = json.loads(desk.run("south", "--json", "doctor").out)["checks"]
+        said = [one for one in checks if one["name"] == "registry" and "page" in one["why"]]
+        return [f"{one['why']} {one['fix']}" for one in said]
+
+    assert found("9999-12-31T23:59:59Z") == [
+        "west has dated its newest page 9999-12-31T23:59:59Z. Set the clock of west."
+    ]
+    [why] = found(soon)
+    assert why.startswith("The clock is behind the newest page of west")
+    assert "Set the clock of this machine" in why
+    assert found("2026-11-01T00:00:00Z") == []
+
+
+def test_a_keeper_who_finds_nothing_to_vouch_for_is_told_so(desk: Desk) -> None:
+    joined(desk)
+    assert "Nothing to do" in desk.run("north", "registry", "vouch", "--all", "--yes").out
 
 
 def test_who_joined_none_is_told_how(desk: Desk) -> None:
@@ -286,7 +319,7 @@ def test_a_home_rebuilt_from_a_backup_says_nothing_new_by_a_stick_that_knows_les
     desk.ask("west", "restore", copy, "--yes")
     desk.ask("west", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
     told = desk.ask("west", "registry", "sync", "--files", stale)
-    assert "came back from a backup" in str(told["told"])
+    assert "was restored from a backup" in str(told["told"])
     assert not list(stale.glob("*/1.jws")), "page 1 was said before"
     assert "1 page that this station wrote before its backup is back" in desk.sync("west")["told"]  # type: ignore[operator]
     desk.sync("north")

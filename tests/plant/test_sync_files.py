@@ -136,7 +136,7 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     pin(copy, bytes(10))
     plants.sync(copy)
     pin(west, bytes([1] * 10))
-    with pytest.raises(Fork, match="copy of it"):
+    with pytest.raises(Fork, match="copy of this home"):
         plants.sync(west)
     assert west.plant.tables.unsent() >= 1
     assert resume(west, plant.files.FilesPost(plants.stick)) == 1
@@ -219,7 +219,7 @@ def test_a_rebuilt_home_waits_where_somebody_has_seen_more_of_it(plants: Plant) 
     plants.sync(back, old)  # it hears what north has seen of it
     back.unlock()
     back.plant.begin_restored()
-    with pytest.raises(PolicyRefused, match="has seen page 2"):
+    with pytest.raises(PolicyRefused, match="has seen its page 2"):
         plants.sync(back, old)
     plants.sync(back)
     assert not back.plant.restored
@@ -252,7 +252,7 @@ def test_a_clock_a_year_ahead_makes_no_roster_that_counts(plants: Plant) -> None
     signed = plant.owner.signed(plants.north, ahead)
     FilesPost(plants.stick).post_roster(signed.version, signed.hash, signed.octets)
     done = plants.sync(south)
-    assert any("check the clock" in line for line in done.told)
+    assert any("check this machine's clock" in line for line in done.told)
     assert south.plant.roster is not None
     assert south.plant.roster.version == version
 

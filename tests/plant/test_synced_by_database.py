@@ -213,7 +213,7 @@ def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(of
     for n, station in enumerate((copy, south), 1):
         station.pins.put(WhitelistEntry(bytes([n] * 10), "ab" * 32, assurance="tap"))
     office.sync(copy)
-    with pytest.raises(Fork, match="a copy of it is at work"):
+    with pytest.raises(Fork, match="a copy of this home is in use"):
         office.sync(south)
     assert office.database.sql("select count(*) from registry.page where n > 1") == [["0"]]
     post = office.post(south)

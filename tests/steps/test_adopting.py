@@ -79,7 +79,7 @@ def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> N
         adopted(station, node, says=PolicyRefused("no thanks"))
     with (
         Conversation(on_reader(node), notice=lambda _notice: None) as talk,
-        pytest.raises(NotAdopted, match="nobody said"),
+        pytest.raises(NotAdopted, match="nobody has approved"),
     ):
         provision(station, talk, ADOPT, accept=lambda _who: None, reporter=Silent())
     assert node.tim.flash.sequence == 0
@@ -130,15 +130,15 @@ def with_tuple(blocks: dict[BlockId, bytes], block: BlockId, kind: int, value: b
 @pytest.mark.parametrize(
     ("blocks", "said"),
     [
-        (named(factory(), 0, "joint\x1b[31m"), "cannot be printed"),
-        (named(factory(), 1, "angle\u202egnp"), "cannot be printed"),
-        (named(factory(), 1, "a\nb"), "cannot be printed"),
+        (named(factory(), 0, "joint\x1b[31m"), "unprintable"),
+        (named(factory(), 1, "angle\u202egnp"), "unprintable"),
+        (named(factory(), 1, "a\nb"), "unprintable"),
         (named(factory(), 0, "x" * 121), "more than 120 octets"),
         (
             {**factory(), (0, 10): teds.compose(10, [("Text", {"LangCode": "en", "Text": "<x>\x1b]0;pwned</x>"})])},
             "text",
         ),
-        (factory(bytes.fromhex("0badc0de5281f7000001")), "that of node 0badc0de5281f7000001"),
+        (factory(bytes.fromhex("0badc0de5281f7000001")), "belongs to node 0badc0de5281f7000001"),
         ({(0, 12): teds.compose(12, {"Format": 0, "TCName": "x"})}, "no TransducerChannel TEDS"),
         ({}, "no TransducerChannel TEDS"),
     ],
@@ -166,7 +166,7 @@ def test_another_nodes_name_needs_another_one(station: Station, tmp_path: Path, 
     with station.durable("test"):
         station.nodes.remember(other, name="elbow")
     node = board(tmp_path / "n", named(factory(), 0, name))
-    with pytest.raises(PolicyRefused, match=f"so node {other.hex()} is called") as refused:
+    with pytest.raises(PolicyRefused, match=f"node {other.hex()} already has that name") as refused:
         adopted(station, node)
     assert "--name" in refused.value.hint
     done, _ = adopted(station, node, BuildOrder(adopt=True, name="mine"))

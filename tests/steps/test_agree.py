@@ -76,7 +76,7 @@ def test_over_a_bus_a_node_that_has_a_key_is_never_pinned(station: Station, boar
     whitelist(station, board)
     run(station, board)
     whitelist(station, board)
-    with pytest.raises(PolicyRefused, match="only a tap can pin its key"):
+    with pytest.raises(PolicyRefused, match="can only be pinned by tap"):
         run(station, board, MemoryLink(board, via="can", tapped=False), rotate=True)
     entry = station.pins.entry(board.uuid)
     assert entry is not None

@@ -216,7 +216,7 @@ def test_what_is_said_in_no_session_changes_no_row(station: Station, board: Boar
     changed_in_flash(board)
     with talk(board) as node:
         who = identify(station, node)
-        plain = verify_node(station, node, read_image(node), who.point, why="the node opens no session")
+        plain = verify_node(station, node, read_image(node), who.point, why="the node does not open a session")
     assert plain.verified.verdict == "unproven"
     assert plain.origin == "plain"
     assert station.nodes.reading(board.uuid) == before

@@ -49,12 +49,12 @@ def test_a_relative_path_is_remembered_whole(
 
 def test_a_profile_that_changed_since_is_told_and_asked(station: Station, board: Board, here: Path) -> None:
     provisioned(station, board, BuildOrder("./own.toml"))
-    assert not any("is not what it was" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
+    assert not any("has changed since" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
     (here / "own.toml").write_text(CELL.replace("\n", "\n# a comment changes nothing\n", 1))
-    assert not any("is not what it was" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
+    assert not any("has changed since" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
     (here / "own.toml").write_text(CELL.replace("high-limit = 500.0", "high-limit = 400.0"))
     told = build(station, board.uuid, BuildOrder(name="a")).warnings
-    assert any("is not what it was when this node's datasheet was made" in text for text in told)
+    assert any("has changed since this node's datasheet was built" in text for text in told)
     station.nodes.drop_draft(board.uuid)
     reset(station, board)
     with pytest.raises(NotNamed):

@@ -52,7 +52,7 @@ def test_rows_without_the_calibration_that_their_type_asks_for_are_told_before_t
     (tmp_path / "cal.csv").write_text("# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,500\n")
     sheet = read(station, tmp_path, "name,calibration,profile\na,,\nb,cal.csv,\nc,,\nd,,limit-switch\n")
     assert [warning for warning in sheet.warnings if "type asks for" in warning] == [
-        "Rows 1, 3: the type asks for a calibration, and none is named."
+        "Rows 1, 3: the type requires a calibration, but the sheet gives none."
     ]
 
 
@@ -161,7 +161,7 @@ def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path
     progress.ran_out(30)
     error = progress.totals().error
     assert isinstance(error, NoNode)
-    assert error.message == "0 passed, 0 failed, 2 skipped. No board came within 30 s for row 1, 2."
+    assert error.message == "0 passed, 0 failed, 2 skipped. No board was tapped within 30 s for row 1, 2."
 
 
 def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(station: Station, tmp_path: Path) -> None:

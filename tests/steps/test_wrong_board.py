@@ -95,13 +95,13 @@ def test_with_retype_it_becomes_one_and_the_hardware_has_the_last_word(
     station: Station, angle: VirtualNode, tmp_path: Path
 ) -> None:
     given(station, on_reader(angle), order(tmp_path, ANGLE))
-    with pytest.raises(WrongBoard, match=r"Channel 1 .* of the board does not bear this datasheet"):
+    with pytest.raises(WrongBoard, match=r"Channel 1 .* of the board does not match this datasheet"):
         given(station, on_reader(angle), order(tmp_path, GRIPPER, retype=True))
 
 
 def test_at_a_terminal_a_yes_to_the_differences_is_enough(station: Station, angle: VirtualNode, tmp_path: Path) -> None:
     asked: list[tuple[str, ...]] = []
-    with pytest.raises(WrongBoard, match="does not bear"):
+    with pytest.raises(WrongBoard, match="does not match"):
         given(station, on_reader(angle), order(tmp_path, GRIPPER), retype=lambda _uuid, told: asked.append(told))
     assert len(asked) == 1, "once, not before and after the key agreement"
     assert any("is a sensor, not an actuator" in text for text in asked[0])
@@ -181,7 +181,7 @@ def test_reason_6_and_23_of_operate_have_words_of_their_own(
     given(station, on_reader(angle), order(tmp_path, ANGLE))
     with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
         require_session(station, node)
-        with pytest.raises(NodeRefused, match=r"does not bear its datasheet on channel 1.*\(reason 6\)") as caught:
+        with pytest.raises(NodeRefused, match=r"does not match its datasheet on channel 1.*\(reason 6\)") as caught:
             operate(node, 1, bytes(16), lease=5)
         assert caught.value.reason == Reason.DIGEST_MISMATCH
         assert "TEDS does not match its signed digest" not in caught.value.message

@@ -240,7 +240,7 @@ def test_a_directory_where_others_may_write_is_refused(tmp_path: Path) -> None:
     home.mkdir()
     (home / "file").write_text("x")
     home.chmod(0o777)
-    with pytest.raises(StoreFailure, match="Others may write"):
+    with pytest.raises(StoreFailure, match="Other users can write"):
         Store.open(home, create=True)
     assert not (home / "store.sqlite3").exists()
 

@@ -117,7 +117,7 @@ def test_a_part_of_a_change_that_failed_takes_the_whole_with_it(store: Store) ->
                 store.put_node(NodeRecord(OTHER))
                 raise RuntimeError
 
-    with pytest.raises(StoreFailure, match="A part of this change failed"):
+    with pytest.raises(StoreFailure, match="Part of this change failed"):
         caught()
     assert store.nodes() == []
     with store.transaction():

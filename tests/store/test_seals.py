@@ -148,7 +148,11 @@ def test_a_planted_end_of_trust_and_a_planted_lifting_do_not_count(home: Path, o
     station.unlock()
     assert station.policy.counts(OTHER)
     assert not station.policy.was_lifted("a ban")
-    assert [sentence for sentence in said if "noted" in sentence and fingerprint(OTHER)[:16] in sentence]
+    assert [
+        sentence
+        for sentence in said
+        if "another program added" in sentence.lower() and fingerprint(OTHER)[:16] in sentence
+    ]
     assert len(list(station.seals.all_broken())) == 2
 
 

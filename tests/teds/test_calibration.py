@@ -480,5 +480,5 @@ def test_a_calibration_kept_from_a_node_gives_the_same_octets(magnetic: Profile)
 
 def test_a_column_that_is_named_twice_is_refused(tactile: Profile) -> None:
     text = "channel;from;to;from;to;offset;c0;c1\n1;0;512;0;0,5;0,001\n"
-    with pytest.raises(BadData, match=r'c\.csv:1: the column "from" is there twice'):
+    with pytest.raises(BadData, match=r'c\.csv:1: the column "from" appears twice'):
         read_calibrations(text, "c.csv", tactile)

@@ -356,7 +356,7 @@ def test_an_actuator_is_set_within_its_limits_and_read_back() -> None:
     assert int.from_bytes(interpreter.encode(high * 3), "big") == 4000
     assert interpreter.decode(interpreter.encode(middle)).value[0] == pytest.approx(middle)
     assert interpreter.beyond(middle) == ""
-    assert "beyond the limits" in interpreter.beyond(high * 1.01)
+    assert "exceeds the limits" in interpreter.beyond(high * 1.01)
     assert interpreter.beyond(math.nan)
     with pytest.raises(BadData, match="not finite"):
         interpreter.encode(math.nan)

@@ -10,12 +10,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from teds_provision import files
 from teds_provision.cli.main import run as in_process
-from teds_provision.vault import agent, forget_vaults
+from teds_provision.vault import agent, choose, forget_vaults
+from teds_provision.vault.pkcs11_token import ask_pin
+from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, clean_environment, spawn
 from tests.vault.softhsm import PIN, loaded, unload
@@ -81,6 +84,25 @@ def test_it_ends_by_itself_at_the_time(home: Path) -> None:
     assert run(home, "unlock", "--for", "1s", passphrase=PASSPHRASE).code == 0
     wait_until(lambda: not (home / agent.SOCKET).exists())
     assert opens(home) == 7
+
+
+def test_a_pin_that_is_held_is_not_spent_on_the_last_attempt() -> None:
+    from pkcs11 import TokenFlag
+
+    class Shown:
+        flags = TokenFlag(0)
+
+    asked: list[str] = []
+
+    def person(prompt: str, confirm: bool) -> str:
+        asked.append(prompt)
+        return "typed"
+
+    give, uri = choose._holding(b"held", person), Pkcs11Uri("/m.so", token="t")
+    assert ask_pin(cast(Any, Shown), uri, give) == "held"
+    Shown.flags = TokenFlag.USER_PIN_FINAL_TRY
+    assert ask_pin(cast(Any, Shown), uri, give) == "typed"
+    assert len(asked) == 1
 
 
 def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

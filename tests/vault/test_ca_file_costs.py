@@ -36,7 +36,7 @@ def test_more_rounds_than_the_bound_are_refused_at_once(tmp_path: Path) -> None:
     assert der.count(own) == 1
     for many in (MAX_ROUNDS + 1, 0xFFFFFF, 0):
         path.write_text(pem_of(der.replace(own, b"\x02\x03" + many.to_bytes(3, "big"))))
-        with costs_at_most(0.1), pytest.raises(VaultFailure, match="sealed in a way"):
+        with costs_at_most(0.1), pytest.raises(VaultFailure, match="encrypted in an unsupported way"):
             read_ca(path, WORDS)
 
 
@@ -64,7 +64,7 @@ def test_a_key_sealed_by_scrypt_is_refused_and_the_usual_openssl_ones_open(tmp_p
     (tmp_path / "scrypt.pem").write_bytes(
         subprocess.run(seal, input=WORDS.encode(), check=True, capture_output=True).stdout
     )
-    with pytest.raises(VaultFailure, match="sealed in a way"):
+    with pytest.raises(VaultFailure, match="encrypted in an unsupported way"):
         read_ca(tmp_path / "scrypt.pem", WORDS)
 
 

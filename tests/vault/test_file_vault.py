@@ -37,7 +37,7 @@ def test_the_keys_come_back_with_the_passphrase(tmp_path: Path, vault: FileVault
 def test_the_product_pays_64_mib_and_says_so_in_the_file(tmp_path: Path) -> None:
     vault, why = create_vault(tmp_path, STORE, "file", Person())
     content = json.loads((tmp_path / "vault.json").read_text())
-    assert (vault.kind, why) == ("file", "the passphrase file was asked for")
+    assert (vault.kind, why) == ("file", "as requested")
     assert (content["kdf"], content["memory_kib"], content["iterations"], content["lanes"]) == ("argon2id", 65536, 3, 4)
     assert (PRODUCT.memory_kib, PRODUCT.iterations, PRODUCT.lanes) == (65536, 3, 4)
 

@@ -96,16 +96,16 @@ def test_a_backend_that_forgets_is_found_out_before_a_key_is_trusted_to_it(monke
     monkeypatch.setenv("PYTHON_KEYRING_BACKEND", forgetful)
     monkeypatch.setitem(keyring_vault.ALLOWED, forgetful, "forgetful")
     monkeypatch.setattr("keyring.backends.null.Keyring.priority", 1)
-    with pytest.raises(VaultFailure, match="did not keep"):
+    with pytest.raises(VaultFailure, match="did not store"):
         KeyringVault.create(STORE)
 
 
 def test_without_a_keyring_init_takes_the_passphrase_file_and_says_why(tmp_path: Path) -> None:
     vault, why = create_vault(tmp_path, STORE, None, ask, costs=THROWAWAY)
     assert vault.kind == "file"
-    assert "no keyring can be used: This machine has no keyring" in why
+    assert "no OS keyring: this machine has no keyring" in why
     again, why = create_vault(tmp_path, STORE, None, ask)
-    assert (again.identity().point, why) == (vault.identity().point, "the passphrase file is already there")
+    assert (again.identity().point, why) == (vault.identity().point, "the passphrase file already exists")
 
 
 def test_a_forbidden_backend_is_named_in_the_reason(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ MAKE = """
 @pytest.mark.system
 def test_a_real_keyring_holds_the_keys_from_one_login_to_the_next(session: Session) -> None:
     made = session.run(MAKE)
-    assert (made["kind"], made["why"]) == ("keyring", "a keyring works here")
+    assert (made["kind"], made["why"]) == ("keyring", "an OS keyring is available")
     assert "Secret Service" in made["about"]
     assert not (session.home / "vault.json").exists()
     later = session.run(f"""
@@ -272,7 +272,7 @@ def test_a_second_init_finds_the_same_keys_and_leaves_no_probe(session: Session)
     assert again.pop("length") < 1280
     assert again == {
         "point": made["point"],
-        "why": "the keyring was asked for",
+        "why": "as requested",
         "entries": [f"station/{STORE}"],
         "ascii": True,
         "lines": 1,

@@ -66,7 +66,7 @@ class Adapter:
         if known is None:
             raise NoNode(
                 f"No node advertises as {address}.",
-                hint="Tap it, then it advertises for 60 s; a node with a key always does. Is it in reach?",
+                hint="Tap it: it then advertises for 60 s; a node with a key always does. Is it in range?",
             )
         return known[0]
 

@@ -41,7 +41,7 @@ def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
         raise NoReader("bluetoothd does not answer.", hint="sudo systemctl restart bluetooth") from None
     except Exception as error:
         trouble = troubles.adapter_trouble(error, "this machine")
-        raise trouble or NoReader(f"bluetoothd cannot be asked: {error}.", hint=troubles.SERVICE_HINT) from error
+        raise trouble or NoReader(f"Cannot talk to bluetoothd: {error}.", hint=troubles.SERVICE_HINT) from error
 
 
 async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
@@ -52,7 +52,7 @@ async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
     try:
         (owned,) = await _call(bus, "org.freedesktop.DBus", "org.freedesktop.DBus", "NameHasOwner", "org.bluez")
         if not owned:
-            raise NoReader("The Bluetooth service (bluetoothd) does not run.", hint=troubles.SERVICE_HINT)
+            raise NoReader("The Bluetooth service (bluetoothd) is not running.", hint=troubles.SERVICE_HINT)
         (objects,) = await _call(bus, "org.bluez", "org.freedesktop.DBus.ObjectManager", "GetManagedObjects")
     finally:
         bus.disconnect()

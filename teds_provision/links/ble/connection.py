@@ -120,7 +120,7 @@ class BleConnection:
             if not await self._client_with_service():
                 await self.down()
                 raise LinkFailure(
-                    f"The device at {self.address} advertises the service of a node and does not have it.",
+                    f"The device at {self.address} advertises the service of a node but does not offer it.",
                     hint="Its firmware is wrong, or a cache: sudo rm -r /var/lib/bluetooth/*/cache, restart bluetooth.",
                 )
         self._adapter.held.add(self)

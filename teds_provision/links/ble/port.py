@@ -156,7 +156,7 @@ class BlePort:
         """The line over the connection of this number; raises NoNode where there is none."""
         connection = next((each for each in self._connections.values() if each.number == number), None)
         if connection is None:
-            raise NoNode("That node is not known here any more.")
+            raise NoNode("That node is no longer known here.")
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice or _silently)
 
     def mtu(self, number: int) -> int:
@@ -188,7 +188,7 @@ class BlePort:
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
         raise NoNode(
             f"The node did not answer over BLE {where}within {seconds:g} s{others}.",
-            hint="A node advertises for 60 s after a tap, and while it has a key. Bring it closer, or tap it.",
+            hint="A node advertises for 60 s after a tap, and as long as it has a key. Bring it closer, or tap it.",
         )
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
@@ -218,7 +218,7 @@ class BlePort:
             return [found[each] for each in sorted(found)]
         raise NoNode(
             f"No node advertises within {seconds:g} s.",
-            hint="A node advertises for 60 s after a tap, and while it has a key.",
+            hint="A node advertises for 60 s after a tap, and as long as it has a key.",
         )
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
@@ -335,7 +335,9 @@ class BlePort:
             if identity.uuid not in told:
                 told.add(identity.uuid)
                 uuid = identity.uuid.hex()
-                notice(Notice("foreign-tag", f"Node {uuid} is at {address}, but it is not the one looked for."))
+                notice(
+                    Notice("foreign-tag", f"Node {uuid} is at {address}, but it is not the node that was requested.")
+                )
             return None
         connection = link.connection.number
         return Contact(identity, link, connection=connection, trace=self.trace, bus=self.place)

@@ -11,7 +11,7 @@ from teds_provision.errors import UsageFailure
 
 _ADDRESS: Final = re.compile(r"([0-9A-F]{2}:){5}[0-9A-F]{2}")
 _ADAPTER: Final = re.compile(r"[A-Za-z0-9_.-]{1,32}")
-_HINT: Final = "Write --ble auto, --ble hci0 or --ble 'hci0?address=C1:D8:57:00:01:01'."
+_HINT: Final = "Use --ble auto, --ble hci0 or --ble 'hci0?address=C1:D8:57:00:01:01'."
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def parse_spec(text: str) -> BleSpec:
     if address is not None:
         address = address.upper().replace("-", ":")
         if not _ADDRESS.fullmatch(address):
-            raise UsageFailure(f"{address!r} is no Bluetooth address.", hint=_HINT)
+            raise UsageFailure(f"{address!r} is not a Bluetooth address.", hint=_HINT)
     if adapter not in ("", "auto") and not _ADAPTER.fullmatch(adapter):
-        raise UsageFailure(f"{adapter!r} is no name of a Bluetooth adapter.", hint=_HINT)
+        raise UsageFailure(f"{adapter!r} is not a Bluetooth adapter name.", hint=_HINT)
     return BleSpec(adapter if adapter not in ("", "auto") else None, address)

@@ -11,7 +11,7 @@ from typing import Final
 from teds_provision.errors import LinkFailure, NodeSilent, NoReader
 from teds_provision.lazy import how_to_install
 
-SERVICE_HINT: Final = "sudo systemctl start bluetooth (package bluez); teds-provision doctor looks closer."
+SERVICE_HINT: Final = "sudo systemctl start bluetooth (package bluez); teds-provision doctor tells you more."
 POWER_HINT: Final = "bluetoothctl power on; where that is refused: rfkill unblock bluetooth."
 _LIMIT: Final = "le-connection-concurrent-connection-limit"
 _REFUSED: Final = ("le-connection-refused", "le-connection-busy", "le-connection-memory-allocation")
@@ -46,17 +46,18 @@ def adapter_trouble(error: Exception, adapter: str) -> LinkFailure | None:
     """The error for Bluetooth that cannot be used at all; None where the trouble is the node's or the air's."""
     reason = getattr(getattr(error, "reason", None), "name", "")
     if isinstance(error, FileNotFoundError | ConnectionRefusedError | PermissionError):
-        return NoReader("There is no D-Bus system bus, so no Bluetooth.", hint=SERVICE_HINT)
+        return NoReader("There is no D-Bus system bus, so Bluetooth is unavailable.", hint=SERVICE_HINT)
     if getattr(error, "dbus_error", "") in _NO_SERVICE:
-        return NoReader("The Bluetooth service (bluetoothd) does not run.", hint=SERVICE_HINT)
+        return NoReader("The Bluetooth service (bluetoothd) is not running.", hint=SERVICE_HINT)
     if reason == "POWERED_OFF" or "adapter-not-powered" in str(error):
         return NoReader(f"Bluetooth is switched off on {adapter}.", hint=POWER_HINT)
     if reason == "NO_BLE_CENTRAL_ROLE":
         return NoReader(
-            f"The Bluetooth of {adapter} has no LE central role.", hint="Use an adapter of Bluetooth 4.0 up."
+            f"Bluetooth adapter {adapter} does not support the LE central role.",
+            hint="Use an adapter with Bluetooth 4.0 or later.",
         )
     if reason:
-        return NoReader("There is no Bluetooth adapter.", hint="Plug one in; bluetoothctl list shows which are there.")
+        return NoReader("There is no Bluetooth adapter.", hint="Plug one in; bluetoothctl list shows the adapters.")
     if "adapter '" in str(error):
         return NoReader(
             f"There is no Bluetooth adapter {adapter}.", hint="bluetoothctl list, or: ls /sys/class/bluetooth"

@@ -168,5 +168,5 @@ class Arrivals:
             if now - last.silent >= _GONE_SECONDS:
                 del self._seen[uuid]
                 name = uuid.hex()
-                text = f"Node {name} at 0x{last.address:02X} does not answer any more."
+                text = f"Node {name} at 0x{last.address:02X} no longer answers."
                 self._notice(Notice("node-left", text, uuid=uuid))

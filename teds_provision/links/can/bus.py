@@ -283,7 +283,7 @@ class Bus:
 
     def _bus_off(self) -> NoReturn:
         raise LinkFailure(
-            f"The CAN controller of {self.spec.text} went bus-off: too many frames met errors.",
+            f"The CAN controller of {self.spec.text} went bus-off: too many frame errors.",
             hint="Check wiring, termination (120 ohm at both ends) and the bit rate; then: "
             f"ip link set {self.spec.channel} type can restart.",
         )
@@ -308,7 +308,7 @@ def _open(spec: CanSpec) -> can.BusABC:
     except can.CanInterfaceNotImplementedError as error:
         known = f"python-can knows {', '.join(sorted(can.VALID_INTERFACES))}."
         raise NoReader(
-            f"The CAN interface {spec.interface!r} is not usable here: {_reason(error)}.",
+            f"Cannot use CAN interface {spec.interface!r} here: {_reason(error)}.",
             hint=_driver(spec.interface) or known,
         ) from error
     except TypeError as error:  # python-can's own word about a key that the interface does not take
@@ -378,7 +378,7 @@ def _options(spec: CanSpec) -> dict[str, Any]:
         options["fd"] = spec.fd
     if spec.interface == "socketcand":
         if spec.fd:
-            raise UsageFailure("socketcand carries classic CAN only.", hint="Leave fd=1 out.")
+            raise UsageFailure("socketcand carries classic CAN only.", hint="Remove fd=1.")
         options = {"host": "127.0.0.1", "port": _SOCKETCAND_PORT, "tcp_tune": True} | options
         _probe(spec, options)
     return options
@@ -389,12 +389,12 @@ def _not_opened(spec: CanSpec, error: Exception) -> NoReader:
     number = _number(error) if spec.interface == "socketcan" else None
     if number == errno.EAFNOSUPPORT:
         return NoReader(
-            "This kernel has no CAN.",
+            "This kernel has no CAN support.",
             hint="Load it (sudo modprobe can_raw), or go over the network: socketcand:can0?host=….",
         )
     if number == errno.ENODEV:
         return NoReader(
-            f"There is no CAN interface {spec.channel}.", hint="See which are there: ip -brief link show type can."
+            f"There is no CAN interface {spec.channel}.", hint="To list the interfaces: ip -brief link show type can."
         )
     return NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec))
 
@@ -454,9 +454,9 @@ def _cure(spec: CanSpec) -> str:
         data = f" dbitrate {spec.data_bitrate} fd on" if spec.fd else ""
         return f"Bring it up: sudo ip link set {spec.channel} up type can bitrate {spec.bitrate}{data}."
     if spec.interface == "udp_multicast":
-        return "It needs a multicast address, and a route to it: sudo ip route add 239.0.0.0/8 dev lo."
+        return "This needs a multicast address and a route to it: sudo ip route add 239.0.0.0/8 dev lo."
     if spec.interface == "socketcand":
-        return "Start socketcand there, or name it: socketcand:can0?host=127.0.0.1&port=29536."
+        return "Start socketcand there, or give its address: socketcand:can0?host=127.0.0.1&port=29536."
     driver = _driver(spec.interface)
     return f"Check the channel's name and that the adapter is plugged in. {driver or 'Is its driver installed?'}"
 
@@ -477,7 +477,8 @@ def _unknown_key(spec: CanSpec, error: TypeError) -> UsageFailure:
         why = f"also needs {missing[1]}" if missing is not None else f"does not take these options: {_reason(error)}"
     return UsageFailure(
         f"The CAN interface {spec.interface} {why}.",
-        hint="Ours are bitrate, data_bitrate, fd, node, source and pace; any other key is the interface's own.",
+        hint="teds-provision's own options are bitrate, data_bitrate, fd, node, source and pace; any other goes"
+        " to the interface.",
     )
 
 
@@ -493,7 +494,7 @@ def _reason(error: BaseException) -> str:
     while error.__cause__ is not None:
         error = error.__cause__
     if isinstance(error, NameError):  # what python-can would have loaded from the driver's library
-        return "the library of its driver is not installed"
+        return "its driver library is not installed"
     text = str(error).strip().splitlines()
     return (text[0] if text else type(error).__name__).rstrip(".")
 

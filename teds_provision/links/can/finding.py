@@ -116,7 +116,9 @@ def read_identity(reply: bytes) -> Identity:
     """Read a reply frame to Identify; raises Garbled or BadData."""
     answer = decode_reply(reply)
     if not answer.ok:
-        raise Garbled("The node refuses Identify, which no node may.", hint="It does not keep to the profile.")
+        raise Garbled(
+            "The node refuses Identify, which no node is allowed to do.", hint="It does not follow the profile."
+        )
     return Identity.decode(answer.payload)
 
 
@@ -141,13 +143,13 @@ def conflict_text(node: int) -> str:
 def twice_text(uuid: bytes, addresses: list[int]) -> str:
     """One sentence that names the UUID and where it answers."""
     where = " and ".join(f"0x{address:02X}" for address in addresses)
-    return f"Node {uuid.hex()} answers under {where}: one of them is not who it says."
+    return f"Node {uuid.hex()} answers at {where}: one of them is an impostor."
 
 
 def unfinished_text(nodes: set[int]) -> str:
     """One sentence that names the addresses whose answers came in part."""
     where = ", ".join(f"0x{node:02X}" for node in sorted(nodes))
-    return f"The answer of {where} began and did not end; ask again."
+    return f"The answer of {where} was incomplete; try again."
 
 
 def _read(gathering: Gathering, node: int) -> Identity | None:

@@ -50,8 +50,8 @@ _LONGEST_TRY: Final = 120.0
 def conflict(node: int) -> AddressConflict:
     """The error for two nodes under one address."""
     return AddressConflict(
-        f"Two nodes answer under the CAN address 0x{node:02X}.",
-        hint="Tap one of them, or connect it alone, and: teds-provision address UUID NEW.",
+        f"Two nodes answer at CAN address 0x{node:02X}.",
+        hint="Tap one of them, or connect it alone, then run: teds-provision address UUID NEW.",
     )
 
 
@@ -291,7 +291,7 @@ class _Exchange:
             if data[0] == OVERFLOW:
                 raise TooLongForNode(
                     f"The node at 0x{self._line.node:02X} refuses {len(self._body)} octets (flow control: overflow).",
-                    hint="Its Identify announces a longer maxMessage than it keeps; write in smaller pieces.",
+                    hint="It announces a longer maxMessage than it can handle.",
                 )
             if data[0] == WAIT:
                 until = time.monotonic() + 1.0
@@ -341,6 +341,6 @@ class _Exchange:
             return conflict(self._line.node)
         if self._torn:
             return Garbled(
-                f"{where} answers, but its replies come with frames missing.", hint="Check wiring, bit rate, bus load."
+                f"{where} answers, but frames of its replies are missing.", hint="Check wiring, bit rate, bus load."
             )
-        return NodeSilent(f"{where} does not answer any more.", hint="Check its power, its wiring and its address.")
+        return NodeSilent(f"{where} no longer answers.", hint="Check its power, its wiring and its address.")

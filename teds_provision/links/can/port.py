@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from shlex import quote
 from typing import Final
 
 from teds_provision.errors import LinkFailure, NoNode
@@ -151,12 +152,13 @@ class CanPort:
             time.sleep(max(0.0, round_ends - time.monotonic()))
         raise self._nobody(seconds, told)
 
-    def _nobody(self, seconds: float, told: set[bytes], whom: str = "The node did not answer") -> NoNode:
+    def _nobody(self, seconds: float, told: set[bytes]) -> NoNode:
         where = f"at 0x{self.spec.node:02X} on {self.spec.text}" if self.spec.node else f"on {self.spec.text}"
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
         return NoNode(
-            f"{whom} {where} within {seconds:g} s{others}.",
-            hint="Check its power, the bit rate and the address; teds-provision identify --via can lists who answers.",
+            f"The node did not answer {where} within {seconds:g} s{others}.",
+            hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
+            " nodes that answer.",
         )
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
@@ -187,7 +189,11 @@ class CanPort:
         if found.identities:
             return [self._contact(node, identity) for node, identity in sorted(found.identities.items())]
         if self.spec.node is None:
-            raise self._nobody(seconds, set(), whom="No node answered")
+            raise NoNode(
+                f"No node answered on {self.spec.text} within {seconds:g} s.",
+                hint="Check the nodes' power, the wiring, both terminators and the bit rate; to test the adapter:"
+                f" teds-provision doctor --can {quote(self.spec.text)}",
+            )
         return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 
     def _everyone(self, longest: float, notice: NoticeSink, silence: float = SILENCE_SECONDS) -> FunctionalAnswers:
@@ -305,5 +311,5 @@ class CanPort:
 def _tell(notice: NoticeSink, told: set[bytes], node: int, identity: Identity) -> None:
     if identity.uuid not in told:
         told.add(identity.uuid)
-        text = f"Node {identity.uuid.hex()} answers at 0x{node:02X}, but it is not the one looked for."
+        text = f"Node {identity.uuid.hex()} answers at 0x{node:02X}, but it is not the node that was requested."
         notice(Notice("foreign-tag", text))

@@ -189,13 +189,13 @@ class Rivals:
     @property
     def text(self) -> str:
         """One sentence that names the address."""
-        return f"Another base station on this bus uses our source address 0x{self._own:02X}."
+        return f"Another base station on this bus uses this station's source address 0x{self._own:02X}."
 
     @property
     def hint(self) -> str:
         """The cure."""
         free = 0xF2 if self._own == 0xF1 else 0xF1
-        return f"Give each station an address of its own, 0xF1 to 0xF7: add source=0x{free:02X} to --can of one."
+        return f"Give each station its own address, 0xF1 to 0xF7: add source=0x{free:02X} to --can of one of them."
 
 
 def _of_a_station(identifier: int) -> bool:

@@ -18,7 +18,7 @@ DEFAULT_DATA_BITRATE: Final = 2_000_000
 
 OptionValue = int | float | str | bool
 
-_HINT: Final = "Write it like socketcan:can0?bitrate=500000 or udp_multicast:239.74.163.2?node=0x21."
+_HINT: Final = "Examples: socketcan:can0?bitrate=500000 or udp_multicast:239.74.163.2?node=0x21."
 _RESERVED: Final = frozenset({"interface", "channel", "can_filters", "ignore_config", "config_context"})
 _HOW: Final = frozenset({"bitrate", "data_bitrate", "hop_limit", "fd", "receive_own_messages", "timing"})
 """Options that say how a bus is used, not which one it is."""
@@ -113,7 +113,7 @@ def _pairs(query: str) -> dict[str, str]:
 def _flag(values: dict[str, str], key: str) -> bool:
     value = values.pop(key, "0").lower()
     if value not in _TRUE | _FALSE:
-        raise UsageFailure(f"--can {key}={value!r} is neither 1 nor 0.", hint=f"Write {key}=1 or leave it out.")
+        raise UsageFailure(f"--can {key}={value!r} is neither 1 nor 0.", hint=f"Write {key}=1 or omit it.")
     return value in _TRUE
 
 

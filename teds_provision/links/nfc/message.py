@@ -62,7 +62,7 @@ def decode(octets: bytes) -> tuple[NdefRecord, ...]:
     while not ended:
         flags, record, at = _record(octets, at)
         if bool(flags & 0x80) != (not records and chunk is None):
-            raise Garbled("The NDEF message does not begin where it says.")
+            raise Garbled("The NDEF message has no valid beginning.")
         ended = bool(flags & 0x40)
         # a record goes on with a chunk where one is open, and only there
         if (chunk is not None) != (record.tnf == 6) or (chunk is not None and record.type):
@@ -73,7 +73,7 @@ def decode(octets: bytes) -> tuple[NdefRecord, ...]:
         if chunk is None:
             records.append(record)
     if chunk is not None or at != len(octets):
-        raise Garbled("The NDEF message does not end where it says.")
+        raise Garbled("The NDEF message has no valid end.")
     return tuple(records)
 
 

@@ -128,7 +128,7 @@ def _chosen(wanted: str) -> str:
         )
     raise NoReader(
         f"No PC/SC reader {wanted!r} is there; there are: {listed}." if found else "No PC/SC reader is plugged in.",
-        hint="Plug it in; pcsc_scan of the package pcsc-tools lists what pcscd sees.",
+        hint="Plug it in; pcsc_scan (package pcsc-tools) lists the readers of pcscd.",
     )
 
 

@@ -45,13 +45,13 @@ class Piece:
     def decode(cls, payload: bytes) -> Piece:
         """Read the payload of the record; raises Garbled when it is torn, corrupt or does not add up."""
         if len(payload) < _PIECE_HEAD:
-            raise Garbled(f"A payload record has at least {_PIECE_HEAD} octets, this one {len(payload)}.")
+            raise Garbled(f"A payload record needs at least {_PIECE_HEAD} octets; this one has {len(payload)}.")
         version, flags, transaction, total, offset = _HEAD.unpack_from(payload)
         if version != 1:
-            raise Garbled(f"A payload record of version {version} came; this tool speaks version 1.")
+            raise Garbled(f"Received a payload record of version {version}; this program supports version 1.")
         body = bytes(payload[_PIECE_HEAD:])
         if zlib.crc32(payload[: _HEAD.size] + body) != int.from_bytes(payload[_HEAD.size : _PIECE_HEAD], "big"):
-            raise Garbled("A payload record is torn: its CRC-32 does not fit.")
+            raise Garbled("A payload record is damaged: its CRC-32 does not match.")
         if body and offset + len(body) > total:
             raise Garbled(f"A payload record ends at {offset + len(body)} of {total} octets.")
         return cls(transaction, total, offset, body, bool(flags & _ANSWER), bool(flags & _MORE))
@@ -118,7 +118,7 @@ class Requester:
 
     def _take_reply(self, piece: Piece) -> None:
         if piece.total > LONGEST_FRAME:
-            raise Garbled(f"The node announces a reply of {piece.total} octets; {LONGEST_FRAME} is the most.")
+            raise Garbled(f"The node announces a reply of {piece.total} octets; at most {LONGEST_FRAME} are allowed.")
         if self._total is None:
             self._total = piece.total
         if piece.total != self._total:

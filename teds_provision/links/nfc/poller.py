@@ -65,9 +65,9 @@ class Poller:
         steps, end = 0, self._clock() + LONGEST
         while (reply := requester.reply) is None:
             if steps > requester.steps_allowed:
-                raise Garbled("The node asks for the same pieces again and again.")
+                raise Garbled("The node keeps asking for the same pieces.")
             if self._clock() > end:
-                raise NodeSilent(f"The node did not come to an end of its reply within {LONGEST:.0f} s.")
+                raise NodeSilent(f"The node did not finish its reply within {LONGEST:.0f} s.")
             steps += 1
             request = message.encode([tnep.payload_record(requester.next().encode())])
             self._exchange(request, lambda records: _take(records, requester))

@@ -56,7 +56,7 @@ def look(tag: ReaderTag) -> NodeInField | Foreign:
         return Foreign(tag, _described(tag, f"It holds {_listed(records)}."))
     payload = tnep.external(records, tnep.ID_TYPE)
     if payload is None:
-        return Foreign(tag, _described(tag, "It offers the service but does not say who it is (no id record)."))
+        return Foreign(tag, _described(tag, "It offers the service but gives no UUID (no id record)."))
     try:
         identity = Identity.decode(payload)
     except BadData as error:
@@ -65,7 +65,7 @@ def look(tag: ReaderTag) -> NodeInField | Foreign:
 
 
 def _described(tag: ReaderTag, what: str) -> str:
-    return f"A tag that is not a node of this profile: {tag.kind}, UID {tag.uid.hex().upper()}. {what}"
+    return f"This tag is not a node of this profile: {tag.kind}, UID {tag.uid.hex().upper()}. {what}"
 
 
 def _listed(records: Sequence[NdefRecord]) -> str:
@@ -140,18 +140,18 @@ class NfcPort:
                 continue
             if not waiting:
                 waiting = True
-                notice(Notice("waiting", f"Hold the node to the reader{self._named}.", left))
+                notice(Notice("waiting", f"Place the node on the reader{self._named}.", left))
             time.sleep(_PAUSE)
         if self._reader is None:
-            raise NoReader("The reader was unplugged and did not come back.", hint="Plug it in again.")
+            raise NoReader("The reader was unplugged.", hint="Plug it in again.")
         if isinstance(seen, NodeInField):
             raise NoNode(
-                f"Node {seen.identity.uuid.hex()} lies on the reader, and it is not the one that is meant.",
-                hint="Put the node there that you named, or name the one that lies there.",
+                f"Node {seen.identity.uuid.hex()} is on the reader, but another node was requested.",
+                hint="Place the requested node on the reader, or name the one that is on it.",
             )
         raise NoNode(
-            f"The node was not held to the reader within {seconds:.0f} s.",
-            hint="Hold the node's NFC antenna flat on the reader, or give it more time with --timeout.",
+            f"No node was placed on the reader within {seconds:.0f} s.",
+            hint="Place the node's NFC antenna flat on the reader, or allow more time with --timeout.",
         )
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
@@ -167,7 +167,7 @@ class NfcPort:
         here: bytes | None = None  # the node of the visit that is not over yet
         link: NfcLink | None = None
         gone_at, told = -_CHANGING, ""
-        waiting = Notice("waiting", f"Hold a node to the reader{self._named}.")
+        waiting = Notice("waiting", f"Place a node on the reader{self._named}.")
         notice(waiting)
         while not stop.is_set():
             seen = self._look(notice, stop)
@@ -222,7 +222,7 @@ class NfcPort:
                 return seen
             if isinstance(seen, NodeInField):
                 raise NodeSilent(
-                    f"The node moved away; another one ({seen.identity.uuid.hex()}) lies on the reader.",
+                    f"The node was removed; another one ({seen.identity.uuid.hex()}) is on the reader now.",
                     hint=f"Put node {uuid.hex()} back and run the command again.",
                 )
             if time.monotonic() > until:
@@ -390,7 +390,7 @@ def _tell(seen: NodeInField | Foreign, told: str, notice: NoticeSink) -> str:
         if text != told:
             notice(Notice("foreign-tag", text))
     else:
-        text = f"Node {seen.identity.uuid.hex()} is not the one that is waited for."
+        text = f"Node {seen.identity.uuid.hex()} is not the one that is expected."
         if text != told:
             notice(Notice("waiting", text))
     return text

@@ -70,8 +70,8 @@ def open_reader(path: str, trace: Trace | None = None) -> Reader | PcscReader:
         return Reader(frontend(device, path), again=path, simulated=True, trace=trace)
     if not _PATH.fullmatch(path):
         raise UsageFailure(
-            f"{path!r} is not the path of a reader.",
-            hint="Write auto, usb, usb:072f:2200, tty:USB0:pn532, pcsc or udp:localhost:54321.",
+            f"{path!r} is not a reader.",
+            hint="Use auto, usb, usb:072f:2200, tty:USB0:pn532, pcsc or udp:localhost:54321.",
         )
     if path.startswith("usb"):
         return _open_usb(path, trace)
@@ -119,7 +119,7 @@ def _the_only_one() -> str:
     found = plugged_in()
     if len(found) > 1:
         raise UsageFailure(
-            f"{len(found)} readers are plugged in: {', '.join(found)}.", hint=f"Name one, e.g. --nfc '{found[0]}'."
+            f"{len(found)} readers are plugged in: {', '.join(found)}.", hint=f"Choose one, e.g. --nfc '{found[0]}'."
         )
     return found[0] if found else "usb"
 
@@ -142,19 +142,21 @@ def _forbidden(path: str, vendor: int, product: int) -> NoReader:
             'TAG+="uaccess", GROUP="plugdev", MODE="0660"'
         )
         return NoReader(
-            f"This user may not open the reader {path}.",
+            f"You do not have permission to open reader {path}.",
             hint=f"Put this line into /etc/udev/rules.d/70-nfc.rules and plug the reader in again: {rule}",
         )
-    return NoReader(f"This user may not open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again.")
+    return NoReader(
+        f"You do not have permission to open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again."
+    )
 
 
 def _in_use(path: str, vendor: int, product: int) -> NoReader:
     driver = _kernel_driver(vendor, product)
     return NoReader(
-        f"The reader {path} is held by {driver or 'another program'}.",
+        f"Reader {path} is in use by {driver or 'another program'}.",
         hint=f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
         if driver
-        else "pcscd claims many readers: use it (--nfc pcsc), or stop it: sudo systemctl stop pcscd.socket pcscd.",
+        else "pcscd claims most readers: use it (--nfc pcsc), or stop it: sudo systemctl stop pcscd.socket pcscd.",
     )
 
 
@@ -162,7 +164,7 @@ def _absent(path: str) -> NoReader:
     if path.startswith("tty"):
         return NoReader(
             f"No NFC reader answers on the serial line {path}.",
-            hint="Look which line is there (ls /dev/ttyUSB* /dev/ttyACM*), and write it like tty:USB0:pn532.",
+            hint="List the serial lines (ls /dev/ttyUSB* /dev/ttyACM*), and write one like tty:USB0:pn532.",
         )
     return NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
 

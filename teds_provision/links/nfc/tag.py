@@ -34,7 +34,7 @@ class FieldLost(NodeSilent):
 
     def __init__(self) -> None:
         super().__init__(
-            "The node moved away from the reader.", hint="Hold it still on the reader and run the command again."
+            "The node was removed from the reader.", hint="Hold it still on the reader and run the command again."
         )
 
 
@@ -42,7 +42,7 @@ class ReaderLost(NoReader):
     """The reader itself went away while it was used."""
 
     def __init__(self, cause: object) -> None:
-        super().__init__(f"The reader does not answer any more ({cause}).", hint="Plug it in again.")
+        super().__init__(f"The reader no longer answers ({cause}).", hint="Plug it in again.")
 
 
 @contextmanager

@@ -49,7 +49,7 @@ class ServiceParameters:
     def decode(cls, payload: bytes) -> ServiceParameters:
         """Read the payload of a ``Tp`` record; raises Garbled when its length does not add up."""
         if len(payload) < 7 or len(payload) != 7 + payload[1]:
-            raise Garbled("A TNEP service record does not have the length that it says.")
+            raise Garbled("A TNEP service record has a wrong length.")
         uri = bytes(payload[2 : 2 + payload[1]])
         mode, wt_int, n_wait, max_ndef = struct.unpack(">BBBH", payload[-5:])
         return cls(uri, wt_int & 63, min(n_wait, 15), max_ndef, mode, payload[0])
@@ -81,7 +81,7 @@ def selection(records: Sequence[NdefRecord]) -> bytes | None:
     for record in records:
         if record.is_well_known(b"Ts"):
             if not record.payload or len(record.payload) != 1 + record.payload[0]:
-                raise Garbled("A TNEP select record does not have the length that it says.")
+                raise Garbled("A TNEP select record has a wrong length.")
             return record.payload[1:]
     return None
 

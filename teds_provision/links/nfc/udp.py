@@ -50,7 +50,7 @@ def address_of(path: str) -> tuple[str, int]:
     if host not in _LOOPBACK:
         raise UsageFailure(
             f"A simulated reader must be on this machine's loopback, not on {host}.",
-            hint="Write udp:localhost:PORT; anybody who reaches the port could write to the node.",
+            hint="Use udp:localhost:PORT; anyone who can reach the port could write to the node.",
         )
     return "127.0.0.1", int(port or DEFAULT_PORT)
 

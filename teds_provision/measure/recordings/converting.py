@@ -55,15 +55,15 @@ def convert(source: Path, target: Path, *, wide: bool = False) -> Converted:
     """
     suffix = target.suffix.lower()
     if suffix not in FILES and suffix != PARQUET:
-        raise UsageFailure(f"No recording is written as {target.name!r}.", hint=f"Use {', '.join([*FILES, PARQUET])}.")
+        raise UsageFailure(f"Unsupported format: {target.name!r}.", hint=f"Use {', '.join([*FILES, PARQUET])}.")
     if wide and suffix not in TEXT and suffix != PARQUET:
-        raise UsageFailure("--wide is for text files and Parquet.", hint="Name a FILE.csv or FILE.parquet.")
+        raise UsageFailure("--wide only works with text files and Parquet.", hint="Name a FILE.csv or FILE.parquet.")
     require_new(target)
     recording = open_recording(source)
     if recording.wide and not (suffix in TEXT or suffix == PARQUET):
         raise UsageFailure(
-            f"{source} is a grid: it has no raw values and no sample numbers for {suffix}.",
-            hint="Convert the recording that it was made of, or convert it to .csv or .parquet.",
+            f"{source} was written with --wide: it has no raw values and sample numbers, which {suffix} needs.",
+            hint="Convert the original recording, or choose .csv or .parquet.",
         )
     wide = wide or recording.wide
     summary = RecordingSummary()
@@ -205,7 +205,7 @@ def _published(path: Path, folder: Path) -> Path:
     try:
         os.link(path, target)
     except FileExistsError:
-        raise UsageFailure(f"{target} exists already and is not overwritten.", hint="Choose another name.") from None
+        raise UsageFailure(f"{target} already exists and is not overwritten.", hint="Choose another name.") from None
     except OSError:  # a file system without hard links
         require_new(target)
         os.rename(path, target)

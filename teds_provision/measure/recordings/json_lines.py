@@ -55,7 +55,7 @@ class JsonLines(Recording):
                 self.station = station_of(self._event(line))
 
     def _bad(self, why: str) -> BadData:
-        return BadData(f"{self.path}:{self._line}: {why}.", hint="It was changed since it was recorded, or is damaged.")
+        return BadData(f"{self.path}:{self._line}: {why}.", hint="It was changed after it was recorded, or is damaged.")
 
     def _lines(self) -> Iterator[bytes]:
         self._line, rest = 0, b""

@@ -78,7 +78,7 @@ class McapRecording(Recording):
     def _bad(self, why: str) -> BadData:
         return BadData(
             f"{self.path}: {why}.",
-            hint=f"See what of it is whole: teds-provision measure recover {quote(str(self.path))}",
+            hint=f"To recover what is intact: teds-provision measure recover {quote(str(self.path))}",
         )
 
     def _records(self, *, chunks: bool = True) -> Iterator[tuple[int, bytes]]:
@@ -86,7 +86,7 @@ class McapRecording(Recording):
         self.complete, self.torn = False, 0
         with open_to_read(self.path) as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise self._bad("it is no MCAP file")
+                raise self._bad("it is not an MCAP file")
             at = len(MAGIC)
             while head := file.read(HEAD.size):
                 code, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)

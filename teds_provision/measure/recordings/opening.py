@@ -26,6 +26,6 @@ def open_recording(path: Path) -> Recording:
     if not begin:
         raise BadData(f"{path} is empty.")
     raise BadData(
-        f"{path} is no recording.",
-        hint="A recording is what `measure --to` wrote: CSV, text, MCAP, JSON lines; or Parquet.",
+        f"{path} is not a recording.",
+        hint="Recordings are written by `measure --to`: CSV, text, MCAP, JSON lines; or Parquet.",
     )

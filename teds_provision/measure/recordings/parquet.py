@@ -177,7 +177,7 @@ class ParquetWriter:
 def _as_int64(column: NDArray[Any]) -> NDArray[Any]:
     whole = column.astype(np.int64)
     if column.dtype.kind == "f" and (whole != column).any():
-        raise ValueError("it is no whole number")
+        raise ValueError("it is not a whole number")
     return whole
 
 
@@ -211,15 +211,15 @@ class ParquetRecording(Recording):
                 self.path, memory_map=False, thrift_string_size_limit=64 << 20, thrift_container_size_limit=1 << 20
             )
         except (self._pa.ArrowException, OSError) as error:
-            raise self._bad(f"it is no whole Parquet file: {_first_line(error)}") from None
+            raise self._bad(f"it is not a complete Parquet file: {_first_line(error)}") from None
 
     def _words(self, metadata: dict[bytes, bytes]) -> tuple[dict[str, Any], list[Any]]:
         try:
             words, log = json.loads(metadata[_KEY]), json.loads(metadata.get(_AFTER, b"[]"))
         except (KeyError, ValueError, RecursionError):
-            raise self._bad("it is no recording of this tool") from None
+            raise self._bad("it is not a recording of this program") from None
         if not isinstance(words, dict) or words.get("format") != _FORMAT or not isinstance(log, list):
-            raise self._bad("it is no recording of this tool")
+            raise self._bad("it is not a recording of this program")
         return words, log
 
     def entries(self) -> Iterator[Entry]:

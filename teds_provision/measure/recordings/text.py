@@ -49,7 +49,7 @@ class TextRecording(Recording):
         self._width = expected
 
     def _bad(self, why: str) -> BadData:
-        return BadData(f"{self.path}:{self._line}: {why}.", hint="It was changed since it was recorded, or is damaged.")
+        return BadData(f"{self.path}:{self._line}: {why}.", hint="It was changed after it was recorded, or is damaged.")
 
     def _lines(self) -> Iterator[str]:
         """Whole lines, without their ends; what is no whole line at the end is torn."""

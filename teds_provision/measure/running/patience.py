@@ -41,7 +41,7 @@ class Patience:
     def again(self, pause: float) -> str:
         """When it is tried again, and for how long that goes on."""
         left = self.left
-        return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, given up in {left:.0f} s"
+        return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, giving up in {left:.0f} s"
 
     def gives_up(self, error: TedsProvisionError, *, proven: bool, elsewhere: Callable[[], bool]) -> bool:
         """Whether no other try is worth it.

@@ -21,7 +21,7 @@ from teds_provision.protocol.operation.stream_commands import Clock, StreamKind,
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.talk.conversation import SessionLost
 
-UNSIGNED = "nobody has signed the datasheet: raw values alone"
+UNSIGNED = "the datasheet is unsigned: raw values only"
 SILENT = 2.0  # seconds without a good message, beside three messages' time: then the node is lost
 
 

@@ -64,7 +64,7 @@ def _arm(
                 trusted.node.send(token.arm(Action.START, TRIGGER_LIFE).command(), "to wait for the trigger")
             armed.append((keeper, trusted))
         except (TedsProvisionError, SessionLost) as error:
-            note(f"Node {keeper.uuid.hex()} does not take the trigger: {error}")
+            note(f"Node {keeper.uuid.hex()} did not accept the trigger: {error}")
     return armed
 
 
@@ -77,12 +77,12 @@ def _mark(keeper: NodeKeeper, trusted: Trusted, before: int, after: int, note: C
         with keeper.turn:
             mark = keeper.streams.tell_time(trusted).mark
     except (TedsProvisionError, SessionLost) as error:
-        note(f"Node {keeper.uuid.hex()} did not say when it saw the trigger: {error}")
+        note(f"Node {keeper.uuid.hex()} did not report when it saw the trigger: {error}")
         return None
     with keeper.streams.mapping:
         low, high = keeper.streams.clock.ticks_at(before).low, keeper.streams.clock.ticks_at(after).high
     if not mark or not mark_is_honest(mark, TickBounds(low, high)):
-        note(f"Node {keeper.uuid.hex()} names another moment for the trigger: it is not begun.")
+        note(f"Node {keeper.uuid.hex()} reported a different time for the trigger, so it was not started.")
         keeper.stop()
         return None
     return mark

@@ -155,7 +155,7 @@ class ThreadedSink(ABC):
         if thread is not None:
             thread.join(CLOSING)
             if thread.is_alive():
-                self._fail(TedsProvisionError(f"{self.name} did not end within {CLOSING:.0f} s."))
+                self._fail(TedsProvisionError(f"{self.name} did not finish within {CLOSING:.0f} s."))
 
     @abstractmethod
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
@@ -294,13 +294,13 @@ def as_sink_failure(error: OSError, name: str) -> TedsProvisionError:
     import errno
 
     cures = {
-        errno.ENOSPC: ("the disk is full", "Free some space; what was written until now is whole."),
-        errno.EDQUOT: ("the disk quota is used up", "Free some space; what was written until now is whole."),
-        errno.EFBIG: ("the file may not grow any more", "Record to another disk, or in shorter runs."),
-        errno.EACCES: ("it may not be written", "Check the owner and mode of the folder."),
+        errno.ENOSPC: ("the disk is full", "Free some space; everything written so far is intact."),
+        errno.EDQUOT: ("the disk quota is used up", "Free some space; everything written so far is intact."),
+        errno.EFBIG: ("the file cannot grow any further", "Record to another disk, or in shorter runs."),
+        errno.EACCES: ("permission denied", "Check the owner and mode of the folder."),
         errno.EROFS: ("the disk is read-only", "Record to another disk."),
     }
     if error.errno == errno.ENOENT:
-        return NotFound(f"{name} cannot be written: its folder is not there.", hint="Make the folder first.")
+        return NotFound(f"{name} cannot be written: its folder is not there.", hint="Create the folder first.")
     cause, cure = cures.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path."))
     return StoreFailure(f"{name} cannot be written: {cause}.", hint=cure)

@@ -239,7 +239,7 @@ class FileSink(ThreadedSink):
         self._full = time.time(), before, what
         lost = self._abandon()
         self._count(written=-lost, dropped=lost)
-        self._say("waiting", f"The {what} since {iso(self._full[0])}: nothing is recorded until there is room.")
+        self._say("waiting", f"The {what} since {iso(self._full[0])}: nothing is recorded until space is free.")
 
     def _abandon(self) -> int:
         """Let the part go, and one without a whole piece altogether; how many values are lost with it."""
@@ -319,5 +319,5 @@ class FileSink(ThreadedSink):
             told = " ".join(self._gaps[-3:])
             raise StoreFailure(
                 f"{self.name} has {len(self._gaps)} {'gap' if len(self._gaps) == 1 else 'gaps'}. {told}",
-                hint="Free some space before the next run; what was written is whole.",
+                hint="Free some space before the next run; what was written is intact.",
             )

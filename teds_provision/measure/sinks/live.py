@@ -345,7 +345,7 @@ class TopicSink(ThreadedSink):
         rate = self._sent / (now - self._second) if self._second else 0.0
         self._sent, self._second = 0, now
         if self.stats.state == "running":
-            over = f", above the {BUDGET} that one process bears: lower --scalar-rate" if rate > BUDGET else ""
+            over = f", above the {BUDGET} that one process can handle: lower --scalar-rate" if rate > BUDGET else ""
             self._say("running", f"{rate:.0f} messages/s{over}")
         self._diagnose(time.time(), self._statuses(rate))
 
@@ -353,13 +353,11 @@ class TopicSink(ThreadedSink):
         found = [self._status(report) for report in self._reports.values()]
         for uuid in sorted({one.uuid for one in self._facts.values() if one.unsigned}):
             name = f"{self._topics.node(uuid)}: datasheet"
-            found.append(
-                DiagnosticEntry(WARN, name, "nobody has signed it: raw values alone, which reach no topic", uuid)
-            )
+            found.append(DiagnosticEntry(WARN, name, "unsigned: raw values only, not published on any topic", uuid))
         for uuid in sorted({one.uuid for one in self._facts.values() if one.unverified}):
             name = f"{self._topics.node(uuid)}: datasheet"
             found.append(
-                DiagnosticEntry(WARN, name, "unverified: nobody has signed it, and values are calibrated by it", uuid)
+                DiagnosticEntry(WARN, name, "unverified: values are calibrated by an unsigned datasheet", uuid)
             )
         for one in self._facts.values():
             if one.overdue:

@@ -71,11 +71,11 @@ class MqttSink(ThreadedSink):
         except (ValueError, KeyError):
             parts, port = urlsplit(""), 0
         if not parts.hostname or parts.path.strip("/") or parts.fragment:
-            raise UsageFailure(f"{spec!r} is no MQTT URL.", hint="Write mqtt://HOST or mqtts://USER@HOST:8883.")
+            raise UsageFailure(f"{spec!r} is not an MQTT URL.", hint="Use mqtt://HOST or mqtts://USER@HOST:8883.")
         if parts.password is not None:
             raise UsageFailure(
-                "A password may not stand on the command line.",
-                hint="Put it into a file: mqtt://USER@HOST?password-file=PATH",
+                "Passwords are not allowed on the command line.",
+                hint="Store it in a file: mqtt://USER@HOST?password-file=PATH",
             )
         shown = f":{port}" if port != PORTS[parts.scheme] else ""  # two brokers of one host are told apart
         super().__init__(f"{parts.scheme}://{_host(parts.hostname)}{shown}")
@@ -83,7 +83,7 @@ class MqttSink(ThreadedSink):
         self._host, self._port = parts.hostname, port
         self._files = _files_of(parts.query, tls=parts.scheme == "mqtts")
         if "password-file" in self._files and not parts.username:
-            raise UsageFailure("A password without a user is of no use.", hint=f"Write {parts.scheme}://USER@HOST?…")
+            raise UsageFailure("A password needs a user.", hint=f"Write {parts.scheme}://USER@HOST?…")
         self._why, self._greeted = "", False
         """Why it is not connected, as far as that is known; whether the broker has ever taken this client."""
         self._client: Any = None
@@ -132,7 +132,7 @@ class MqttSink(ThreadedSink):
         try:
             return _octets("password-file", self._files["password-file"]).decode().rstrip("\r\n")
         except UnicodeDecodeError as error:
-            raise BadData(f"The password file {self._files['password-file']} is no UTF-8 text.") from error
+            raise BadData(f"The password file {self._files['password-file']} is not UTF-8 text.") from error
 
     def _tls(self) -> ssl.SSLContext:
         """How the broker is checked, and what this client shows; raises NotFound, BadData."""
@@ -141,21 +141,21 @@ class MqttSink(ThreadedSink):
         try:
             context = ssl.create_default_context(cafile=self._files.get("ca"))
         except (ssl.SSLError, OSError) as error:
-            raise BadData(f"{self._files.get('ca')} holds no CA certificate in PEM.") from error
+            raise BadData(f"{self._files.get('ca')} contains no CA certificate in PEM format.") from error
         if "cert" in self._files:
             own, key = self._files["cert"], self._files.get("key")
             try:
                 context.load_cert_chain(own, key, password=_no_password)
             except (ssl.SSLError, OSError, ValueError) as error:
                 raise BadData(
-                    f"{own} and {key or own} are no certificate with its key (PEM, not encrypted).",
-                    hint="Name them by cert=PATH and key=PATH; openssl pkey takes the passphrase off a key.",
+                    f"{own} and {key or own} are not a certificate and its key (PEM, unencrypted).",
+                    hint="Give them as cert=PATH and key=PATH; openssl pkey removes the passphrase from a key.",
                 ) from error
         return context
 
     def _on_connect(self, _client: Any, _userdata: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
-            self._waits(f"the broker at {self._host} refuses: {str(reason).lower()}")
+            self._waits(f"the broker at {self._host} refused: {str(reason).lower()}")
             return
         self._greeted = True
         self._connected.set()
@@ -169,17 +169,18 @@ class MqttSink(ThreadedSink):
     def _on_disconnect(self, _client: Any, _userdata: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if self._connected.is_set():
             self._connected.clear()
-            self._waits(f"the broker at {self._host} has gone")
+            self._waits(f"the broker at {self._host} disconnected")
         elif reason == "Keep alive timeout":
             self._waits(f"whoever listens at {self._host}:{self._port} says nothing for {KEEP_ALIVE} s")
         elif not self._why:  # with TLS 1.3 a server refuses a client's certificate after the client's handshake
             tls = self._parts.scheme == "mqtts"
-            may = "; it may want another client certificate (cert=, key=)" if tls else "; it may speak TLS (mqtts://)"
-            self._waits(f"the broker at {self._host}:{self._port} ends the connection before it answers{may}")
+            other = "; it may expect a different client certificate (cert=, key=)"
+            may = other if tls else "; it may expect TLS (mqtts://)"
+            self._waits(f"the broker at {self._host}:{self._port} closed the connection without answering{may}")
 
     def _waits(self, why: str) -> None:
         self._why = why
-        self._say("waiting", why or f"waits for the broker at {self._host}")
+        self._say("waiting", why or f"waiting for the broker at {self._host}")
 
     def _begin(self) -> None:
         self._waits("")
@@ -315,7 +316,7 @@ class MqttSink(ThreadedSink):
         self._client.loop_stop()
         if not self._greeted and self.stats.dropped:
             why = self._why or f"the broker at {self._host}:{self._port} does not answer"
-            self._fail(TedsProvisionError(f"{self.name} took nothing: {why}.", hint="Mend that, and measure again."))
+            self._fail(TedsProvisionError(f"{self.name} accepted nothing: {why}.", hint="Fix that and measure again."))
 
     def _said_offline(self) -> bool:
         """Whether the broker knows that this measurement has ended."""
@@ -347,7 +348,7 @@ def _files_of(query: str, *, tls: bool) -> dict[str, str]:
     named: dict[str, str] = {}
     for key, path in parse_qsl(query, keep_blank_values=True):
         if key not in known or key in named or not path:
-            what = "comes twice or is empty" if key in known else "is not known there"
+            what = "comes twice or is empty" if key in known else "is unknown"
             more = "" if tls else f"; with mqtts:// also {', '.join(FILES[1:])}"
             raise UsageFailure(f"{key!r} in the URL of a broker {what}.", hint=f"Known: {', '.join(known)}{more}.")
         named[key] = path
@@ -379,11 +380,11 @@ def _in_words(error: BaseException, host: str, port: int) -> str:
     if isinstance(error, ssl.SSLError):
         return f"TLS with {host}:{port} fails: {error.reason or error}"
     if isinstance(error, socket.gaierror):
-        return f"the host {host} is not known"
+        return f"unknown host {host}"
     if isinstance(error, ConnectionRefusedError):
-        return f"nobody listens at {host}:{port}"
+        return f"nothing is listening at {host}:{port}"
     if isinstance(error, TimeoutError):
         return f"{host}:{port} does not answer"
     if isinstance(error, ConnectionResetError):  # while TLS begins
-        return f"{host}:{port} ends the connection; it may speak no TLS (mqtt://)"
+        return f"{host}:{port} closed the connection; it may not support TLS (mqtt://)"
     return f"{host}:{port} cannot be reached: {getattr(error, 'strerror', None) or error}"

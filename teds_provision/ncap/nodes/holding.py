@@ -162,7 +162,7 @@ class Holding:
         if held.error is not None and held.answered <= mine:
             raise held.error
         if held.let_go and held.answered < mine:
-            raise NodeBusy("The actuator was let go before it took this value.", hint="Set it again.")
+            raise NodeBusy("The actuator was released before it took this value.", hint="Set it again.")
         if held.answered < mine or held.applied is None:
             raise LinkFailure("The actuator did not answer in time.", hint="Its dead-man takes it to its safe state.")
         held.until = time.monotonic() + seconds

@@ -92,7 +92,7 @@ def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
             )
         blocks[block] = octets
     image = Image(node.uuid, blocks)
-    why = "the node opens no session under any key that is held here" if is_keyed(station, node.uuid) else ""
+    why = "the node does not open a session with any key held here" if is_keyed(station, node.uuid) else ""
     checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
     return Look(NodeVerdict(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), Sheet.of(image))
 

@@ -52,7 +52,7 @@ class StillThere:
         self._last = 0.0
 
     def look(self, known: Mapping[str, Sighting]) -> Iterator[tuple[str, Sighting | None]]:
-        """Ask those whose turn has come: each with what it says now, None where it does not answer any more."""
+        """Ask those whose turn has come: each with what it says now, None where it no longer answers."""
         now = time.monotonic()
         if now - self._last < 1.0:
             return
@@ -191,7 +191,7 @@ class Watch:
             except TedsProvisionError as error:
                 self._down(error)
             except Exception:  # noqa: BLE001 - a bug here must not end the watch on a link for good
-                _log.exception("The watch on %s failed; it begins anew.", self.place)
+                _log.exception("Watching %s failed; starting again.", self.place)
                 self._down(TedsProvisionError("This link failed unexpectedly.", hint="See the log."))
             if self.port is None:
                 self._anew.wait(pause)

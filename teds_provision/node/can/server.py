@@ -108,7 +108,7 @@ class Addresses:
         if seat.claim.conflict and not told:
             self._tell(
                 f"Another node announces the UUID {seat.uuid.hex()} (or one of equal CRC-32) "
-                f"from the CAN address 0x{before:02x}: take one of the two from the bus."
+                f"from the CAN address 0x{before:02x}: disconnect one of them."
             )
         if address != before:
             self._moved(seat)

@@ -119,11 +119,9 @@ class NfcServer:
             self._device.air = Air()
         try:
             if not self._bound() and not self._queue:
-                raise NoReader(f"Another node (or program) lies on {self._path}.", hint="End it, or name another port.")
+                raise NoReader(f"Another node or program is using {self._path}.", hint="Stop it, or use another port.")
         except OSError as error:
-            raise NoReader(
-                f"The node cannot lie on {self._path}: {error.strerror}.", hint="Try another port."
-            ) from error
+            raise NoReader(f"The node cannot use {self._path}: {error.strerror}.", hint="Try another port.") from error
         self._tnep.start()
         self._thread.start()
 

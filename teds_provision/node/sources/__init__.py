@@ -30,7 +30,7 @@ def kind_of(text: str) -> str:
     if kind not in SOURCES:
         raise UsageFailure(
             f"--source {text!r} is not known.",
-            hint="Write noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH or exec:COMMAND.",
+            hint="Use noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH or exec:COMMAND.",
         )
     return kind
 

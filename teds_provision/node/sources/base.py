@@ -74,7 +74,7 @@ class Drive(Protocol):
         """
 
     def host_clock(self) -> None:
-        """The source is at its end: the clock goes on with that of the host."""
+        """The source has ended: the clock goes on with that of the host."""
 
 
 class Generated:

@@ -67,7 +67,7 @@ class CommandSource(Lines):
         feed(lambda: os.read(descriptor, 65536), self.take)
         code = self._process.wait()
         if not self._stopped:
-            self._tell(f"The program {self._words[0]} ended with {code}: from now on no value is valid.")
+            self._tell(f"The program {self._words[0]} ended with {code}: from now on all values are invalid.")
             self.end()
 
 
@@ -78,5 +78,5 @@ def make(argument: str, places: Sequence[Place], tell: Tell) -> CommandSource:
     except ValueError as error:
         raise UsageFailure(f"exec: {error}.", hint="Close the quotes.") from error
     if not words:
-        raise UsageFailure("exec: names no program.", hint="Write --source 'exec:./hand --rate 100'.")
+        raise UsageFailure("exec: needs a program.", hint="Write --source 'exec:./hand --rate 100'.")
     return CommandSource(places, tell, words)

@@ -59,10 +59,10 @@ class Lines:
         if problem:
             self.dropped += 1
             if self.dropped == 1 or self.dropped % _TELL_EVERY == 0:
-                self._tell(f"A line of the source is left out ({self.dropped} so far): {problem}.")
+                self._tell(f"A line of the source was skipped ({self.dropped} so far): {problem}.")
 
     def end(self) -> None:
-        """The source is at its end: no value is valid any more, the node stays."""
+        """The source has ended: no value is valid any more, the node stays."""
         self._readings = {}
         if self._drive is not None:
             self._drive.host_clock()
@@ -71,9 +71,9 @@ class Lines:
         try:
             data = json.loads(line)
         except (ValueError, RecursionError):
-            return "it is no JSON"
+            return "it is not JSON"
         if not isinstance(data, dict):
-            return "it is no JSON object"
+            return "it is not a JSON object"
         readings: dict[int, Reading | None] = {}
         for form in ("value", "raw"):
             problem = self._read(form, data.get(form, {}), readings)
@@ -83,7 +83,7 @@ class Lines:
 
     def _read(self, form: str, values: object, readings: dict[int, Reading | None]) -> str:
         if not isinstance(values, dict):
-            return f'"{form}" is no object of channel names and numbers'
+            return f'"{form}" is not an object of channel names and numbers'
         for name, value in values.items():
             number = self._numbers.get(name)
             if number is None:
@@ -106,7 +106,7 @@ class Lines:
             change()
             return ""
         if not _is_seconds(time):
-            return '"t" is no number of seconds from 0 on'
+            return '"t" is not a number of seconds of 0 or more'
         if self._last is None:  # where the node's clock is further already, this one goes on from there
             self._drive.own_clock()
             self._offset = max(0.0, self._drive.now() - time)
@@ -167,7 +167,7 @@ class StandardInput(Lines):
         descriptor = self._stream.fileno()
         feed(lambda: b"" if self._stop.is_set() else os.read(descriptor, 65536), self.take)
         if not self._stop.is_set():
-            self._tell("Standard input is at its end: from now on no value is valid.")
+            self._tell("Standard input has ended: from now on all values are invalid.")
             self.end()
 
 
@@ -238,7 +238,7 @@ class UnixSocket(Lines):
                 feed(lambda: self._receive(peer), self.take)
                 self._peer = None
             if not self._stop.is_set():
-                self._tell("The simulation went away: until the next one comes no value is valid.")
+                self._tell("The simulation disconnected: until the next one connects, all values are invalid.")
                 self.end()
 
     def _receive(self, peer: socket.socket) -> bytes:
@@ -268,5 +268,5 @@ def make_stream(argument: str, places: Sequence[Place], tell: Tell) -> StandardI
 def make_socket(argument: str, places: Sequence[Place], tell: Tell) -> UnixSocket:
     """``unix:/run/user/1000/hand.sock``."""
     if not argument:
-        raise UsageFailure("unix: names no path.", hint="Write --source unix:/tmp/hand.sock.")
+        raise UsageFailure("unix: needs a path.", hint="Write --source unix:/tmp/hand.sock.")
     return UnixSocket(places, tell, Path(argument))

@@ -21,5 +21,5 @@ class Noise(Generated):
 def make(argument: str, places: Sequence[Place], tell: Tell) -> Noise:
     """``noise`` takes no argument."""
     if argument:
-        raise UsageFailure(f"noise takes nothing behind it, not {argument!r}.", hint="Write --source noise.")
+        raise UsageFailure(f"noise takes no argument, not {argument!r}.", hint="Write --source noise.")
     return Noise(places)

@@ -41,7 +41,7 @@ class Recorded(Generated):
         if seconds > self._end:
             if not self._told:
                 self._told = True
-                self._tell("The file of values is at its end: from now on no value is valid.")
+                self._tell("The file of values has ended: from now on all values are invalid.")
             return None
         if column is None:
             return None
@@ -51,7 +51,7 @@ class Recorded(Generated):
 def make(argument: str, places: Sequence[Place], tell: Tell) -> Recorded:
     """``file:run.csv``; raises NotFound, and BadData with the line that is wrong."""
     if not argument:
-        raise UsageFailure("file: names no file.", hint="Write --source file:run.csv.")
+        raise UsageFailure("file: needs a file.", hint="Write --source file:run.csv.")
     return read(Path(argument), places, tell)
 
 
@@ -84,14 +84,14 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     text = read_text(path, MOST_OCTETS, "file of values")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if len(lines) < 2:
-        raise BadData(f"{path} holds no row of values.", hint="First line: t,NAME,NAME …; then a row for each instant.")
+        raise BadData(f"{path} has no rows of values.", hint="First line: t,NAME,NAME …; then a row for each instant.")
     return lines
 
 
 def _time(path: Path, line: int, text: str, before: list[float]) -> float:
     time = _number(path, line, text)
     if time is None or (before and time < before[-1]):
-        raise BadData(f"{path}, line {line}: times must be numbers that ascend.")
+        raise BadData(f"{path}, line {line}: times must be ascending numbers.")
     return time
 
 
@@ -106,7 +106,7 @@ def _columns(path: Path, header: list[str], places: Sequence[Place]) -> list[tup
     numbers = {place.name: place.number for place in places if place.name}
     found: list[tuple[int, int, bool]] = []
     if not any(name.lower() in _TIME_NAMES for name in header):
-        raise BadData(f"{path}: no column is named t.", hint="First line: t,NAME,NAME …")
+        raise BadData(f"{path}: there is no column t.", hint="First line: t,NAME,NAME …")
     for index, name in enumerate(header):
         raw = name.startswith(_RAW)
         number = numbers.get(name.removeprefix(_RAW))
@@ -126,5 +126,5 @@ def _number(path: Path, line: int, text: str) -> float | None:
     try:
         number = float(text)
     except ValueError:
-        raise BadData(f"{path}, line {line}: {text[:40]!r} is no number.") from None
+        raise BadData(f"{path}, line {line}: {text[:40]!r} is not a number.") from None
     return number if math.isfinite(number) else None

@@ -144,7 +144,7 @@ def seal(
     """Return the envelope, signed by the station ``key`` with its ``certificate`` (field 104, 64 octets).
 
     ``proof`` is the board's signature over the challenge of ``nonce``; both are empty for a failed attempt at a board
-    that does not answer any more.
+    that no longer answers.
     """
     shown = security.decode(claim.teds)
     node = {"point": shown.node_key.hex(), "nonce": nonce.hex(), "proof": proof.hex(), "teds": claim.teds.hex()}

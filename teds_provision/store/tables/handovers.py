@@ -60,7 +60,7 @@ class HandoverTables:
                 "SELECT DISTINCT fingerprint FROM trust WHERE substr(fingerprint, 1, ?) = ?", (len(digits), digits)
             )
             if len(found) > 1:
-                raise UsageFailure(f"{digits} fits {len(found)} trusted keys.", hint="Give the whole fingerprint.")
+                raise UsageFailure(f"{digits} matches {len(found)} trusted keys.", hint="Give the whole fingerprint.")
             return bool(found) and self._database.change("DELETE FROM trust WHERE fingerprint = ?", found[0]) > 0
 
     def handovers(self) -> list[Handover]:

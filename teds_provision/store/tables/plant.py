@@ -242,10 +242,11 @@ class PlantTables:
         )
 
     def page_newest(self) -> list[tuple[str, str]]:
-        """Return, for every station, when its newest page was made as it says."""
-        return self._database.execute(
-            "SELECT station, max(created) FROM pages JOIN chains USING(chain) GROUP BY station"
+        """Return, for every station, when its newest page was made as it says: the one of the highest number."""
+        found = self._database.execute(
+            "SELECT station, created, max(n) FROM pages JOIN chains USING(chain) GROUP BY station"
         )
+        return [(station, created) for station, created, _ in found]
 
     def page(self, chain: int, n: int, hash: str) -> PageRow | None:
         """Return one page."""

@@ -208,7 +208,7 @@ def _segment_columns(table: CsvTable, number: int, names: list[str], channel: in
     wanted = (*SEGMENT, *takewhile(names.__contains__, (f"c{power}" for power in count())))
     twice = next((name for name in wanted if names.count(name) > 1), None)
     if twice is not None:
-        raise BadData(f'{table.file}:{number}: the column "{twice}" is there twice.')
+        raise BadData(f'{table.file}:{number}: the column "{twice}" appears twice.')
     wrong = _wrong_columns(names if channel is None else names[:channel] + names[channel + 1 :], wanted)
     if wrong:
         raise BadData(f"{table.file}:{number}: {wrong}: a table of segments has from, to, offset, c0, c1 and so on.")

@@ -87,7 +87,7 @@ class PreparedCurve:
         return total
 
     def outside(self, *inputs: Floats) -> NDArray[np.bool_]:
-        """Where an input lies outside its outer boundaries, or is no number."""
+        """Where an input lies outside its outer boundaries, or is not a number."""
         flags = np.zeros(inputs[0].shape, dtype=bool)
         for part, values in zip(self.calibration.inputs, inputs, strict=True):
             flags |= ~((values >= part.boundaries[0]) & (values <= part.boundaries[-1]))

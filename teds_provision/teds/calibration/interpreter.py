@@ -36,7 +36,7 @@ class Values:
     """A block of samples: ``raw`` as the data model says, ``value`` in the channel's unit, NaN where not ``valid``.
 
     Not valid: the raw value cannot be (more than SigBits, not a number), or the value lies beyond the limits by more
-    than the stated uncertainty, or is no number. Angles over a full turn wrap, so no limit is beyond them.
+    than the stated uncertainty, or is not a number. Angles over a full turn wrap, so no limit is beyond them.
     ``extrapolated``: an input lay outside the calibrated range; such a value is valid as long as the limits hold, which
     the guard looked at before the datasheet was signed.
     """
@@ -228,7 +228,7 @@ class ChannelInterpreter:
         unit = told or self.channel.shown
         asked, *ends = (unit.from_si(self.unit.to_si(each)) for each in (value, low, high))
         text = f"{min(ends):.6g} to {max(ends):.6g} {unit.text}".strip()
-        return f"{asked:.6g} {unit.text} is beyond the limits of channel {self.channel.number}, {text}."
+        return f"{asked:.6g} {unit.text} exceeds the limits of channel {self.channel.number}, {text}."
 
     @property
     def accepted(self) -> Range:

@@ -250,7 +250,7 @@ def _ascending(block: bytes, parts: list[tuple[int, int, int]]) -> tuple[dict[in
     if unknown and min(unknown) < 111:
         raise NotCanonical(f"The Security TEDS holds a field {min(unknown)} that the profile does not know.")
     if len(values.get(5, b"")) > CA_OCTETS:
-        raise NotCanonical(f"Field 5 (CA) has {len(values[5])} octets; {CA_OCTETS} is the most.")
+        raise NotCanonical(f"Field 5 (CA) has {len(values[5])} octets; at most {CA_OCTETS} are allowed.")
     return values, blocks
 
 

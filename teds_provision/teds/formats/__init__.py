@@ -115,7 +115,7 @@ def _read(octets: bytes, kind: Kind, path: Path | None) -> list[TedsBlock]:
     try:
         text = octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise BadData(f"Octet {error.start} of the file is no UTF-8 text.") from error
+        raise BadData(f"Octet {error.start} of the file is not UTF-8 text.") from error
     return _read_text(text, kind, path)
 
 

@@ -139,7 +139,7 @@ def _record(line: str, number: int) -> tuple[int, int, bytes]:
     except ValueError as error:
         raise BadData(f"Line {number} holds something that is no hex digit.") from error
     if len(octets) < 5 or octets[0] != len(octets) - 5:
-        raise BadData(f"Line {number} does not have the length that it says.")
+        raise BadData(f"Line {number} has a wrong length.")
     if sum(octets) & 0xFF:
         raise BadData(f"The checksum of line {number} is wrong.")
     kind, data = octets[3], octets[4:-1]

@@ -97,7 +97,7 @@ def _keys(element: Element, places: Mapping[str, Any], where: str, by: str) -> I
         if unit is not None:
             unit = str(words.get(unit, unit)) if isinstance(words, dict) else unit
             if _NUMBER.fullmatch(text) is None:
-                raise BadData(f"{where}: {text!r} at {rule['at']!r} is no number.")
+                raise BadData(f"{where}: {text!r} at {rule['at']!r} is not a number.")
             yield key, f"{text} {unit}"
         else:
             yield key, _plain(text)

@@ -213,7 +213,7 @@ def units_from_parts(parts: Mapping[str, object]) -> Units:
         exponents = {name: Fraction(_short(parts.get(name, 0))) for name in UNIT_PARTS}
         interpretation, extension = (int(_short(parts.get(name, 0))) for name in ("interpretation", "extension"))
     except (ValueError, ZeroDivisionError) as error:
-        raise BadData("The units hold an exponent that is no number.") from error
+        raise BadData("The units hold an exponent that is not a number.") from error
     if not all(abs(exponent) <= 64 and (2 * exponent).denominator == 1 for exponent in exponents.values()):
         raise BadData("Exponents of units are multiples of 1/2 from -64 to 63.5.")
     return Units(interpretation, **exponents, extension=extension)

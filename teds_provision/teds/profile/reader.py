@@ -426,7 +426,7 @@ def _number_text(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise _Wrong(f'a number and a unit are expected, like "10 mm"; "{text}" is no number.') from None
+        raise _Wrong(f'a number and a unit are expected, like "10 mm"; "{text}" is not a number.') from None
 
 
 def _angle(value: object) -> float:

@@ -180,7 +180,7 @@ def test_a_device_that_never_has_the_service_is_told(air: Air, port: Ports) -> N
     notices: list[Notice] = []
     with pytest.raises(NoNode):
         port().find(anyone, seconds=2, notice=notices.append)
-    assert any("does not have it" in notice.text for notice in notices)
+    assert any("does not offer it" in notice.text for notice in notices)
     assert radio.do("counts")["removed"] <= 2
 
 

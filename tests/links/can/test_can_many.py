@@ -208,7 +208,7 @@ def test_the_registry_opens_a_place_and_names_what_it_does_not_know(hub: Hub) ->
     port.close()
     with pytest.raises(UsageFailure, match="radio"):
         open_place("radio:0")
-    with pytest.raises(UsageFailure, match="know the bus"):
+    with pytest.raises(UsageFailure, match="requires --can"):
         open_port(LinkSettings("can"))
     with pytest.raises(UsageFailure, match="2 readers"):
         open_port(LinkSettings(nfc=("udp:localhost:7", "udp:localhost:8")))

@@ -150,7 +150,7 @@ def test_unplugging_in_the_middle_of_a_transfer_is_a_reader_error(make_node: Cal
         contact.link.exchange(bytes(400))
     assert caught.value.exit_code == 5
     contact.link.close()
-    with pytest.raises(NoReader, match="did not come back"):
+    with pytest.raises(NoReader, match="was unplugged"):
         port.find(lambda identity: True, seconds=0.5, notice=lambda notice: None)
     chip.plugged = True
     node.put_down()
@@ -162,7 +162,7 @@ def test_unplugging_in_the_middle_of_a_transfer_is_a_reader_error(make_node: Cal
 @pytest.mark.parametrize(
     ("refuse", "message", "hint"),
     [
-        (errno.EACCES, "may not open", 'ATTRS{idVendor}=="04e6", ATTRS{idProduct}=="5591"'),
+        (errno.EACCES, "do not have permission to open", 'ATTRS{idVendor}=="04e6", ATTRS{idProduct}=="5591"'),
         (errno.EBUSY, "held by pn533_usb", "modprobe -r pn533_usb"),
         (errno.EIO, "cannot be opened", "plug it in again"),
     ],

@@ -35,7 +35,7 @@ def refused(path: Path, *words: str) -> None:
     ("octets", "words"),
     [
         (b"", ["is empty"]),
-        (b"\x7fELF" + bytes(100), ["no recording"]),
+        (b"\x7fELF" + bytes(100), ["not a recording"]),
         (b"PAR1" + bytes(100) + b"PAR1", ["Parquet"]),
         (b'{"event":"data","uuid":"1","channel":1,"index":0,"time":[1],"raw":[1,2],"value":[1],"valid":[true]}\n', []),
         (b'{"event":' + b"[" * 100_000 + b"\n", [":1:", "not JSON"]),

@@ -116,7 +116,7 @@ def test_a_file_that_may_not_grow_ends_a_conversion_with_words_and_leaves_nothin
         check=False,
     )
     assert done.returncode == 7
-    assert "may not grow" in done.stderr
+    assert "cannot grow" in done.stderr
     assert {one.name for one in tmp_path.iterdir()} == {"run.mcap"}
 
 

@@ -364,7 +364,7 @@ def test_damage_inside_costs_the_damaged_chunk_alone(long: Finished, tmp_path: P
     if shape != "no end either":
         assert left[-1] == before[-1], "everything behind it stays"
     assert recover(done.output).was_whole
-    with pytest.raises(UsageFailure, match="exists already"):
+    with pytest.raises(UsageFailure, match="already exists"):
         recover(path)
     assert recover(path, tmp_path / "other.mcap").output == tmp_path / "other.mcap"
 
@@ -409,7 +409,7 @@ def test_a_file_whose_recorder_writes_is_refused(tmp_path: Path, name: str) -> N
     try:
         sink.write(block())
         until(lambda: (tmp_path / name).stat().st_size > 8, "nothing is written")
-        with pytest.raises(StoreLocked, match="is being recorded now"):
+        with pytest.raises(StoreLocked, match="is being recorded right now"):
             recover(tmp_path / name)
     finally:
         sink.close()

@@ -433,7 +433,7 @@ def test_a_command_that_is_no_number_moves_nothing() -> None:
     [
         (NodeReport(ARM, "running"), OK),
         (NodeReport(ARM, "running", lost=1), WARN),
-        (NodeReport(ARM, "running", "its clock lies"), WARN),
+        (NodeReport(ARM, "running", "its clock is inconsistent"), WARN),
         (NodeReport(ARM, "waiting"), WARN),
         (NodeReport(ARM, "lost", "no frame for 1 s"), ERROR),
         (NodeReport(ARM, "refused", "another key"), ERROR),

@@ -175,7 +175,7 @@ class TestWithMosquitto:
         sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
         sink.open([ANGLE], STATION)
         try:
-            until(lambda: sink.stats.detail == f"nobody listens at 127.0.0.1:{broker.port}")
+            until(lambda: sink.stats.detail == f"nothing is listening at 127.0.0.1:{broker.port}")
             sink.write(block())
             until(lambda: sink.stats.dropped == 1)
             for _ in range(2):

@@ -147,9 +147,9 @@ def test_a_client_shows_its_own_certificate(ports: dict[str, int], authority: Au
     both = authority.folder / "both.pem"
     both.write_bytes(certificate.read_bytes() + key.read_bytes())
     assert taken(f"{url}&cert={both}").error == ""
-    refused(url, "ends the connection", "client certificate")
+    refused(url, "closed the connection", "client certificate")
     stranger = Authority(authority.folder, "stranger").issue("intruder")
-    refused(f"{url}&cert={stranger[0]}&key={stranger[1]}", "ends the connection", "client certificate")
+    refused(f"{url}&cert={stranger[0]}&key={stranger[1]}", "closed the connection", "client certificate")
 
 
 @pytest.mark.system
@@ -158,8 +158,8 @@ def test_each_failure_is_told_in_words(ports: dict[str, int], authority: Authori
     elsewhere = f"mqtts://127.0.0.1:{ports['elsewhere']}?ca={authority.file}"
     refused(elsewhere, "certificate of 127.0.0.1 does not verify", "mismatch")
     refused(f"mqtts://127.0.0.1:{ports['users']}", "127.0.0.1", "TLS")
-    refused(f"mqtt://127.0.0.1:{ports['tls']}", "ends the connection", "mqtts://")
-    refused(f"mqtt://127.0.0.1:{free_tcp_port()}", "nobody listens at 127.0.0.1")
+    refused(f"mqtt://127.0.0.1:{ports['tls']}", "closed the connection", "mqtts://")
+    refused(f"mqtt://127.0.0.1:{free_tcp_port()}", "nothing is listening at 127.0.0.1")
     refused("mqtt://nowhere.invalid", "host nowhere.invalid is not known")
     refused(f"mqtt://127.0.0.1:{ports['users']}", "refuses", "not authorized")
     password = tmp_path / "password"
@@ -197,7 +197,7 @@ def test_files_are_regular_small_and_what_they_should_be(tmp_path: Path, authori
     pipe, huge, text = tmp_path / "pipe", tmp_path / "huge", tmp_path / "text"
     os.mkfifo(pipe)
     huge.write_bytes(b"x" * (1 << 21))
-    text.write_text("no certificate")
+    text.write_text("not a certificate")
     locked = authority.issue("locked", passphrase=b"secret words")
     for query, error in (
         (f"password-file={pipe}", BadData),

@@ -109,7 +109,7 @@ def test_a_key_that_may_leave_the_token_is_not_used(home, store_id, uri, vault):
     private = {Attribute.SENSITIVE: False, Attribute.EXTRACTABLE: True}
     curve.generate_keypair(label="loose", id=b"loose", private_template=private)
     (home / "b").mkdir()
-    with pytest.raises(VaultFailure, match="may leave the token"):
+    with pytest.raises(VaultFailure, match="can leave the token"):
         Pkcs11Vault.create(home / "b", store_id, uri.replace("?", ";object=loose?"), Person())
 
 
@@ -165,7 +165,7 @@ def test_many_processes_make_one_vault_and_all_hold_the_same_keys(tmp_path):
 
 def test_the_tool_chooses_and_opens_it_by_its_uri(home, store_id, uri):
     vault, why = create_vault(home, store_id, uri, Person())
-    assert (vault.kind, why) == ("pkcs11", "the token was asked for")
+    assert (vault.kind, why) == ("pkcs11", "as requested")
     assert "bench" in vault.description
     person = Person()
     assert open_vault(home, store_id, uri, person) is vault

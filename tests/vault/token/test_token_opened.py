@@ -43,9 +43,9 @@ def test_what_a_token_tells_of_the_tries_left():
     """SoftHSM never locks, so the flags are given here."""
     from pkcs11 import TokenFlag
 
-    assert _tries(0) == "The token does not say how many tries are left."
-    assert "counted a wrong try" in _tries(TokenFlag.USER_PIN_COUNT_LOW)
-    assert "One try is left" in _tries(TokenFlag.USER_PIN_COUNT_LOW | TokenFlag.USER_PIN_FINAL_TRY)
+    assert _tries(0) == "The token does not say how many attempts are left."
+    assert "counted a wrong attempt" in _tries(TokenFlag.USER_PIN_COUNT_LOW)
+    assert "One attempt is left" in _tries(TokenFlag.USER_PIN_COUNT_LOW | TokenFlag.USER_PIN_FINAL_TRY)
 
 
 def test_a_pin_pad_and_the_last_try():
@@ -58,7 +58,7 @@ def test_a_pin_pad_and_the_last_try():
     assert ask_pin(Shown, uri, person) is None
     Shown.flags = TokenFlag.USER_PIN_FINAL_TRY
     assert ask_pin(Shown, uri, person) == PIN
-    assert person.prompts == ["PIN of the token 't' (the last try before it locks)"]
+    assert person.prompts == ["PIN of the token 't' (last attempt before it locks)"]
 
 
 @pytest.mark.parametrize("module", ["/nowhere/module.so", __file__, "/usr/lib/x86_64-linux-gnu/libc.so.6", "/tmp"])
@@ -72,7 +72,7 @@ def test_a_token_that_is_not_there_or_not_clear(home, store_id, uris):
     with pytest.raises(VaultFailure, match="no token 'nobody'") as refused:
         Pkcs11Vault.create(home, store_id, f"pkcs11:token=nobody?module-path={MODULE}", Person())
     assert "Plug it in" in refused.value.hint
-    with pytest.raises(VaultFailure, match="tokens fit"):
+    with pytest.raises(VaultFailure, match="tokens match"):
         Pkcs11Vault.create(home, store_id, f"pkcs11:model=SoftHSM%20v2?module-path={MODULE}", Person())
 
 

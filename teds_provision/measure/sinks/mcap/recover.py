@@ -90,9 +90,9 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
             scan.walk()
             return _finished(scan, file, path, output)
     except FileNotFoundError:
-        raise NotFound(f"There is no file {path}.", hint="Name the recording that was cut.") from None
+        raise NotFound(f"There is no file {path}.", hint="Give the recording that was cut off.") from None
     except IsADirectoryError:
-        raise NotFound(f"{path} is a folder, not a file.", hint="Name one recording in it.") from None
+        raise NotFound(f"{path} is a folder, not a file.", hint="Give one recording in it.") from None
     except OSError as error:
         raise as_sink_failure(error, str(path)) from error
 
@@ -111,7 +111,7 @@ def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise StoreLocked(
-                f"{path} is being recorded now.", hint="End that measurement, or wait until it is over."
+                f"{path} is being recorded right now.", hint="End that measurement, or wait until it is over."
             ) from None
         except OSError:  # a file system without locks
             pass
@@ -122,7 +122,7 @@ def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
 
 
 def _no_mcap(path: Path) -> BadData:
-    return BadData(f"{path} is no MCAP file.", hint="A text or JSON-line recording needs no recovery.")
+    return BadData(f"{path} is not an MCAP file.", hint="Text and JSON-line recordings need no recovery.")
 
 
 def _finished(scan: _Scan, file: int, path: Path, output: Path | None) -> Recovered:
@@ -145,7 +145,7 @@ def _end_in_place(scan: _Scan, summary: McapSummary, file: int, path: Path) -> N
     """Cut the torn end off and write the one that belongs there; cut off itself, it leaves a torn end again."""
     with path.open("r+b") as same:
         if not os.path.samestat(os.fstat(file), os.fstat(same.fileno())):
-            raise BadData(f"{path} was replaced meanwhile.", hint="Run the same command again.")
+            raise BadData(f"{path} was replaced in the meantime.", hint="Run the same command again.")
         same.seek(scan.end)
         same.truncate()
         indexes = scan.end_indexes
@@ -313,12 +313,12 @@ class _Scan:
         chunk.found = None
         head = CHUNK_HEAD.unpack_from(self.octets, chunk.offset + HEAD.size)[:2]
         if chunk.counts and head != chunk.span:
-            self._damage("head of a chunk, mended", chunk.offset, chunk.begin)
+            self._damage("chunk header, repaired", chunk.offset, chunk.begin)
         elif torn and not chunk.indexed:
             self.end = chunk.begin
             return
         elif stated and not chunk.indexed:
-            self._damage("index of a chunk, made anew", chunk.begin, chunk.end)
+            self._damage("chunk index, rebuilt", chunk.begin, chunk.end)
         self.chunk = None
 
     def _body(self, chunk: _Chunk) -> bytes:
@@ -513,7 +513,7 @@ def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[by
     elif compression == b"":
         body = packed
     elif compression == b"lz4":
-        raise BadData(f"A chunk of {path} is compressed with lz4, which is not known here.")
+        raise BadData(f"A chunk of {path} is compressed with lz4, which is not supported.")
     else:
         return None
     return body, len(body) == size and (not checksum or zlib.crc32(body) == checksum)

@@ -108,7 +108,7 @@ const VERDICTS = {
 
 /** Tone, sign, word and meaning of the verdict on a node or a datasheet. */
 export function verdict(of) {
-  if (of.unverified) return ["warn", "warn", "Unverified", "Nobody signed this datasheet: name, channels and values are what the node says of itself."];
+  if (of.unverified) return ["warn", "warn", "Unverified", "Nobody signed this datasheet: name, channels and values come from the node itself."];
   const known = VERDICTS[of.verdict];
   if (known && of.from === "kept") return [...known.slice(0, 3), `${known[3]} Only the Security TEDS was read now; the rest is from the last reading.`];
   if (known) return known;

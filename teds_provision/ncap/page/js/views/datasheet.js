@@ -91,9 +91,9 @@ export class DatasheetTab {
     );
     return h(
       "div",
-      { class: "brought", role: "group", "aria-label": "Datasheet of the board itself" },
-      h("p", {}, "The board brought this datasheet itself; nobody has signed it. Look at it below. If it is right, sign it, and the node is in service."),
-      h("div", { class: "row" }, wrong ? field("Why it is right in spite of the findings", reason) : null, yes),
+      { class: "brought", role: "group", "aria-label": "The board's own datasheet" },
+      h("p", {}, "The board brought this datasheet, and nobody has signed it. Review it below. If it is correct, sign it to put the node into service."),
+      h("div", { class: "row" }, wrong ? field("Reason to accept it despite the findings", reason) : null, yes),
       result,
     );
   }

@@ -37,7 +37,7 @@ export class HistoryTab {
       entries.forEach((one) => this.entries.set(one.seq, one));
       this.paint();
     } catch (error) {
-      if (!this.entries.size) fill(this.none, error.status === 404 ? empty("Nothing is recorded of this node yet.") : trouble(error));
+      if (!this.entries.size) fill(this.none, error.status === 404 ? empty("No history for this node yet.") : trouble(error));
     }
   }
 
@@ -47,7 +47,7 @@ export class HistoryTab {
     this.shown = found.length;
     fill(this.total, this.older.hidden ? count(found.length, "entry", "entries") : `Newest ${count(found.length, "entry", "entries")}`);
     if (found.length) this.none.replaceChildren();
-    else fill(this.none, empty("Nothing is recorded of this node yet."));
+    else fill(this.none, empty("No history for this node yet."));
     fill(this.list, found.map((one) =>
       h("li", { class: one.failed ? "failed" : "" }, h("span", { class: "time" }, clock(one.time)), h("strong", {}, one.act), one.failed ? chip("bad", "bad", "failed") : null, h("span", { class: "grow" }, one.detail ?? ""), h("span", { class: "hint" }, one.actor ?? one.who ?? "")),
     ));

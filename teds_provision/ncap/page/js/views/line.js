@@ -84,7 +84,7 @@ function stationPart(part, job) {
     { class: "station-part", "aria-label": `${part.name}, ${job.title}` },
     h("h4", {}, part.name, part.over ? chip("warn", "warn", "more than allotted") : null),
     bars("Boards", [["first pass", first / whole, "good", part.first_pass === null ? "no board yet" : `${(100 * part.first_pass).toFixed(1)} %`], ["passed", part.passed / whole, "good", `${part.passed} of ${part.units}`], ["begun", part.units / whole, "", `${part.units} of ${part.allotment}`]]),
-    steps.length ? bars("Seconds, median and worst", steps.map(([name, one]) => [name, one.median / worst, "", `${one.median.toFixed(2)} · ${one.worst.toFixed(2)}`, one.worst / worst])) : h("p", { class: "hint" }, part.attempts ? "Its pages say no seconds; its evidence is not here." : "Nothing was tried yet."),
+    steps.length ? bars("Seconds, median and worst", steps.map(([name, one]) => [name, one.median / worst, "", `${one.median.toFixed(2)} · ${one.worst.toFixed(2)}`, one.worst / worst])) : h("p", { class: "hint" }, part.attempts ? "No step times: this station's evidence is not available here." : "No attempts yet."),
     failures.length ? bars("Failures", failures.map(([code, many]) => [code, many / most, "bad", count(many, "attempt")])) : null,
   );
 }

@@ -7,7 +7,7 @@ import { now, on, state } from "../state.js";
 
 const EVERY = 5000; // ms between two looks for what is new
 const PAGE = 200; // entries in one answer
-const TIMES = [["All of it", 0], ["Last hour", 3600], ["Last day", 86400], ["Last 7 days", 604800]]; // s
+const TIMES = [["All entries", 0], ["Last hour", 3600], ["Last day", 86400], ["Last 7 days", 604800]]; // s
 const TYPING = 250; // ms after the last key before the station is asked
 
 export function logView(main) {

@@ -27,7 +27,7 @@ class Groups {
     this.error = h("div", {});
     this.fresh = h("details", { class: "panel new" }, h("summary", {}, icon("plus"), "New group"), h("div", { class: "stack" }, field("Name", this.name, "Letters, digits and _; the topic gets this name."), this.members, h("div", { class: "row" }, this.make), this.error));
     this.others = h("ul", { class: "groups" });
-    this.all = button("Measure everything that is trusted", { onclick: () => this.all.busy(() => this.everything()) }, "play");
+    this.all = button("Measure all trusted nodes", { onclick: () => this.all.busy(() => this.everything()) }, "play");
     this.element = h("section", { class: "side-wide", "aria-label": "Groups" }, h("div", { class: "row" }, this.all), h("h3", {}, "Groups"), this.none, this.list, this.fresh, this.others);
     this.off = on("groups measurements nodes status connection", () => this.paint());
     this.paint();
@@ -55,7 +55,7 @@ class Groups {
     this.error.replaceChildren();
     try {
       await post("measurements", { match: "all" });
-      say("Every trusted node is measured from now on, and when it comes.");
+      say("Every trusted node is measured now, and as soon as it appears.");
       await refresh("measurements", "nodes");
     } catch (error) {
       toast("bad", error.message, error.hint);
@@ -222,7 +222,7 @@ function loneCard(one) {
     const names = members.map(nameOf).join(", ");
     if (now.match) {
       const waiting = now.nodes.filter((node) => node.state === "waiting" && node.why);
-      text(name, now.match === "all" ? "Everything that is trusted" : now.match);
+      text(name, now.match === "all" ? "All trusted nodes" : now.match);
       text(words, [`${count(members.length, "node")} measured${names ? `: ${names}` : ""}`, ...waiting.map((node) => `${nameOf(state.nodes.get(node.uuid) ?? node)} waits: ${node.why}`)].join(". "));
     } else if (members.length > 1) {
       text(name, count(members.length, "node"));

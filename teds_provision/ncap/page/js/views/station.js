@@ -120,7 +120,7 @@ export function stationView(main) {
     }
     if (words !== whose.value.trim()) return; // a later question is under way
     const lines = found.nodes.map((one) => h("li", {}, h("span", { class: "grow" }, h("strong", {}, one.name || short8(one.uuid)), h("span", { class: "hint" }, ` ${one.uuid}: ${heldBy(one.says)}`)), one.says.revoked.length ? chip("bad", "warn", "revoked") : one.conflicts.length ? chip("warn", "warn", one.conflicts[0].name) : null));
-    fill(holders, words && !lines.length ? h("li", { class: "hint" }, "No station says anything of such a node.") : lines, found.more ? h("li", { class: "hint" }, "There are more: type more of its UUID or name.") : null);
+    fill(holders, words && !lines.length ? h("li", { class: "hint" }, "No station reports such a node.") : lines, found.more ? h("li", { class: "hint" }, "More nodes match: enter more of the UUID or name.") : null);
   }
 
   const asking = setInterval(askPlant, PLANT_EVERY);

@@ -82,7 +82,7 @@ export class WritePanel {
 
   /** A board of another type than the datasheet's becomes one only where a person says so. */
   otherType(name, body, error) {
-    const again = button("Make it one of the new type: compare", {}, "ask");
+    const again = button("Change its type and compare", {}, "ask");
     again.addEventListener("click", () => this.compare(name, { ...body, retype: true }));
     fill(this.result, trouble({ message: error.message, hint: "Choose the datasheet of this board, or connect the right board." }), h("div", { class: "row" }, again));
   }
