@@ -298,7 +298,7 @@ def test_a_healthy_station_has_nothing_that_failed(stationed: System, monkeypatc
     for name in ("home", "store", "audit log", "backup", "lock", "disk"):
         assert found[name].result == "ok", found[name]
     assert found["keyring"].result == "skipped"
-    assert (found["vault"].result, "cheaply" in found["vault"].why) == ("warning", True)
+    assert (found["vault"].result, "weak demo settings" in found["vault"].why) == ("warning", True)
 
 
 def test_a_home_open_to_others_gets_its_chmod(stationed: System) -> None:

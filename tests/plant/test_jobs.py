@@ -178,7 +178,7 @@ def test_a_board_of_another_type_costs_no_unit(tmp_path: Path, owner: Station) -
 
 def test_a_board_on_the_bus_is_not_enough_for_a_job_that_asks_for_taps(owner: Station) -> None:
     line, one = line_of(owner), board(1)
-    with pytest.raises(PolicyRefused, match="assurance tap"):
+    with pytest.raises(PolicyRefused, match="assurance 'tap'"):
         build(line, one, MemoryLink(one, via="can", tapped=True))
     assert units(line) == []
     assert one.state.state == NodeState.FACTORY
@@ -270,7 +270,7 @@ def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: 
     file = tmp_path / f"{one.uuid.hex()}.csv"
     line = line_of(owner, tmp_path, calibration=CalibrationRule("any", max_age_days=30))
     table = "raw, value\n0, 0\n16384, 6.283185307\n"
-    for dated, why in ((f"# date: {NOW - timedelta(days=31):%Y-%m-%d}\n", "is of"), ("", "has no date")):
+    for dated, why in ((f"# date: {NOW - timedelta(days=31):%Y-%m-%d}\n", "is dated"), ("", "has no date")):
         file.write_text(dated + table)
         with pytest.raises(PolicyRefused, match=why):
             build(line, one)
@@ -295,7 +295,7 @@ def test_a_job_is_a_keepers_word_and_its_id_means_one_job(tmp_path: Path, owner:
 
 def test_who_joined_no_registry_takes_no_job(tmp_path: Path, owner: Station) -> None:
     stranger = make_station(tmp_path / "stranger")
-    with pytest.raises(PolicyRefused, match="joined no registry"):
+    with pytest.raises(PolicyRefused, match="has not joined one"):
         take_job(stranger, job_of(owner))
     stranger.close()
 

@@ -258,12 +258,15 @@ def test_an_office_signs_for_a_line_over_a_folder(desk: Desk, owner: Station, we
     asked = tmp_path / "request.jws"
     assert west.ask("sign", other.uuid, "--by", "owner", "--job", job, "--output", asked, *nfc(desk))["request"]
     assert owner.ask("signer", "once", asked, "--output", tmp_path / "signed.json")["sequence"] == 1
-    west.ask("write", other.uuid, "--image", tmp_path / "signed.json", *nfc(desk))
-    done = west.provision("nfc", "--job", job, "--files", stick)
-    assert (done["verdict"], done["attempt"]) == ("authentic", 2)
     west.ask("agree", other.uuid, "--rotate", "--yes", *nfc(desk))
     stale = west.refuses("write", other.uuid, "--image", tmp_path / "signed.json", *nfc(desk), code=6)
     assert "--by OFFICE" in stale["hint"], "this station may not sign it itself"
+    anew = tmp_path / "anew.jws"
+    assert west.ask("sign", other.uuid, "--by", "owner", "--job", job, "--output", anew, *nfc(desk))["request"]
+    owner.ask("signer", "once", anew, "--output", tmp_path / "anew.json")
+    west.ask("write", other.uuid, "--image", tmp_path / "anew.json", *nfc(desk))
+    done = west.provision("nfc", "--job", job, "--files", stick)
+    assert (done["verdict"], done["attempt"]) == ("authentic", 2)
     shown = owner.run("job", "status", made["id"]).out
     assert "west: nothing received yet" in shown, "0 units only means that its pages are not here"
     west.ask("evidence", "export", tmp_path / "proof")

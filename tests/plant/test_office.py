@@ -364,7 +364,7 @@ def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: D
 
 def test_who_has_not_sign_is_no_office(desk: Desk) -> None:
     request = desk.request(desk.run(), board(1))
-    with pytest.raises(PolicyRefused, match="role sign"):
+    with pytest.raises(PolicyRefused, match="role 'sign'"):
         answer(desk.line, request.octets)
 
 

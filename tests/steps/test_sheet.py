@@ -51,7 +51,7 @@ def test_rows_without_the_calibration_that_their_type_asks_for_are_told_before_t
 ) -> None:
     (tmp_path / "cal.csv").write_text("# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,500\n")
     sheet = read(station, tmp_path, "name,calibration,profile\na,,\nb,cal.csv,\nc,,\nd,,limit-switch\n")
-    assert [warning for warning in sheet.warnings if "type asks for" in warning] == [
+    assert [warning for warning in sheet.warnings if "type requires" in warning] == [
         "Rows 1, 3: the type requires a calibration, but the sheet gives none."
     ]
 

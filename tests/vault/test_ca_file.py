@@ -23,7 +23,7 @@ def test_the_ca_key_can_be_kept_away_and_brought_back(tmp_path: Path, vault: Fil
     assert vault.drop_ca()
     assert not vault.drop_ca()
     assert FileVault.open(tmp_path, STORE, Person()).ca() is None
-    with pytest.raises(VaultFailure, match="no CA key"):
+    with pytest.raises(VaultFailure, match="does not contain a CA key"):
         vault.export_ca(tmp_path / "other.pem", "a passphrase for the safe")
     with pytest.raises(WrongPassphrase):
         vault.import_ca(away, "not that passphrase")

@@ -150,7 +150,7 @@ def test_what_is_written_is_made_from_what_lies_in_the_keyring_now(monkeypatch: 
     assert not other.refresh()
     assert not other.drop_ca(), "it is gone already"
     backend.entries.clear()
-    with pytest.raises(VaultFailure, match="any more"):
+    with pytest.raises(VaultFailure, match="no longer has"):
         other.add_master()
     assert backend.entries == {}
 

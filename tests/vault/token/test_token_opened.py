@@ -25,7 +25,7 @@ def closed(uri, home, store_id):
 
 def test_a_wrong_pin_is_said_once_with_what_is_known_of_the_tries(closed, home, store_id, uri):
     person = Person("000000")
-    with pytest.raises(WrongPassphrase, match=r"PIN of the token 'bench' is wrong\. .*tr") as refused:
+    with pytest.raises(WrongPassphrase, match=r"PIN of the token 'bench' is wrong\. .*attempt") as refused:
         Pkcs11Vault.open(home, store_id, uri, person)
     assert len(person.prompts) == 1
     assert refused.value.exit_code == 7
