@@ -200,7 +200,7 @@ $(VENV)/.dev: $(VENV)/.made pyproject.toml
 firmware: vectors-c $(VENV)/.dev
 	@sh scripts/install-test-packages
 	$(MAKE) --no-print-directory -C firmware all check
-	$(BIN)/python -m pytest -q -m 'soak or not soak' tests/firmware/test_faults.py
+	$(BIN)/python -m pytest -q -m 'soak or not soak' tests/firmware/test_faults.py tests/firmware/test_options.py
 
 # Every test of whole runs whose needs the node in C meets, with it on the desk (tests/firmware/c_node.py).
 OF_C := tests/e2e tests/cli/test_handover.py tests/cli/test_life.py tests/cli/test_messages.py tests/check/test_node_check_cli.py

@@ -52,15 +52,15 @@ def host() -> Path:
     return BUILD / "host" / "teds-node"
 
 
-def compile_host(program: Path, source: Path) -> None:
-    """The host port with this file in place of the one of its name."""
+def compile_host(program: Path, source: Path | None = None, *options: str) -> None:
+    """The host port with this file in place of the one of its name, with these options beside its own."""
     need("make", "gcc")
     words = make("-s", "--no-print-directory", "words-of-host").split()
     good = [FIRMWARE / word for word in words if word.endswith(".c")]
-    sources = [str(source if path.name == source.name else path) for path in good]
+    sources = [str(source if source is not None and path.name == source.name else path) for path in good]
     flags = [word for word in words if not word.endswith(".c")]
     done = subprocess.run(
-        ["gcc", "-O1", "-w", *flags, *sources, "-o", str(program), "-lbearssl", "-lm"],
+        ["gcc", "-O1", "-w", *flags, *options, *sources, "-o", str(program), "-lbearssl", "-lm"],
         cwd=FIRMWARE, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
