@@ -1,23 +1,459 @@
-"""``handover``: what became of the bundles that left here and came here."""
+"""Node keys that leave for another station and come from one: ``export-keys``, ``import-keys``, ``handover``."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from io import BytesIO
+from itertools import chain, islice, zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 import click
 
 from teds_provision import handover as handover_room
-from teds_provision import protocol
+from teds_provision import plant, protocol
+from teds_provision.cli import options
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
-from teds_provision.cli.rendering import count_of, local_time
-from teds_provision.errors import BadData, NotFound, TedsProvisionError
-from teds_provision.files import read_limited
+from teds_provision.cli.options import (
+    COMMAND_SETTINGS,
+    WholeNumber,
+    command,
+    dry_run_option,
+    examples,
+    link_options,
+    links_given,
+    yes_option,
+)
+from teds_provision.cli.rendering import count_of, first_lines, local_time, reporter_for
+from teds_provision.errors import BadData, LinkFailure, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.files import holds, open_to_read, read_limited, require_new, write_new
+from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from teds_provision.handover.incoming import Imported, ImportPlan
+    from teds_provision.handover.outgoing import Exported, ExportPlan, Leaving
     from teds_provision.handover.pending import Closed
     from teds_provision.station.station import Station
+
+
+# -- export-keys -------------------------------------------------------------------------------------------------------
+
+_LEAVING_SHOWN = 20
+_MEANS = {
+    "copy": "A copy: both stations will hold the same keys, and either can impersonate a node to the other.",
+    "move": "A move: this station stops using the keys at once. It is only certain to be locked out when the other"
+    " station has rotated them at its first contact.",
+}
+
+
+@command(
+    "teds-provision export-keys --to lab --all --output lab.jwe",
+    "teds-provision export-keys --to lab 8d4d --mode move --output finger.jwe",
+    "teds-provision export-keys --to south 8d4d --mode move --send",
+)
+@click.argument("uuids", metavar="[UUID]…", nargs=-1)
+@click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
+@click.option("--all", "everything", is_flag=True, help="Export every node whose key is held and proven.")
+@click.option(
+    "--mode",
+    type=click.Choice(["copy", "move"]),
+    default="copy",
+    show_default=True,
+    help="Share the keys, or hand them over.",
+)
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Where to write the sealed bundle.",
+)
+@click.option("--send", is_flag=True, help="Send it through the registry at the next sync, instead of a file.")
+@click.option(
+    "--expires",
+    type=WholeNumber(1, 365),
+    default=7,
+    show_default=True,
+    metavar="DAYS",
+    help="Days until the bundle expires.",
+)
+@click.option("--ca", metavar="FINGERPRINT", help="Only nodes that hold this CA key.")
+@yes_option
+@dry_run_option
+@pass_app
+def export_keys(
+    app: App,
+    uuids: tuple[str, ...],
+    receivers: tuple[str, ...],
+    everything: bool,
+    mode: Literal["copy", "move"],
+    output: Path | None,
+    send: bool,
+    expires: int,
+    ca: str | None,
+    yes: bool,
+    dry_run: bool,
+) -> None:
+    """Hand node keys to other base stations in a bundle sealed to them and signed by this one.
+
+    Nothing is ever written unencrypted. A move marks the nodes as given away before the file exists; its receipt
+    completes it ("handover receipt"), and until then "handover undo" reverts it. If one bundle cannot hold all nodes,
+    they are split into FILE, FILE.2 and so on, each with its own receipt.
+    """
+    if everything == bool(uuids):
+        raise click.UsageError("Name the nodes, or use --all.")
+    if send == (output is not None):
+        raise click.UsageError("Give one of --output FILE and --send.")
+    if send and len(receivers) != 1:
+        raise click.UsageError("A parcel is for one station: give --to once.")
+    station = app.station()
+    if send:
+        plant.folding.require_roster(station)
+    nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
+    order = handover_room.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
+    if not dry_run:
+        station.unlock()  # now: nobody is asked for a passphrase while the store is held
+    state = station.version()  # before the plan: what changes while it is made is not overlooked either
+    shown = handover_room.outgoing.plan_exports(station, order)
+    outputs = handover_room.outgoing.outputs_of(output, len(shown)) if output is not None else []
+    if dry_run:
+        told = _exported(shown, outputs, station)
+        id_ = None if shown[0].earlier is None else shown[0].id
+        app.emit({**told, "id": id_, "plan": True}, _plan_text(shown, station))
+        return
+    app.note(_plan_text(shown, station))
+    app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
+    with station.lock("export-keys", app.note):
+        # A person may have taken minutes to answer. What they said yes to is done, or nothing is.
+        plans = shown if station.version() == state else handover_room.outgoing.plan_exports(station, order)
+        require_same([plan.content for plan in plans] == [plan.content for plan in shown])
+        told = _exported(plans, outputs, station)
+        if send:
+            names = [plant.parcels.send_export(station, plan, datetime.now(UTC)) for plan in plans]
+            app.emit({**told, "parcels": names}, f"{_count(plans)} will leave with the next registry sync.")
+            return
+        done = handover_room.outgoing.export_all(station, plans, outputs)
+    _tell_export(app, plans, outputs, told, done)
+
+
+def _tell_export(
+    app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], told: dict[str, Any], done: Sequence[Exported]
+) -> None:
+    for bundle, one in zip(told["bundles"], done, strict=True):
+        bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
+    fresh = any(one.fresh for one in done)
+    told |= {"sha256": done[0].sha256, "octets": sum(one.octets for one in done), "fresh": fresh}
+    again = "" if fresh else " (nothing to do: it already exists)"
+    moved = plans[0].mode == "move"
+    next_step = "\nTo complete the move with its receipt: teds-provision handover receipt FILE.receipt" if moved else ""
+    files = ", ".join(map(str, outputs))
+    app.emit(told, f"{_count(plans)} in {files}, handover {plans[0].id}{again}.{next_step}")
+
+
+def _count(plans: Sequence[ExportPlan]) -> str:
+    return count_of(sum(len(plan.nodes) for plan in plans))
+
+
+def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Station) -> dict[str, Any]:
+    plan = plans[0]
+    return {
+        "bundle": str(outputs[0]) if outputs else None,
+        "from": station.fingerprint,
+        "to": [{"name": record.name, "fingerprint": record.fingerprint} for record in plan.receivers],
+        "mode": plan.mode,
+        "count": sum(len(one.nodes) for one in plans),
+        "id": plan.id,
+        "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "nodes": [node.uuid.hex() for one in plans for node in one.nodes],
+        "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
+        "also_held_by": sorted({digits for one in plans for digits in one.also_held_by}),
+        "bundles": [
+            {"bundle": None if output is None else str(output), "id": one.id, "count": len(one.nodes)}
+            for one, output in zip_longest(plans, outputs)
+        ],
+    }
+
+
+def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
+    plan, chosen = plans[0], [one for part in plans for one in part.nodes]
+    lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {local_time(plan.expires.isoformat())}"]
+    lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
+    lines += first_lines(_node_lines(chosen[:_LEAVING_SHOWN], station), _LEAVING_SHOWN, len(chosen))
+    lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
+    if plan.also_held_by:
+        names = ", ".join(handover_room.pending.peer_name(station, digits) for digits in plan.also_held_by)
+        lines.append(f"  also held by {names} from an earlier copy, until the keys are rotated")
+    lines.append("Compare by voice:")
+    lines += [
+        f"  to   {record.name}\n       {handover_room.trust.spoken(record.fingerprint)}" for record in plan.receivers
+    ]
+    lines.append(f"  from {station.name}\n       {handover_room.trust.spoken(station.fingerprint)}")
+    return "\n".join([*lines, _MEANS[plan.mode]])
+
+
+def _node_lines(chosen: Sequence[Leaving], station: Station) -> list[str]:
+    known = station.nodes.of_page([node.uuid for node in chosen])
+    return [f"  {node.uuid.hex()}  epoch {node.epoch}  {known[node.uuid].name or ''}".rstrip() for node in chosen]
+
+
+def require_same(same: bool) -> None:
+    """What a person was shown must still be so under the lock."""
+    if not same:
+        raise PolicyRefused("Another command changed the plan while this one was waiting.", hint="Run it again.")
+
+
+# -- import-keys -------------------------------------------------------------------------------------------------------
+
+_COMING_SHOWN = 40
+_PIECE = 64 * 1024
+_CIPHERTEXT = b'"ciphertext"'
+_COPIED = "A copy: the sender keeps the same keys, and either station can impersonate a node to the other."
+_MOVED = "A move: each key is rotated at the first contact; until then, the sender can still use it."
+
+
+@command(
+    "teds-provision import-keys lab.jwe --no-prove",
+    "teds-provision import-keys lab.jwe --via can --can udp_multicast:239.74.163.2 --yes",
+    "teds-provision import-keys --received",
+)
+@click.argument("file", type=options.FileToRead(), required=False)
+@click.option("--received", is_flag=True, help="Import parcels from the registry that wait for confirmation.")
+@click.option(
+    "--prove/--no-prove", default=None, help="Contact each node and open a session (default if a link is named)."
+)
+@click.option(
+    "--receipt",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Where to write the signed receipt (default: FILE.receipt).",
+)
+@yes_option
+@dry_run_option
+@link_options
+@click.pass_context
+def import_keys(
+    ctx: click.Context,
+    file: Path | None,
+    received: bool,
+    prove: bool | None,
+    receipt: Path | None,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
+) -> None:
+    """Take over node keys from a trusted base station: check, show the plan, import, write the receipt.
+
+    A node counts as taken over once it opens a session here; after a move its key is rotated in that session, and only
+    then is the sender locked out. Importing the same bundle again changes nothing and gives the same receipt.
+    """
+    app = ctx.find_object(App)
+    assert app is not None
+    station = app.station()
+    if received == (file is not None):
+        raise click.UsageError("Give one of FILE and --received.")
+    if file is None:
+        _take_received(app, station, yes=yes, dry_run=dry_run)
+        return
+    with _bundle_file(file) as bundle:
+        receipt = receipt or file.with_name(file.name + ".receipt")
+        station.unlock()
+        state = station.version()  # before the plan: what changes while it is made is not overlooked either
+        shown = handover_room.incoming.plan_import(station, bundle)
+        if dry_run:
+            app.emit({**_import_plan(shown), "receipt": None, "plan": True}, _import_text(station, shown))
+            return
+        if not isinstance(shown, handover_room.incoming.Imported):
+            require_new(receipt)
+            app.note(_import_text(station, shown))
+            app.confirm(f"Import {count_of(len(shown.taken))}?", yes=yes)
+        with station.lock("import-keys", app.note):
+            plan = shown if station.version() == state else handover_room.incoming.plan_import(station, bundle)
+            _require_as_shown(plan, shown)
+            if isinstance(plan, handover_room.incoming.Imported):  # before, or meanwhile by another command
+                done = plan
+            else:
+                done = handover_room.incoming.import_bundle(station, plan)
+            if not holds(receipt, done.receipt + b"\n"):  # the same bundle once more: its receipt may lie there
+                write_new(receipt, done.receipt + b"\n")
+    outcomes: list[dict[str, Any]] = []
+    if links_given(ctx) if prove is None else prove:
+        outcomes = _prove(app, station, done, links)
+    _tell_import(app, station, done, receipt, _import_plan(shown), outcomes)
+    if prove and any(outcome["why"] for outcome in outcomes):
+        raise click.exceptions.Exit(LinkFailure.exit_code)
+
+
+def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
+    """Show each parcel that waits, and why; take in those that a person says yes to."""
+    plant.folding.require_roster(station)
+    station.unlock()
+    tables, told = station.plant.parcels, list[dict[str, Any]]()
+    for row in tables.parcels("in", "waiting", "later"):
+        if row.kind != "bundle":
+            continue
+        octets = tables.parcel_document(row.id, "in")
+        try:
+            shown = handover_room.incoming.plan_import(station, octets)
+        except TedsProvisionError as error:
+            app.warn(f"{row.id}: {error.message}")
+            continue
+        app.note(f"{_import_text(station, shown)}\nReason for waiting: {row.detail or 'it has just arrived'}")
+        one = {**_import_plan(shown), "parcel": row.id, "why": row.detail}
+        told.append(one)
+        if dry_run:
+            continue
+        app.confirm("Import this parcel?", yes=yes)
+        with station.lock("import-keys", app.note):
+            plan = handover_room.incoming.plan_import(station, octets)
+            _require_as_shown(plan, shown)
+            done = plant.parcels.import_parcel(station, row, plan)
+        one["fresh"] = done.fresh
+    count = f"{len(told)} parcel{'s' * (len(told) != 1)}"
+    text = f"{count}." if dry_run else f"{count} imported; the receipts leave with the next sync."
+    app.emit({"received": told, "plan": dry_run}, text if told else "Nothing waits.")
+
+
+@contextmanager
+def _bundle_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a bundle, to be read from any place; one that comes through a pipe is read whole."""
+    most = protocol.handover.bundle.MAX_BUNDLE_OCTETS
+    with open_to_read(path) as file:
+        whole = file if file.seekable() else BytesIO(file.read(most + 1))
+        if whole.seek(0, os.SEEK_END) > most:
+            raise BadData(f"{path} is larger than {most} octets and cannot be a bundle.")
+        if not _is_sealed(whole):
+            raise BadData(f"{path} is not a handover bundle.", hint="Use the file that export-keys wrote.")
+        yield whole
+
+
+def _is_sealed(file: BinaryIO) -> bool:
+    """Whether a file looks like a JWE."""
+    file.seek(0)
+    before = file.read(_PIECE)
+    if before.lstrip()[:1] != b"{":
+        return False
+    while (piece := file.read(_PIECE)) and _CIPHERTEXT not in before:
+        before = before[-len(_CIPHERTEXT) :] + piece
+    return _CIPHERTEXT in before
+
+
+def _require_as_shown(plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> None:
+    """Raise PolicyRefused where another command changed what becomes of a node; taken in meanwhile is fine."""
+    if not isinstance(plan, handover_room.incoming.Imported):
+        require_same(not isinstance(shown, handover_room.incoming.Imported) and plan.nodes == shown.nodes)
+
+
+def _import_plan(plan: ImportPlan | Imported) -> dict[str, Any]:
+    """The result as far as it is known before anything happens."""
+    if isinstance(plan, handover_room.incoming.Imported):
+        return _taken_before(plan)
+    bundle = plan.opened.bundle
+    nodes = ((one.node.uuid.hex(), one.decision, one.why) for one in plan.nodes)
+    denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
+    told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
+    notes = {one.node.uuid.hex(): list(one.notes) for one in plan.nodes if one.notes}
+    passed_over = [{"uuid": one.uuid.hex(), "why": why} for one, why in plan.passed_over]
+    return told | {"notes": notes, "revocations_passed_over": passed_over}
+
+
+def _taken_before(done: Imported) -> dict[str, Any]:
+    refused = done.refused_uuids
+    same = ((uuid, "same", "") for uuid in done.notes.uuids if uuid not in refused)
+    nodes = chain(same, ((uuid, "refused", why) for uuid, why in done.notes.refused))
+    return _import_result(done.row.peers[0], done.row.mode, done.row.id, nodes, [])
+
+
+def _import_text(station: Station, plan: ImportPlan | Imported) -> str:
+    """The plan for people."""
+    if isinstance(plan, handover_room.incoming.Imported):
+        return f"This bundle was imported on {plan.row.created}; there is nothing to do."
+    bundle, nodes = plan.opened.bundle, plan.nodes
+    lines = [
+        f"A {bundle.mode} of {count_of(len(nodes))} from {handover_room.pending.peer_name(station, bundle.sender)}"
+    ]
+    shown = [f"  {one.decision:<8} {one.node.uuid.hex()}  {one.why}".rstrip() for one in nodes[:_COMING_SHOWN]]
+    lines += first_lines(shown, _COMING_SHOWN, len(nodes))
+    noted = islice((one for one in nodes if one.notes), _COMING_SHOWN)
+    lines += [f"  {one.node.uuid.hex()}: {note}" for one in noted for note in one.notes]
+    lines += [f"  revoked  {one.uuid.hex()}  {one.why}" for one in plan.denied]
+    lines += [f"  its ban of {one.uuid.hex()} is ignored: {why}" for one, why in plan.passed_over]
+    own, sender = handover_room.trust.spoken(station.fingerprint), handover_room.trust.spoken(bundle.sender)
+    lines += [f"Compare by voice:\n  from {sender}\n  to   {own}"]
+    if not plan.ca_is_known:
+        lines.append(f"The CA {protocol.keys.fingerprint(bundle.ca)[:32]} will be trusted for these nodes only.")
+    return "\n".join([*lines, _COPIED if bundle.mode == "copy" else _MOVED])
+
+
+def _import_result(
+    sender: str, mode: str, handover_id: str, nodes: Iterable[tuple[str, str, str]], denied: list[dict[str, str]]
+) -> dict[str, Any]:
+    decisions: dict[str, str] = {}
+    refused: list[dict[str, str]] = []
+    for uuid, decision, why in nodes:
+        decisions[uuid] = decision
+        if decision == "refused":
+            refused.append({"uuid": uuid, "why": why})
+    return {
+        "from": sender,
+        "id": handover_id,
+        "mode": mode,
+        "count": len(decisions),
+        "imported": [uuid for uuid, decision in decisions.items() if decision != "refused"],
+        "refused": refused,
+        "decisions": decisions,
+        "revoked": denied,
+    }
+
+
+def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:
+    proven = handover_room.incoming.proven_of(station, done.uuids)
+    waiting = [uuid for uuid in done.uuids if uuid not in proven]
+
+    def hold() -> AbstractContextManager[None]:
+        return station.lock("import-keys", app.note)
+
+    outcomes = (
+        handover_room.incoming.prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
+    )
+    return [
+        {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
+        if isinstance(one, handover_room.incoming.Proven)
+        else {"uuid": one.uuid.hex(), "rotated": False, "why": one.why}
+        for one in outcomes
+    ]
+
+
+def _tell_import(
+    app: App, station: Station, done: Imported, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
+) -> None:
+    imported = told["imported"]
+    known = handover_room.incoming.proven_of(station, map(bytes.fromhex, imported))
+    proven = [uuid for uuid in imported if bytes.fromhex(uuid) in known] if known else []
+    pending = [uuid for uuid in imported if bytes.fromhex(uuid) not in known] if known else imported
+    not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
+    told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
+    app.emit(told, _summary(done, receipt, not_met, pending, sum(bool(one["rotated"]) for one in outcomes)))
+
+
+def _summary(done: Imported, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
+    lines = [
+        f"{count_of(len(done.notes.uuids) - len(done.notes.refused))} imported"
+        + ("." if done.fresh else " earlier; nothing changed.")
+    ]
+    lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
+    lines += [f"  no contact with {uuid}: {why}" for uuid, why in not_met.items()]
+    lines += [f"{count_of(rotated)} rotated: the sender is locked out."] if rotated else []
+    if pending:
+        lines.append(f"{count_of(len(pending))} not proven yet: the first contact here proves them (agree UUID).")
+    lines.append(f"Receipt for the sender: {receipt}")
+    return "\n".join(lines)
+
+
+# -- handover ----------------------------------------------------------------------------------------------------------
 
 
 @click.group(

@@ -62,8 +62,8 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "names": Entry("names", "names", "Choose the topics under which channels are published."),
     },
     "Keys and backup": {
-        "export-keys": Entry("export_keys", "export_keys", "Hand node keys to another station in a sealed bundle."),
-        "import-keys": Entry("import_keys", "import_keys", "Take over node keys from another station."),
+        "export-keys": Entry("handover", "export_keys", "Hand node keys to another station in a sealed bundle."),
+        "import-keys": Entry("handover", "import_keys", "Take over node keys from another station."),
         "handover": Entry("handover", "handover", "List, confirm and undo key handovers."),
         "revoke": Entry("life", "revoke", "Ban a node's key on this station and those it hands keys to."),
         "decommission": Entry("life", "decommission", "Reset a node and take it out of service."),
@@ -80,9 +80,9 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         ),
     },
     "The line": {
-        "job": Entry("job", "job", "Define what a line may build, and follow its progress."),
-        "signer": Entry("signer", "signer", "Sign what a line builds, as the office of a job."),
-        "evidence": Entry("evidence", "evidence", "List, export and verify evidence of every board."),
+        "job": Entry("line", "job", "Define what a line may build, and follow its progress."),
+        "signer": Entry("line", "signer", "Sign what a line builds, as the office of a job."),
+        "evidence": Entry("line", "evidence", "List, export and verify evidence of every board."),
     },
     "Try it out": {
         "demo": Entry("demo", "demo", "Run two stations and a virtual node on this machine, start to finish."),

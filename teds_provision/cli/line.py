@@ -1,31 +1,49 @@
-"""``job``: what a line may build, and how it does."""
+"""The production line: ``job``, what may be built; ``signer``, the office; ``evidence``, the proof of every board."""
 
 from __future__ import annotations
 
-import uuid
+import signal
+import threading
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 import click
 
-from teds_provision import plant, protocol, steps
+from teds_provision import plant, protocol, steps, talk, teds
 from teds_provision.cli.build import read_file, write_file
-from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, WholeNumber, command, dry_run_option, examples
+from teds_provision.cli.context import App, pass_app, to_json
+from teds_provision.cli.options import (
+    COMMAND_SETTINGS,
+    FileToRead,
+    Seconds,
+    WholeNumber,
+    command,
+    dry_run_option,
+    examples,
+)
 from teds_provision.cli.rendering import local_time, moment, print_table
-from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, UsageFailure
 from teds_provision.files import json_files
-from teds_provision.teds.profile.load import default_folders, find_profile, load_profile
+from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from rich.console import Console
 
+    from teds_provision.plant.office import Answered
+    from teds_provision.plant.verify_evidence import JudgedEvidence
     from teds_provision.plant.yields import StationYield
     from teds_provision.protocol.plant.job import CalibrationRule, Job
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.station.station import Station
+    from teds_provision.store import EvidenceRow
+
+
+# -- job ---------------------------------------------------------------------------------------------------------------
 
 
 @click.group(
@@ -106,14 +124,16 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
 def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
     if (told["count"] is None) == (told["listed"] is None):
         raise UsageFailure("A job needs a number of boards or a list of boards.", hint="Use one of --count and --list.")
-    path = find_profile(told["profile"], default_folders(station.home))
-    load_profile(path, default_folders(station.home)).build(bytes(10))  # else nobody could work on the job
+    path = teds.profile.load.find_profile(told["profile"], teds.profile.load.default_folders(station.home))
+    teds.profile.load.load_profile(path, teds.profile.load.default_folders(station.home)).build(
+        bytes(10)
+    )  # else nobody could work on the job
     boards = _boards(told["listed"]) if told["listed"] is not None else {}
     total = told["count"] or len(boards)
     sign = told["sign"]
     begins = told["not_before"]
     return protocol.plant.job.Job(
-        str(uuid.uuid4()),
+        str(uuid4()),
         roster.registry,
         told["title"],
         path.stem,
@@ -377,3 +397,243 @@ def _table(console: Console, found: Job, parts: list[StationYield], here: str) -
 
 for one in (new, list_jobs, show, send, close, status):
     job.add_command(one)
+
+
+# -- signer ------------------------------------------------------------------------------------------------------------
+
+_LOOK_SECONDS = 0.2
+_MOST_WAIT_SECONDS = 1.0
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision signer run --job 0b5f --files /media/stick",
+        "teds-provision signer once request.jws --output signed.json",
+    ),
+)
+def signer() -> None:
+    """Sign what a line builds: every datasheet is rebuilt here before it is signed."""
+
+
+@command("teds-provision signer run --job 0b5f --files /media/stick", name="run")
+@click.option("--job", "jobs", multiple=True, required=True, metavar="ID", help="Sign for this job; repeatable.")
+@click.option(
+    "--files",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Transfer folder, instead of the registry.",
+)
+@click.option(
+    "--for", "seconds", type=Seconds(min=0), metavar="SECONDS", help="Stop after this time (default: Ctrl-C)."
+)
+@pass_app
+def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None) -> None:
+    """Answer requests until Ctrl-C, one line each.
+
+    A request is signed if its board signed it, its job allows it, and the datasheet built here is the same.
+    """
+    station = app.station()
+    ids = {plant.jobs.find_job(station, job).id for job in jobs}
+    station.unlock()
+    post = plant.asking.post_of(station, files)
+    app.closing(post.close)
+    inbox = plant.asking.Inbox(station, post, protocol.plant.document.SIGN_REQUEST)
+    app.closing(inbox.close)
+    stop = talk.meeting.IdleStop(None)
+    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
+    if seconds is not None:
+        threading.Timer(seconds, stop.set).start()
+    app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")
+    while True:
+        for one in plant.office.answer_all(station, post, inbox, ids, stop=stop.is_set):
+            _tell(app, station, one)
+        if stop.is_set():
+            return
+        inbox.wait(_MOST_WAIT_SECONDS, _LOOK_SECONDS)
+
+
+@command(
+    "teds-provision signer once request.jws --output signed.json",
+    "teds-provision signer once request.jws --output answer.jws",
+    name="once",
+)
+@click.argument("file", type=FileToRead(), metavar="FILE")
+@click.option(
+    "--output",
+    "-o",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="FILE.json for the signed image (see: write --image), otherwise the answer.",
+)
+@click.option("--jump", is_flag=True, help="Accept a sequence far above the one known here.")
+@pass_app
+def once(app: App, file: Path, output: Path, jump: bool) -> None:
+    """Answer one request that came as a file.
+
+    `sign UUID --by OFFICE --output FILE` creates it. This station must know its job: teds-provision job show FILE.
+    """
+    station = app.station()
+    station.unlock()
+    octets = read_file(file).strip()
+    sealed = plant.office.answer(station, octets, jump=jump)
+    if sealed is None:
+        raise NotAuthentic(
+            f"{file} is not a request from a member of this plant to this office.",
+            hint="To create one: teds-provision sign UUID --by OFFICE --output FILE",
+        )
+    request = protocol.plant.signing.open_request(octets, plant.jobs.roster_of(station).point_of)
+    answered = protocol.plant.signing.open_answer(sealed, lambda kid: station.point)
+    if output.suffix != ".json":
+        write_file(output, sealed.decode())
+    elif answered.security:
+        write_file(output, request.image.with_block(teds.image.SECURITY, answered.security).to_json())
+    _tell(app, station, plant.office.Answered(request, answered), end=True)
+
+
+def _tell(app: App, station: Station, one: Answered, *, end: bool = False) -> None:
+    request, answered = one.request, one.answer
+    told: dict[str, Any] = {"uuid": request.uuid.hex(), "job": request.job, "from": request.signer}
+    roster = station.plant.roster
+    name = roster.name_of(request.signer) if roster is not None else request.signer[:16]
+    if not answered.refused:
+        app.emit({**told, "sequence": answered.sequence}, f"signed   {request.uuid.hex()}  {answered.sequence}  {name}")
+        return
+    if end:
+        raise plant.asking.OfficeRefused(f"Not signed ({answered.refused}): {answered.why}.")
+    refused = {**told, "refused": answered.refused, "why": answered.why}
+    app.emit(refused, f"refused  {request.uuid.hex()}  {answered.refused}  {name}: {answered.why}")
+
+
+for one in (run, once):
+    signer.add_command(one)
+
+
+# -- evidence ----------------------------------------------------------------------------------------------------------
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision evidence list",
+        "teds-provision evidence export evidence/",
+        "teds-provision evidence verify evidence/ --ca ca.pem",
+    ),
+)
+def evidence() -> None:
+    """List, export and verify evidence: one file per board and attempt, signed by station and board."""
+
+
+@command(
+    "teds-provision evidence verify evidence/ --ca ca.pem",
+    "teds-provision --json evidence verify 8d4d9da65281f7000000.1.json --ca ca.pem --pins boards.csv",
+    name="verify",
+)
+@click.argument("files", metavar="FILE|DIR…", nargs=-1, required=True)
+@click.option("--ca", type=FileToRead(), required=True, metavar="KEY.pem", help="The owner's CA key.")
+@click.option("--pins", type=FileToRead(), metavar="FILE", help="Whitelist file: the key of each board.")
+@click.option("--roster", type=FileToRead(), metavar="FILE", help="Also check it against this roster of the plant.")
+@pass_app
+def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster: Path | None) -> None:
+    """Verify evidence offline, from files alone.
+
+    Needs no station, no store and no network. A file is valid if a station certified by this CA signed it, its
+    datasheet is authentic under this CA, and the board itself signed the facts. Valid evidence may document a failed
+    attempt. Prints one line each, then totals; exits with the worst: 4 for an invalid file, 8 for one that cannot be
+    read.
+    """
+    grounds = plant.verify_evidence.Grounds.of(protocol.keys.from_pem(read_file(ca)), pins, roster)
+    names = json_files([Path(file) for file in files], "evidence")
+    totals = plant.verify_evidence.EvidenceTotals()
+    for lines, counted in plant.verify_evidence.verify_evidence(grounds, names, _json if app.json else _line):
+        totals.join(counted)
+        app.lines(lines)
+    if app.json:
+        app.emit(totals.to_json())
+    else:
+        words = ", ".join(f"{count} {word}" for word, count in sorted(totals.words.items()))
+        app.lines([f"{totals.files} file{'' if totals.files == 1 else 's'}: {words}."])
+        if roster is None:
+            app.note("Without --roster, evidence from a stolen station counts as valid too.")
+    if totals.exit_code:
+        raise click.exceptions.Exit(totals.exit_code)
+
+
+def _line(judged: JudgedEvidence) -> str:
+    found = judged.evidence
+    text = f"{judged.word:<13}  {found.uuid.hex() if found else '-':<20}  {judged.path}"
+    why = judged.error.message if judged.error is not None else "; ".join(judged.faults)
+    if judged.good and found is not None and found.facts.failure is not None:
+        why = f"the attempt ended with {found.facts.failure}"
+    return printable(f"{text}: {why}" if why else text)
+
+
+def _json(judged: JudgedEvidence) -> str:
+    return to_json(judged.to_json())
+
+
+@command("teds-provision evidence list", "teds-provision evidence list 8d4d --job 0b5f", name="list")
+@click.argument("uuids", metavar="[UUID…]", nargs=-1)
+@click.option("--job", metavar="ID", help="Only evidence of this job.")
+@pass_app
+def list_evidence(app: App, uuids: tuple[str, ...], job: str | None) -> None:
+    """List the evidence that this station keeps, by board and attempt."""
+    rows = list(_rows(app.station(), uuids, job))
+    told = [
+        {
+            "uuid": row.uuid.hex(),
+            "job": row.job,
+            "unit": row.unit,
+            "attempt": row.attempt,
+            "verdict": row.verdict,
+            "finished": row.finished,
+            "sha256": row.sha256,
+        }
+        for row in rows
+    ]
+
+    def table(console: Console) -> None:
+        from rich.table import Table
+
+        shown = Table("board", "job", "unit", "attempt", "verdict", "finished", box=None, pad_edge=False)
+        for row in rows:
+            job, unit = (row.job or "")[:8], str(row.unit or "")
+            shown.add_row(row.uuid.hex(), job, unit, str(row.attempt), row.verdict, local_time(row.finished))
+        print_table(console, shown)
+
+    none = "There is no evidence yet. To collect it: teds-provision provision --evidence"
+    app.emit({"evidence": told}, table if told else none)
+
+
+@command(
+    "teds-provision evidence export evidence/",
+    "teds-provision evidence export evidence/ 8d4d --job 0b5f",
+    name="export",
+)
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
+@click.argument("uuids", metavar="[UUID…]", nargs=-1)
+@click.option("--job", metavar="ID", help="Only evidence of this job.")
+@dry_run_option
+@pass_app
+def export(app: App, folder: Path, uuids: tuple[str, ...], job: str | None, dry_run: bool) -> None:
+    """Write evidence to files, UUID.N.json.
+
+    One file per board and attempt; a file with the same content is left alone.
+    """
+    station = app.station()
+    files = plant.evidence.export(station.plant.line, _rows(station, uuids, job), folder, write=not dry_run)
+    told = {"folder": str(folder), "files": len(files), "written": sum(files.values())}
+    word = "Would write" if dry_run else "Wrote"
+    app.emit(told, f"{word} {told['written']} of {told['files']} files to {folder}.")
+
+
+def _rows(station: Station, uuids: tuple[str, ...], job: str | None) -> Iterator[EvidenceRow]:
+    id = plant.jobs.job_id(station, job) if job is not None else None
+    chosen: list[bytes | None] = [station.nodes.resolve(text) for text in uuids]
+    for uuid in chosen or [None]:
+        yield from station.plant.line.evidence(uuid=uuid, job=id)
+
+
+for one in (verify, list_evidence, export):
+    evidence.add_command(one)
