@@ -122,23 +122,40 @@ def _mark(
         had = beyond.get((uuid, key.epoch, key.key_id), set()) | {
             holder.fingerprint for holder in station.keys.holders(uuid) if roster.removed_one(holder.fingerprint)
         }
-        for one in roster.removed:
-            if one.fingerprint not in had and not _had(one, (key.epoch, key.key_id), said):
-                continue
-            forgot = said[one.fingerprint].forgot if one.fingerprint in said else -1
-            if one.why == "retired" and forgot >= key.epoch:
-                continue
-            if key.source == "agreement" or now - ours.get(one.fingerprint, now) >= OTHERS:
-                if one.why == "stolen":
-                    wanted[uuid] = f"{STOLEN}{one.name} has held this key"
-                    break
-                wanted[uuid] = f"{WHY}{one.name} ({one.why}) has held this key"
+        known = [one for one in roster.removed if one.fingerprint in had or _had(one, (key.epoch, key.key_id), said)]
+        why = _why_due(known, key, said, now, ours)
+        if why is not None:
+            wanted[uuid] = why
     wanted = {uuid: why for uuid, why in wanted.items() if uuid not in marked or why.startswith(STOLEN)}
     if wanted:
         with station.durable(_COMMAND):
             for uuid, why in wanted.items():
                 station.keys.demand_rotation(uuid, why)
                 station.audit("registry", uuid, "rotation due", why=why)
+
+
+def _why_due(
+    known: Sequence[Removed],
+    key: KeyRecord,
+    said: Mapping[str, Claim],
+    now: datetime,
+    ours: Mapping[str, datetime],
+) -> str | None:
+    """Why a key that these removed stations have held is to be replaced; a stolen one goes before all others.
+
+    Who was retired and says that it forgot the key needs no rotation. A key that another station agreed is that
+    station's to rotate; this one does it when the removal has been known here for ``OTHERS``.
+    """
+    why = None
+    for one in known:
+        forgot = said[one.fingerprint].forgot if one.fingerprint in said else -1
+        if one.why == "retired" and forgot >= key.epoch:
+            continue
+        if key.source == "agreement" or now - ours.get(one.fingerprint, now) >= OTHERS:
+            if one.why == "stolen":
+                return f"{STOLEN}{one.name} has held this key"
+            why = f"{WHY}{one.name} ({one.why}) has held this key"
+    return why
 
 
 def _had(one: Removed, key: Key, said: Mapping[str, Claim]) -> bool:

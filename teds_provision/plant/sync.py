@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from shlex import quote
-from typing import Final
+from typing import Final, NoReturn
 
 from teds_provision.errors import Fork, NotAuthentic, NotMember, PolicyRefused, TedsProvisionError
 from teds_provision.plant import leaving, parcels
@@ -147,21 +147,7 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
     restored = station.plant.restored
     known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain)}
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
-    found, junk = read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
-    if junk and not post.everybody:
-        alarm(
-            station,
-            "junk",
-            station.fingerprint,
-            junk[0],
-            f"{post.where} has pages that this station's key did not sign",
-        )
-        raise NotAuthentic(
-            f"{post.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
-            hint=f"To delete them there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
-        )
-    if junk:
-        done.told.append(f"{post.where}: {len(junk)} files in this station's folder that it did not sign; ignored")
+    found = _own_pages(station, post, roster, done, above)
     new = [page for page in found if (page.n, page.hash) not in known]
     if new and restored and _follows(chain, new):
         adopt(station, roster, new)
@@ -171,15 +157,7 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
             back = f"{len(new)} pages that this station wrote before its backup are"
         done.told.append(f"{back} back")
     elif new:
-        homes = ", ".join(sorted({page.home or "unknown" for page in new}))
-        first = min(page.n for page in new)
-        alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
-        raise Fork(
-            f"{post.where} has pages under this station's key that are not of this home, from number {first} on"
-            f" (home {homes}; here {station.plant.home}): a disk image was restored, or a copy of this home is in use.",
-            hint="Find out who has a copy; if in doubt, have this station removed. Then: teds-provision"
-            " registry resume",
-        )
+        _stop_at_fork(station, post, new)
     else:
         _require_resumed(station)
     if restored:
@@ -197,6 +175,38 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
         alarm(station, "rolled-back", station.fingerprint, joined.acknowledged, why)
         done.told.append(f"{post.where} was rolled back: {why}; it is being refilled")
+
+
+def _own_pages(station: Station, post: Post, roster: Roster, done: Synced, above: int) -> list[Page]:
+    """The pages under this station's key; where only members can write, what it did not sign stops everything."""
+    found, junk = read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
+    if junk and not post.everybody:
+        alarm(
+            station,
+            "junk",
+            station.fingerprint,
+            junk[0],
+            f"{post.where} has pages that this station's key did not sign",
+        )
+        raise NotAuthentic(
+            f"{post.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
+            hint=f"To delete them there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
+        )
+    if junk:
+        done.told.append(f"{post.where}: {len(junk)} files in this station's folder that it did not sign; ignored")
+    return found
+
+
+def _stop_at_fork(station: Station, post: Post, new: Sequence[Page]) -> NoReturn:
+    """Raise Fork: another home writes, or has written, under this station's key."""
+    homes = ", ".join(sorted({page.home or "unknown" for page in new}))
+    first = min(page.n for page in new)
+    alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
+    raise Fork(
+        f"{post.where} has pages under this station's key that are not of this home, from number {first} on"
+        f" (home {homes}; here {station.plant.home}): a disk image was restored, or a copy of this home is in use.",
+        hint="Find out who has a copy; if in doubt, have this station removed. Then: teds-provision registry resume",
+    )
 
 
 def _require_resumed(station: Station) -> None:
