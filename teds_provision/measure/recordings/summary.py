@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from teds_provision.measure.recordings.source import MOST, Entry, Recording
 from teds_provision.measure.sinks.lines import facts_as_json, iso
 
 NOTES = 100
+_COUNTED = ("samples", "lost", "late", "bad", "invalid")
 
 
 @dataclass
@@ -38,7 +39,11 @@ class ChannelStatistics:
 
 @dataclass
 class RecordingSummary:
-    """Counts what goes by. ``missing`` samples are gaps of the sample number within a run of a stream."""
+    """Counts what goes by. ``missing`` samples are gaps of the sample number within a run of a stream.
+
+    A measurement's counts go on from part to part. What was reported of a node with samples before its first sample in
+    this file belongs to the parts before.
+    """
 
     channels: dict[tuple[str, int], ChannelStatistics] = field(default_factory=dict)
     facts: dict[tuple[str, int], ChannelFacts] = field(default_factory=dict)
@@ -46,6 +51,8 @@ class RecordingSummary:
     notes: list[Note] = field(default_factory=list)
     messages: int = 0
     missing: int = 0
+    _begun: set[str] = field(default_factory=set)  # nodes with samples in this file
+    _before: dict[str, NodeReport] = field(default_factory=dict)
     _next: dict[tuple[str, int, tuple[int, ...]], int] = field(default_factory=dict)
 
     def take(self, entry: Entry) -> None:
@@ -54,11 +61,14 @@ class RecordingSummary:
             self._block(entry)
         elif isinstance(entry, GroupRows):
             self.messages += len(entry.time)
+            self._begun |= {uuid for uuid, _ in entry.channels}
             for column, key in enumerate(entry.channels):
                 self._seen_of(key).saw(entry.time, entry.value[:, column])
         elif isinstance(entry, NodeReport):
             if len(self.reports) < MOST.channels:
                 self.reports[entry.uuid] = entry
+                if entry.samples and entry.uuid not in self._begun:
+                    self._before[entry.uuid] = entry
         elif isinstance(entry, Note):
             self.notes = [*self.notes, entry][:NOTES]
         else:
@@ -71,6 +81,7 @@ class RecordingSummary:
         if not len(block.time):
             return
         self.messages += len(block.time)
+        self._begun.add(block.uuid)
         stream = block.uuid, block.stream, block.channels
         due = self._next.get(stream, block.index)
         if block.index > due:
@@ -80,12 +91,13 @@ class RecordingSummary:
             self._seen_of((block.uuid, number)).saw(block.time, block.value[:, column])
 
     def to_json(self, recording: Recording) -> dict[str, Any]:
-        """The result of ``record info``: ``lost`` counts messages of nodes, as the recorder reported them last.
+        """The result of ``record info``: ``lost`` counts messages of nodes in this file, as the recorder reported them.
 
         null where it reported nothing; times are ISO 8601.
         """
         seen = self.channels.values()
-        lost = sum(one.lost for one in self.reports.values()) if self.reports else None
+        reports = [self._of_this_file(one) for one in self.reports.values()]
+        lost = sum(one.lost for one in reports) if reports else None
         first = min((one.first for one in seen), default=math.inf)
         last = max((one.last for one in seen), default=-math.inf)
         return {
@@ -109,10 +121,18 @@ class RecordingSummary:
             "nodes": [
                 {"uuid": one.uuid, "state": one.state, "why": one.why, "samples": one.samples, "lost": one.lost,
                  "late": one.late, "bad": one.bad, "invalid": one.invalid}
-                for one in self.reports.values()
+                for one in reports
             ],
             "notes": [{"time": iso(one.at), "why": one.text} for one in self.notes],
         }  # fmt: skip
+
+    def _of_this_file(self, last: NodeReport) -> NodeReport:
+        """What was counted of a node since this file began."""
+        before = self._before.get(last.uuid)
+        if before is None:
+            return last
+        counts = {name: max(0, getattr(last, name) - getattr(before, name)) for name in _COUNTED}
+        return replace(last, **counts)
 
     def _channel(self, key: tuple[str, int], recording: Recording) -> dict[str, Any]:
         facts = self.facts.get(key) or recording.facts.get(key) or ChannelFacts(key[0], "", key[1], "")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from teds_provision.errors import StoreFailure, TedsProvisionError
 from teds_provision.files import sync_folder
-from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, Note, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, NodeReport, Note, StationFacts
 from teds_provision.measure.sinks.base import Item, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.lines import iso
 
@@ -122,6 +122,8 @@ class FileSink(ThreadedSink):
         self._tried = 0.0
         self._gaps: list[str] = []
         self._unsaid: list[ClockSet] = []  # came while no part could be written
+        self.reports: dict[str, NodeReport] = {}
+        """The newest of each node."""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -172,8 +174,14 @@ class FileSink(ThreadedSink):
             for entry in entries:
                 if isinstance(entry, Note):
                     self._note(entry.at, entry.text)
-                else:
-                    self._take(entry)
+                    continue
+                if isinstance(entry, NodeReport):
+                    first = entry.uuid not in self.reports
+                    self.reports[entry.uuid] = entry
+                    if first and entry.samples:
+                        self._tell_counts(entry)
+                        continue
+                self._take(entry)
             self._close_part()
         finally:
             part, self._part = self._part, None
@@ -186,6 +194,10 @@ class FileSink(ThreadedSink):
     def _note(self, at: float, text: str) -> None:
         """Write words about the recording into the part, as its format has them."""
 
+    def _tell_counts(self, report: NodeReport) -> None:
+        """Write what was counted of a node by now, as the beginning of a part needs it (summary.py)."""
+        self._take(report)
+
     def _first(self) -> None:
         try:
             self._begin()
@@ -193,6 +205,8 @@ class FileSink(ThreadedSink):
             self._wait_for_room(error)
 
     def _one(self, item: Item) -> None:
+        if isinstance(item, NodeReport):
+            self.reports[item.uuid] = item
         if self._full is not None:
             self._miss(item)
             return
@@ -268,6 +282,7 @@ class FileSink(ThreadedSink):
                 self._mend(self._parts[-1])
             self._part = self._next_part()
             self._begin()
+            self._go_on()
             now, missing = time.time(), self.stats.dropped - before
             was = what.replace(" is ", " was ")
             gap = f"The {was} from {iso(since)} to {iso(now)}: {missing} values are not recorded."
@@ -291,6 +306,12 @@ class FileSink(ThreadedSink):
         self._close_part()
         self._part = self._next_part()
         self._begin()
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """The counts of a measurement go on from part to part: say with which this one begins."""
+        for report in self.reports.values():
+            self._tell_counts(report)
 
     def _idle(self, now: float) -> None:
         if self._part is not None:

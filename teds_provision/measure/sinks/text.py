@@ -36,6 +36,7 @@ class TextSink(FileSink):
         super().__init__(path)
         self._comma = "," if path.suffix.lower() == ".csv" else "\t"
         self._columns: dict[tuple[str, int], int] = {}
+        self._headed = False  # whether this part has its head
         self._states: dict[str, str] = {}
         """What stands in this part of each node that is not measured: it is tried again without a line each time."""
         self._templates: dict[tuple[str, tuple[int, ...], bool, str], tuple[str, list[int]]] = {}
@@ -62,8 +63,22 @@ class TextSink(FileSink):
             self._line(f"# {iso(item.time)} {item.uuid} {said}")
 
     def _begin(self) -> None:
+        self._headed = False
         if self.facts:
             self._header()
+
+    def _tell_counts(self, report: NodeReport) -> None:
+        if self._headed:
+            self._state(report)
+
+    def _close_part(self) -> None:
+        """A file without a value says why, and each says what was counted of its nodes."""
+        if self._part is not None:
+            if not self._headed:
+                self._header()
+            for report in self.reports.values():
+                self._state(report)
+        super()._close_part()
 
     def _line(self, text: str) -> None:
         octets = (text + "\n").encode()
@@ -83,7 +98,7 @@ class TextSink(FileSink):
         self._preamble(known, columns)
 
     def _preamble(self, known: Sequence[ChannelFacts], columns: Sequence[str]) -> None:
-        self._states = {}
+        self._states, self._headed = {}, True
         station = self.station
         clock = printable(station.clock)
         self._line(f"# teds-provision measurement, {self.layout}; times are unix seconds, clock: {clock}")

@@ -14,7 +14,9 @@ import numpy as np
 
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
 from teds_provision.measure.sinks.base import Item
+from teds_provision.measure.sinks.lines import iso
 from teds_provision.measure.sinks.text import TextSink, heads_of
+from teds_provision.sanitize import printable
 
 WIDE = "wide:"
 """What stands before the path of such a file in the words for a sink."""
@@ -44,7 +46,20 @@ class WideSink(TextSink):
 
     def _begin(self) -> None:
         """Begin with the first row, which says what channels there are."""
-        self._columns, self._changed = {}, False
+        self._columns, self._changed, self._headed = {}, False, False
+
+    def _header(self) -> None:
+        """The head of a part that no row came for."""
+        self._head_of([self.facts[key] for key in sorted(self.facts)])
+
+    def _head_of(self, known: list[ChannelFacts]) -> None:
+        self._preamble(known, ["time", *heads_of(known)])
+        if len(self.files) > 1:  # rows lag behind: in the first part what was counted by now is of rows to come
+            for report in self.reports.values():
+                self._state(report)
+        notes, self._unwritten = self._unwritten, []
+        for at, text in notes:
+            self._line(f"# {iso(at)} {printable(text)}")
 
     def _note(self, at: float, text: str) -> None:
         if self._columns:
@@ -60,10 +75,7 @@ class WideSink(TextSink):
         if not self._columns:
             self._columns = {key: place for place, key in enumerate(rows.channels)}
             known = [self.facts.get(key) or ChannelFacts(key[0], "", key[1], "") for key in rows.channels]
-            self._preamble(known, ["time", *heads_of(known)])
-            notes, self._unwritten = self._unwritten, []
-            for at, text in notes:
-                self._note(at, text)
+            self._head_of(known)
             self._form = self._comma.join(["%.6f", *["%.12g"] * len(known)]) + "\n"
         table = np.column_stack([rows.time, rows.value]).tolist()
         text = "".join([self._form % tuple(row) for row in table])

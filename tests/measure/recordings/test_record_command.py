@@ -8,13 +8,16 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from teds_provision.measure.blocks import ChannelFacts, ClockSet, NodeReport
 from teds_provision.measure.recordings.opening import open_recording
+from teds_provision.measure.sinks import Sink, open_sink
 from tests.cli.shell import call, unmeasured_environment
 from tests.measure.recordings.test_converting import recorded, told
-from tests.measure.sinks.parts import block
+from tests.measure.sinks.parts import ANGLE, ARM, STATION, block
 from tests.pace import until
 
 WRITER = """
@@ -124,3 +127,57 @@ def test_wide_needs_a_file_of_text(tmp_path: Path) -> None:
     done = call(tmp_path / "home", "measure", "8d4d", "--to", str(tmp_path / "run.mcap"), "--wide")
     assert done.code == 2
     assert "--to FILE.csv" in done.err
+
+
+def info_of(folder: Path, path: Path) -> dict[str, Any]:
+    done = call(folder / "home", "--json", "record", "info", str(path))
+    assert done.code == 0, done
+    found: dict[str, Any] = json.loads(done.out)
+    return found
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.txt", "run.jsonl", "run.mcap", "wide:run.csv"])
+def test_a_measurement_that_ended_before_a_value_came_leaves_a_file_that_says_why(tmp_path: Path, name: str) -> None:
+    """Text was a file without an octet, which everything refused."""
+    spec, _, file = name.rpartition(":")
+    path = tmp_path / file
+    sink = open_sink(f"{spec}:{path}" if spec else str(path))
+    fill_with(sink, [], [NodeReport(ARM, "waiting"), NodeReport(ARM, "refused", "it did not answer within 3 s")])
+    info = info_of(tmp_path, path)
+    assert (info["messages"], info["lost"], info["complete"], info["station"]) == (0, 0, True, "bench")
+    [node] = info["nodes"]
+    assert (node["uuid"], node["state"], node["why"]) == (ARM, "refused", "it did not answer within 3 s")
+    converted = call(tmp_path / "home", "--json", "record", "convert", str(path), str(tmp_path / "again.csv"))
+    assert converted.code == 0
+    assert info_of(tmp_path, tmp_path / "again.csv")["messages"] == 0
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".txt", ".jsonl", ".mcap"])
+def test_each_part_tells_of_its_own_losses_and_so_does_what_is_made_of_it(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"run{suffix}"
+    first = NodeReport(ARM, "running", samples=30, lost=5, late=1, bad=2, invalid=3)
+    last = NodeReport(ARM, "ended", samples=33, lost=7, late=1, bad=2, invalid=4)
+    news = ClockSet(by=3600.0, time=1_795_003_600.0)
+    items = [NodeReport(ARM, "waiting"), *(block(index=k) for k in range(0, 30, 3)), first, news]
+    fill_with(open_sink(str(path)), [ANGLE], [*items, block(index=33), last])
+    for place in (path, path.with_suffix(f".2{suffix}")):
+        [node] = info_of(tmp_path, place)["nodes"]
+        own = (30, 5, 1, 2, 3) if place == path else (3, 2, 0, 0, 1)
+        assert tuple(node[name] for name in ("samples", "lost", "late", "bad", "invalid")) == own, place
+        for to in (".csv", ".jsonl", ".mcap"):
+            made = place.with_suffix(f".made{to}")
+            assert call(tmp_path / "home", "record", "convert", str(place), str(made)).code == 0
+            assert info_of(tmp_path, made)["nodes"][0]["lost"] == own[1], made
+
+
+def fill_with(sink: Sink, facts: list[ChannelFacts], items: list[Any]) -> None:
+    sink.open(facts, STATION)
+    for item in items:
+        if isinstance(item, ClockSet):
+            sink.clock_set(item)
+        elif isinstance(item, NodeReport):
+            sink.report(item)
+        else:
+            sink.write(item)
+    sink.close()
+    assert sink.stats.error == ""
