@@ -15,7 +15,7 @@ from teds_provision.protocol.operation.stream_commands import stop
 from tests.firmware.bench import Acting, CBench
 from tests.firmware.desk import CDesk
 from tests.protocol.desk import CREDENTIALS, META, NAME, UUID, Desk
-from tests.protocol.operation.bench import MS
+from tests.protocol.operation.bench import MS, Bench
 from tests.protocol.operation.test_claims import VALUE
 from tests.protocol.operation.test_refusals import subscribe
 
@@ -88,6 +88,23 @@ def test_a_node_with_an_actuator_claimed_stays_where_it_is(acts: bool) -> None:
     home = node(bench).can_address
     node(bench).take_frame(0x1CFF0000 | home, b"\x01\x02\0\0\0\x01\0\0")
     assert (node(bench).can_address == home) is acts
+
+
+@pytest.mark.parametrize("polled", [False, True], ids=["a command comes first", "its loop does"])
+def test_a_dead_man_that_ran_out_long_ago_is_told(polled: bool) -> None:
+    """The loop was held up until its session was over, too: what stopped the actuator was the dead-man, before."""
+    said = []
+    for made in (Bench, CBench):
+        bench = made()
+        bench.open().operate(4)
+        assert bench.send(write_data_set(4, VALUE)).ok
+        bench.hardware.tick += 700_000 * MS
+        if polled:
+            bench.tim.poll()
+        bench.open()
+        said.append(bench.send(security_command(Function.OPERATION)).payload)
+    assert said[0] == said[1]
+    assert said[1][1 + 3 * 3 + 1] & 0x30 == 0x30
 
 
 def test_what_no_event_sensor_has_seen_is_no_event() -> None:

@@ -144,6 +144,7 @@ class Tim:
         by default now. When the reply has left, call :meth:`reply_left`.
         """
         tick = received if received is not None else self._role.now() if self._role is not None else 0
+        self.poll()  # what ran out before this frame is over, and is told: it revives no lease, hides no dead-man
         reply = self._run(frame, Origin(link, tapped, port or port_of(link), tick)).encode()
         while self._ending:  # what ends with the reply: sessions after Close, Confirm, Reset
             self._ending.pop()()
@@ -301,7 +302,6 @@ class Tim:
     # -- sessions --------------------------------------------------------------------------------------------------
 
     def _sealed(self, payload: bytes, origin: Origin) -> bytes:
-        self.poll()  # a lease that ran out before this frame came is over: the frame does not revive it
         taken = self._sessions.take(payload, origin.link)
         if not taken.room:
             return taken.session.seal(taken.counter, refusal(Reason.NO_ROOM).encode())

@@ -14,7 +14,7 @@
 
 int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length);
 
-/* The port's functions that fail now, by bit. */
+/* The port's functions that fail now, by bit; the bits above count the read of flash that fails. */
 enum { RANDOM = 1, POINTS = 2, MACS = 4, SEALS = 8, FLASH = 16 };
 static unsigned failing;
 
@@ -402,6 +402,7 @@ static void measures(memory_board *own, const uint8_t *octets, size_t length, bo
         case 5:
             failing = count > 0 ? copy[0] : 0;
             memory_fails(own, (failing & FLASH) != 0);
+            memory_read_fails(own, failing >> 5);
             break;
         case 6: memory_ble_written(own, 0, copy, count); break;
         case 7: (what & 8 ? memory_ble_driven : memory_ble_written)(own, what >> 4 & 3, copy, count); break;
