@@ -163,7 +163,10 @@ def used_once(found: dict[str, Module]) -> list[str]:
 
 
 def _called(node: ast.Call) -> str:
-    return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+    """The name that is called; nothing for what a class does as its base does, and more."""
+    if isinstance(node.func, ast.Attribute):
+        return "" if ast.unparse(node.func.value) == "super()" else node.func.attr
+    return getattr(node.func, "id", "")
 
 
 def shared_names(found: dict[str, Module]) -> list[str]:

@@ -260,12 +260,8 @@ def _know_again(station: Station, page: Page) -> None:
             station.nodes.remember(uuid, epoch=max(node.epoch, epoch), sequence=max(node.sequence, sequence))
         elif uuid in signed:  # no sequence says two things, be the board unknown here
             station.nodes.remember(uuid, sequence=sequence)
-    _pin_again(station, sorted(signed))
-
-
-def _pin_again(station: Station, uuids: Sequence[bytes]) -> None:
-    """Pin boards that this station signed for under the key that it said itself: no other board gets their units."""
-    for uuid, text in station.plant.tables.claims_of_chain(own_chain(station).chain, uuids).items():
+    # Pin boards that this station signed for under the key that it said itself: no other board gets their units.
+    for uuid, text in station.plant.tables.claims_of_chain(own_chain(station).chain, sorted(signed)).items():
         pin = Claim.from_json(text).pin
         if pin is not None and station.pins.entry(uuid) is None:
             station.pins.put(WhitelistEntry(uuid, pin[0], assurance=pin[1]))  # type: ignore[arg-type]

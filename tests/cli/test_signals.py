@@ -11,8 +11,8 @@ from tests.test_architecture import MODULES
 INTERRUPTED = """
 import signal, sys
 from teds_provision.cli.sample import ending
-from teds_provision.talk.meeting import Patience
-stop = Patience(None)
+from teds_provision.talk.meeting import IdleStop
+stop = IdleStop(None)
 with ending(stop):
     with stop._cond:  # as for some microseconds in each wait
         signal.raise_signal(signal.SIGTERM)
@@ -26,7 +26,7 @@ def test_a_command_that_is_about_to_wait_hears_its_signal() -> None:
 
 
 def test_no_signal_handler_takes_a_lock() -> None:
-    """``Event.set`` in a handler waits for ever for the lock that the interrupted thread holds: ``Patience.ask``."""
+    """``Event.set`` in a handler waits for ever for the lock that the interrupted thread holds: ``IdleStop.ask``."""
     found = []
     for module in MODULES:
         tree = ast.parse(module.read_text())

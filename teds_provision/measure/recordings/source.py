@@ -177,7 +177,10 @@ def facts_of(words: object, where: str) -> ChannelFacts:
     except BadData:
         kept["units"] = None
     if curve is not None:
-        kept["calibration"] = calibration_from_json(curve, kept["number"], kept["units"] or Units())
+        try:
+            kept["calibration"] = calibration_from_json(curve, kept["number"], kept["units"] or Units())
+        except BadData as error:
+            raise BadData(f"{where}: the calibration of channel {kept['number']} cannot be read.") from error
     return ChannelFacts(**{"node": "", "name": "", **kept})
 
 

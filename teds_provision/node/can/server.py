@@ -337,7 +337,11 @@ class CanServer:
             line, pair = seat.pair(station, own)
             self._request(seat, line, pair, frame)
         if frame.data and frame.data[0] >> 4 == _FLOW_CONTROL:
-            self._flow_control_of_old_address(station, own, frame)
+            # A reply that is still leaving from the address before 128.10 needs its flow control.
+            for seat, pair in list(self._active):
+                if pair.own == own and pair.peer == station and seat.address != own and pair.sending:
+                    pair.take(frame)
+                    self._note(seat, pair)
 
     def _request(self, seat: Seat, line: StationLine, pair: Pair, frame: Frame) -> None:
         begun = Reassembly.begin(pair.peer, frame)
@@ -363,13 +367,6 @@ class CanServer:
             for seat in self._addresses.at(address.node):
                 if seat.measuring is not None:
                     seat.measuring.drive(link_name(station), frame.data)
-
-    def _flow_control_of_old_address(self, station: int, own: int, frame: Frame) -> None:
-        """A reply that is still leaving from the address before 128.10 needs its flow control."""
-        for seat, pair in list(self._active):
-            if pair.own == own and pair.peer == station and seat.address != own and pair.sending:
-                pair.take(frame)
-                self._note(seat, pair)
 
     def _run_request(self, line: StationLine, pair: Pair, request: SeatRequest) -> None:
         """Run one request in the turn of its node and send the reply from the address that was asked."""

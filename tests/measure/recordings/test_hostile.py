@@ -43,6 +43,7 @@ def refused(path: Path, *words: str) -> None:
         (b'{"event":"channel","uuid":5}\n', ["uuid"]),
         (b'{"event":"channel","uuid":"1","number":1e9}\n', ["number of a channel"]),
         (b'{"event":"channel","uuid":"1","number":1,"low":NaN}\n', ["not finite"]),
+        (b'{"event":"channel","uuid":"1","number":1,"calibration":{"method":"x"}}\n', [":1:", "calibration of"]),
         (b"# teds-provision measurement, text 1\ntime,uuid,index\n", ["columns"]),
         (b"# teds-provision measurement, text 1\n# channel: [1]\n", ["JSON object"]),
         (b"# teds-provision measurement, text 1\ntime,uuid,index,clock_error,note\n1,2,3,4,5,6\n", [":3:", "6 cells"]),
