@@ -317,6 +317,9 @@ static int sealed(teds_node *node, const teds_command *command, teds_origin *ori
     uint8_t *inner = out + (TEDS_MAX_MESSAGE - 3) - (command->length >= 36 ? command->length - 20 : 0);
     size_t length;
     int outcome;
+#if TEDS_OPERATION
+    (void)teds_operation_poll(node, teds_now(node)); /* a lease that ran out before is over: this does not revive it */
+#endif
     outcome = teds_take_sealed(node, origin->link, origin->arrival, command->payload, command->length, inner, &taken);
     if (outcome) {
         return outcome;
@@ -346,9 +349,6 @@ size_t teds_node_handle(teds_node *node, teds_link link, const teds_arrival *arr
     teds_command command;
     int outcome;
     size_t octets;
-#if TEDS_OPERATION
-    (void)teds_operation_poll(node, teds_now(node)); /* a lease that ran out before is over: this does not revive it */
-#endif
     teds_sessions_expire(node, teds_now(node));
     if (length > TEDS_MAX_MESSAGE) {
         return close_reply(reply, -TEDS_TOO_LARGE);
@@ -556,10 +556,10 @@ int teds_node_reset_by_hand(teds_node *node)
 uint64_t teds_node_poll(teds_node *node, uint64_t now)
 {
     uint64_t due, next = TEDS_NEVER;
-#if TEDS_OPERATION
-    next = teds_operation_poll(node, now); /* first: a dead-man that stopped an actuator is told, a session's end is not */
-#endif
     teds_sessions_expire(node, now);
+#if TEDS_OPERATION
+    next = teds_operation_poll(node, now);
+#endif
 #if TEDS_NFC
     teds_nfc_poll(node);
 #endif

@@ -73,6 +73,9 @@ void teds_sessions_expire(teds_node *node, uint64_t now)
 {
     for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
         if (node->sessions[i].used && now >= node->sessions[i].good_at + IDLE_NS) {
+#if TEDS_OPERATION
+            (void)teds_operation_poll(node, now); /* a dead-man that stopped an actuator before is told, this end is not */
+#endif
             teds_session_end(node, i);
         }
         if (node->half_open[i].used && now >= node->half_open[i].at + HALF_OPEN_NS) {
