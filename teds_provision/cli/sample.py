@@ -254,7 +254,11 @@ def _require_unit(app: App, channel: Channel, value: float, unit: str | None) ->
 
 @contextmanager
 def ending(stop: IdleStop) -> Iterator[None]:
-    """The first Ctrl-C or SIGTERM ends in order, a second one at once with 130."""
+    """The first Ctrl-C or SIGTERM ends in order, a second one at once with 130.
+
+    So does a terminal that is closed (SIGHUP, twice where the shell passes it on), unless nohup has it ignored: a
+    recording gets its end, and nodes are let go at once.
+    """
 
     def end(*_: object) -> None:
         if stop.is_set():
@@ -262,6 +266,8 @@ def ending(stop: IdleStop) -> Iterator[None]:
         stop.ask()
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, lambda *_: stop.ask())
     try:
         yield
     finally:

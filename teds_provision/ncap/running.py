@@ -91,6 +91,8 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, _ending(stop))
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # its terminal was closed; under nohup it is ignored
+        loop.add_signal_handler(signal.SIGHUP, stop.set)
     servers = Servers()
     watchdog = asyncio.create_task(_watchdog())
     app = build(daemon)

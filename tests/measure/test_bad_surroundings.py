@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import csv
+import fcntl
+import os
+import pty
+import shlex
 import signal
+import subprocess
+import sys
+import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.e2e.desk import ANGLE, Running, limited
+from teds_provision.measure.sinks.mcap.recover import recover
+from tests.cli.shell import clean_environment
+from tests.e2e.desk import ANGLE, PASSPHRASE, Running, limited
 from tests.links.can.hub import Hub
 from tests.measure.hall import Hall, events, of, states
 from tests.pace import PATIENCE
@@ -98,3 +107,50 @@ def test_a_reader_that_stalls_holds_up_no_recording(hall: Hall, tmp_path: Path) 
     outcome = running.end()
     assert outcome.code == 0, outcome.err
     assert events(outcome.out)[-1]["event"] == "end"
+
+
+def test_a_terminal_that_is_closed_ends_the_recording_in_order_and_lets_the_node_go(hall: Hall, tmp_path: Path) -> None:
+    node, file = hall.nodes["a"].start(), tmp_path / "run.mcap"
+    near, far = pty.openpty()
+
+    def of_its_own() -> None:
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    words = [sys.executable, "-m", "teds_provision", "--home", hall.station.home, "--passphrase-fd", "9", "measure"]
+    words += [node.uuid, "--can", hall.can, "--rate", "50", "--to", file]
+    given = f"exec {shlex.join(map(str, words))} 9<<< {shlex.quote(PASSPHRASE)}"
+    environment = clean_environment(TERM="xterm")
+    measure = subprocess.Popen(
+        ["bash", "-c", given],
+        stdin=far,
+        stdout=far,
+        stderr=far,
+        preexec_fn=of_its_own,  # noqa: PLW1509 - two calls of the system, nothing else
+        env=environment,
+    )
+    os.close(far)
+    try:
+        shown = b""
+        while b"running" not in shown:
+            shown += os.read(near, 65536)
+        os.close(near)
+        assert measure.wait(PATIENCE) >= 0, "it ended by itself; what it said at its end nobody could read"
+    finally:
+        measure.kill()
+        measure.wait()
+    assert recover(file).was_whole
+    assert hall.ask("mode", node.uuid)["mode"] == "configuration"
+
+
+def test_a_measurement_that_nobody_is_to_hang_up_goes_on(hall: Hall) -> None:
+    node = hall.nodes["a"].start()
+    held = "import runpy, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); sys.argv[0] = 'teds-provision'; "
+    program = (sys.executable, "-c", f"{held}runpy.run_module('teds_provision', run_name='__main__')")
+    running = hall.begin(node.uuid, "--rate", 20, program=program, fork=False)
+    running.wait_for('"event":"data"')
+    running.signal(signal.SIGHUP)
+    data = running.out.count('"event":"data"')
+    wait_for_count(running, '"event":"data"', data + 10)
+    running.signal(signal.SIGTERM)
+    assert running.end().code == 0

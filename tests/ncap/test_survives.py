@@ -123,6 +123,15 @@ def test_a_client_that_is_kept_open_changes_something_after_a_restart_of_the_dae
     service.end()
 
 
+def test_a_terminal_that_is_closed_ends_the_daemon_in_order(lab: Lab) -> None:
+    running = lab.service.process = lab.service.station.start("--json", "ncap", "run")
+    running.wait_for_lines(1)
+    for _ in range(2):  # the kernel's, and the shell's
+        running.signal(signal.SIGHUP)
+    assert running.end().code == 0
+    assert not (lab.service.station.home / "ncap.sock").exists()
+
+
 def test_without_http_the_socket_alone_is_served(lab: Lab) -> None:
     running = lab.service.process = lab.service.station.start("--json", "ncap", "run")
     [ready, *_] = running.wait_for_lines(1)
