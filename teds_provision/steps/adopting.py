@@ -6,7 +6,7 @@ severity error, names and texts that people and topics will see. What the board 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -107,6 +107,12 @@ def brought_by(station: Station, image: Image, *, name: str | None = None) -> Br
             raise _refused(uuid, why)
     own = sheet.meta.name
     _require_own_name(station, image.uuid, own)
+    errors, warnings = _wrong_with(sheet, blocks)
+    return Brought(found, own, sheet.channels, _once(errors), _once(warnings))
+
+
+def _wrong_with(sheet: Sheet, blocks: Mapping[BlockId, bytes]) -> tuple[list[str], list[str]]:
+    """Errors and warnings of a datasheet that can be signed: of its TEDS, its channels, its calibrations."""
     errors = [f"{name_of(one.access_code)}: {one.message}" for one in sheet.errors]
     warnings = [f"{name_of(one.access_code)}: {one.message}" for one in sheet.findings if one.severity == "warning"]
     warnings += [one.value_problem for one in sheet.channels if one.value_problem and not one.actuator]
@@ -114,7 +120,7 @@ def brought_by(station: Station, image: Image, *, name: str | None = None) -> Br
         for finding in guarding.check_calibration(blocks):
             said = f"channel {finding.channel}: {finding.message}."
             (errors if finding.severity == "error" else warnings).append(said)
-    return Brought(found, own, sheet.channels, _once(errors), _once(warnings))
+    return errors, warnings
 
 
 def require_a_reason(station: Station, brought: Brought, reason: str | None) -> None:

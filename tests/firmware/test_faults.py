@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from teds_provision.check.run import CheckReport
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.station.station import Station
@@ -97,7 +98,7 @@ class Board(nodes.Measuring):
         return self.key.secret() if kind == "i" else b"\x01" + os.urandom(size - 1) if kind == "o" else os.urandom(size)
 
 
-def check(folder: Path, station: Station, patch: pytest.MonkeyPatch, name: str) -> nodes.CheckReport:
+def check(folder: Path, station: Station, patch: pytest.MonkeyPatch, name: str) -> CheckReport:
     patch.setattr(Board, "library", built(folder, name), raising=False)
     patch.setattr(nodes, "Measuring", Board)
     patch.setattr(nodes, "Board", Board)

@@ -151,25 +151,9 @@ def facts_of(words: object, where: str) -> ChannelFacts:
     """
     if not isinstance(words, dict):
         raise BadData(f"{where}: the facts of a channel are not a JSON object.")
-    kept: dict[str, Any] = {}
     curve = words.get("calibration")
-    for name, value in words.items():
-        if name in _TEXTS and isinstance(value, str) and len(value) <= MOST.text:
-            kept[name] = value
-        elif name in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
-            kept[name] = _finite(float(value), name, where)
-        elif (name in _FLAGS and isinstance(value, bool)) or (name == "kind" and value in get_args(Kind)):
-            kept[name] = value
-        elif name == "vector" and (
-            isinstance(value, list)
-            and len(value) <= MOST.text
-            and all(isinstance(one, int) and 0 <= one <= 0xFFFF for one in value)
-        ):
-            kept[name] = tuple(value)
-        elif name == "number":
-            kept[name] = channel_number(value, where)
-        elif name in _FIELDS and name != "calibration":
-            raise BadData(f"{where}: {name} of a channel is {_short(value)}.")
+    told = ((name, value) for name, value in words.items() if name in _FIELDS and name != "calibration")
+    kept: dict[str, Any] = {name: _fact(name, value, where) for name, value in told}
     if "uuid" not in kept or "number" not in kept:
         raise BadData(f"{where}: a channel has no UUID or no number.")
     try:
@@ -182,6 +166,21 @@ def facts_of(words: object, where: str) -> ChannelFacts:
         except BadData as error:
             raise BadData(f"{where}: the calibration of channel {kept['number']} cannot be read.") from error
     return ChannelFacts(**{"node": "", "name": "", **kept})
+
+
+def _fact(name: str, value: Any, where: str) -> Any:
+    """One fact as :class:`ChannelFacts` has it; raises BadData where the value is not of its kind."""
+    if name in _TEXTS and isinstance(value, str) and len(value) <= MOST.text:
+        return value
+    if name in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
+        return _finite(float(value), name, where)
+    if (name in _FLAGS and isinstance(value, bool)) or (name == "kind" and value in get_args(Kind)):
+        return value
+    if name == "vector" and isinstance(value, list) and len(value) <= MOST.text:
+        return tuple(channel_number(one, where) for one in value)
+    if name == "number":
+        return channel_number(value, where)
+    raise BadData(f"{where}: {name} of a channel is {_short(value)}.")
 
 
 def channel_number(value: object, where: str) -> int:
