@@ -31,7 +31,7 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
         (("measure", g, "--mqtt", "http://x"), 2, "is not a broker URL"),
         (("measure", g, "--mqtt", "mqtt://me:secret@x"), 2, "password-file"),
         (("measure", g, "--channel", "y"), 2, "not a channel number"),
-        (("measure", g, "--channel", "1", "--duration", "1"), 8, "no sensor"),
+        (("measure", g, "--channel", "1", "--duration", "1"), 8, "is not a sensor"),
         (("measure", g, "--to", "run.xyz"), 2, ".csv"),
         (("measure", g, "--to", tmp_path / "no" / "run.csv", "--duration", "1"), 3, "its folder is not there"),
         (("measure", g, "--require", nothing), 8, "asks for nothing"),

@@ -98,7 +98,7 @@ def test_a_clock_that_was_wrong_at_the_start_is_followed_when_it_is_set(
     began = time.time()
     running = hall.begin(hall.nodes["a"].uuid, "--rate", 20, *to, environment=clock.environment)
     wait_for_data(running)
-    for seconds, way in ((0.0, "put forward by 3600.0"), (-10.0, "put back by 10.0")):
+    for seconds, way in ((0.0, "set forward by 3600.0"), (-10.0, "set back by 10.0")):
         clock.put(seconds)
         running.wait_for(way)
         wait_for_data(running)

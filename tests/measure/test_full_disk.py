@@ -186,6 +186,6 @@ def test_the_clock_is_set_and_a_datasheet_comes_while_the_disk_is_full(
     octets = second.read_bytes()
     assert len(stamps(second)) == 3
     assert b"ef" * 32 in octets
-    assert b"put forward by 60.000 s" in octets
+    assert b"set forward by 60.000 s" in octets
     if suffix == "mcap":
         assert recover(Path(sink.files[0])).was_whole

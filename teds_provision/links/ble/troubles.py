@@ -53,7 +53,7 @@ def adapter_trouble(error: Exception, adapter: str) -> LinkFailure | None:
         return NoReader(f"Bluetooth is switched off on {adapter}.", hint=POWER_HINT)
     if reason == "NO_BLE_CENTRAL_ROLE":
         return NoReader(
-            f"Bluetooth adapter {adapter} does not support the LE central role.",
+            f"The LE central role is not supported by {adapter}.",
             hint="Use an adapter with Bluetooth 4.0 or later.",
         )
     if reason:

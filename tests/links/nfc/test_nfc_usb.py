@@ -163,7 +163,7 @@ def test_unplugging_in_the_middle_of_a_transfer_is_a_reader_error(make_node: Cal
     ("refuse", "message", "hint"),
     [
         (errno.EACCES, "do not have permission to open", 'ATTRS{idVendor}=="04e6", ATTRS{idProduct}=="5591"'),
-        (errno.EBUSY, "held by pn533_usb", "modprobe -r pn533_usb"),
+        (errno.EBUSY, "in use by pn533_usb", "modprobe -r pn533_usb"),
         (errno.EIO, "cannot be opened", "plug it in again"),
     ],
 )

@@ -384,7 +384,7 @@ def test_an_unsigned_datasheet_is_told_in_diagnostics_and_metadata() -> None:
     assert sink.scalars == []
     assert json.loads(sink.words["/bench/arm/teds"])["channels"][0]["unsigned"] is True
     assert "unsigned" not in json.loads(sink.words["/bench/hand/teds"])["channels"][0]
-    [told] = [one for one in sink.statuses if "nobody has signed it" in one.message]
+    [told] = [one for one in sink.statuses if one.message.startswith("unsigned:")]
     assert (told.level, told.hardware) == (1, ARM)
 
 

@@ -160,12 +160,12 @@ def test_each_failure_is_told_in_words(ports: dict[str, int], authority: Authori
     refused(f"mqtts://127.0.0.1:{ports['users']}", "127.0.0.1", "TLS")
     refused(f"mqtt://127.0.0.1:{ports['tls']}", "closed the connection", "mqtts://")
     refused(f"mqtt://127.0.0.1:{free_tcp_port()}", "nothing is listening at 127.0.0.1")
-    refused("mqtt://nowhere.invalid", "host nowhere.invalid is not known")
-    refused(f"mqtt://127.0.0.1:{ports['users']}", "refuses", "not authorized")
+    refused("mqtt://nowhere.invalid", "unknown host nowhere.invalid")
+    refused(f"mqtt://127.0.0.1:{ports['users']}", "refused", "not authorized")
     password = tmp_path / "password"
     password.write_text("another one\n")
     url = f"mqtt://arm@127.0.0.1:{ports['users']}?password-file={password}"
-    stats = refused(url, "refuses")
+    stats = refused(url, "refused")
     assert "another one" not in f"{stats}"
     password.write_text(f"{SECRET}\n")
     assert taken(url).error == ""
@@ -181,9 +181,9 @@ def test_each_failure_is_told_in_words(ports: dict[str, int], authority: Authori
         ("mqtts://host?ca=/x&ca=/y", "twice"),
         ("mqtts://host?key=/x", "needs 'cert'"),
         ("mqtt://host?password-file=/x", "user"),
-        ("mqtt://host/topic", "no MQTT URL"),
-        ("mqtt://host:port", "no MQTT URL"),
-        ("mqtt://host#x", "no MQTT URL"),
+        ("mqtt://host/topic", "not an MQTT URL"),
+        ("mqtt://host:port", "not an MQTT URL"),
+        ("mqtt://host#x", "not an MQTT URL"),
     ],
 )
 def test_what_a_url_does_not_know_is_refused_with_what_it_does(url: str, word: str) -> None:
