@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,7 +16,12 @@ def shown_units(station: Station, uuid: bytes) -> Mapping[int, str]:
 
     Values are computed, published and kept in SI whatever it says.
     """
-    return {number: one.display for number, one in channel_profiles(station, uuid).items() if one.display}
+    return units_of(channel_profiles(station, uuid).values())
+
+
+def units_of(channels: Iterable[ChannelProfile]) -> dict[int, str]:
+    """The unit of each of these channels that names one to show its values in."""
+    return {one.number: one.display for one in channels if one.display}
 
 
 def channel_profiles(station: Station, uuid: bytes) -> Mapping[int, ChannelProfile]:

@@ -100,6 +100,8 @@ def differences(
     are no difference. A unit of counts, a ratio, a digital one, V or A says nothing where a calibration is wanted;
     ``calibrated`` are channels that get one, whatever the type says.
     """
+    if not _describes(has):
+        return ()
     own = {channel.number: _Says.of(channel, has) for channel in Sheet.of_blocks(has).channels}
     if not own:
         return ()
@@ -111,8 +113,15 @@ def differences(
     return tuple(text for number in sorted(meant) for text in _between(number, own.get(number), meant[number]))
 
 
+def _describes(has: Mapping[BlockId, bytes]) -> bool:
+    """Whether these TEDS describe any channel; a new board, of which most are asked, has none."""
+    return any(code == AccessCode.CHANNEL for _, code in has)
+
+
 def further(has: Mapping[BlockId, bytes], wanted: Image) -> tuple[str, ...]:
     """A warning for the channels that the board describes and nobody wants, if there are any."""
+    if not _describes(has):
+        return ()
     channels = {one.number for one in Sheet.of_blocks(has).channels} - {one.number for one in Sheet.of(wanted).channels}
     named = ", ".join(map(str, sorted(channels)))
     return (f"The board has more channels than the profile: {named}.",) if channels else ()
@@ -230,7 +239,8 @@ def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = No
     claimed. Sensors that another session claims are left alone. Raises WrongBoard with the channel that
     does not bear it, LinkFailure.
     """
-    sheet, digest = Sheet.of(image).shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
+    described = Sheet.of(Image(image.uuid, image.unsigned_blocks()))  # what the Security TEDS says is judged already
+    sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
     found = {one.number: _bears(node, one, digest) for one in sheet.channels}
     sensors = [one for one in sheet.channels if not one.actuator and found[one.number]]
     if not sensors:

@@ -248,10 +248,17 @@ def compose(
 
 def digest_of(profile: Profile) -> str:
     """SHA-256 (hex) of what a profile says, with all that it extends: of the TEDS that it gives, and its demands."""
+    place = ("digest",)
+    if place not in profile.composed:  # for the first node of this type
+        profile.composed[place] = _digest(profile)
+    return profile.composed[place].hex()
+
+
+def _digest(profile: Profile) -> bytes:
     blocks = _built_of(profile, _NOBODY, {}, None, 2007).blocks
     said = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]
     demands = [repr(one.calibration) for one in profile.channels]
-    return hashlib.sha256(json.dumps([said, demands]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([said, demands]).encode()).digest()
 
 
 def _absolute_profile(profile: str | None) -> str | None:
@@ -550,7 +557,8 @@ def propose(station: Station, prepared: Prepared, present: Survey, *, record: bo
     Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (a calibration that the guard refuses).
     """
     has = present.image
-    proposal = _proposal(station, prepared, present)
+    with station.reading():
+        proposal = _proposal(station, prepared, present)
     warnings = guard(
         station,
         proposal.image,

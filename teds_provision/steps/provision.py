@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.station.shown_units import shown_units
+from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
 from teds_provision.steps.adopting import Adopt, brought_by, nobody_adopts, require_a_reason
 from teds_provision.steps.agree import Agreed, TakeOver, agree
@@ -260,7 +260,7 @@ class _Run:
         signed = self._sign(who, proposal, present)
         written = self._write(signed, proposal, present)
         verified = self._verify(who, written)
-        borne = self._check(written, verified)
+        borne = self._check(prepared, written, verified)
         warnings = merged((*proposal.warnings, *further(present.image.blocks, proposal.image), *borne.warnings))
         return Provisioned(who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples)
 
@@ -385,14 +385,14 @@ class _Run:
             step.detail = f"{written.octets} octets" if written.octets else ""
         return written
 
-    def _check(self, written: Written, verified: Verified) -> Borne:
+    def _check(self, prepared: Prepared, written: Written, verified: Verified) -> Borne:
         """Ask the hardware whether it bears the datasheet, and for one reading; nothing where it is not authentic."""
         with self.steps.step("check") as step:
             if verified.verdict != "authentic":
                 step.result = SKIPPED
                 return Borne({})
-            units = shown_units(self.station, self.node.uuid)
-            self.station.behind(self.station.settle)  # the verdict is on the disk when the run ends and tells it
+            profile = prepared.profile
+            units = shown_units(self.station, self.node.uuid) if profile is None else units_of(profile.channels)
             borne = bears(self.node, written.on_node, units)
             step.result = DONE if borne.asked else SKIPPED
             good = sum(bool(one) for one in borne.channels.values())

@@ -90,13 +90,27 @@ def keep_read(
     profile: str | None = None,
 ) -> NodeVerdict:
     """As :func:`keep`, of what was read in the session of this ``c``, None for what was read in none."""
+    row, judged = judge_reading(station, image, c, by=by, known=known, more=more)
+    keep_judged(station, row, judged, image, profile)
+    return judged
+
+
+def judge_reading(
+    station: Station, image: Image, c: bytes | None, *, by: str, known: Known | None, more: Sequence[Check] = ()
+) -> tuple[NodeReading, NodeVerdict]:
+    """The row of a reading and the verdict on it; nothing is kept yet. See :func:`keep_read`."""
     said, signers = what_octets_say(image, known)
     octets = [*said, *more]
     row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
-    judged = _judged(station, row, keyed=is_keyed(station, image.uuid))
-    worth = c is not None and judged.verified.verdict != "not authentic"  # else what it had stays known
+    return row, _judged(station, row, keyed=is_keyed(station, image.uuid))
+
+
+def keep_judged(
+    station: Station, row: NodeReading, judged: NodeVerdict, image: Image, profile: str | None = None
+) -> None:
+    """Keep what :func:`judge_reading` gave of ``image``."""
+    worth = row.in_session and judged.verified.verdict != "not authentic"  # else what it had stays known
     station.nodes.keep_reading(row, image if worth else None, profile)
-    return judged
 
 
 def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) -> None:

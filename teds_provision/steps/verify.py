@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, Protocol
@@ -293,9 +294,21 @@ class Signers(NamedTuple):
 
 
 def what_octets_say(image: Image, known: Known | None) -> tuple[list[Check], Signers]:
-    """The checks that no later change of trust alters, and what :func:`judge` needs for the others."""
-    proofs = _proofs(image)
-    return _octets(image, proofs, known), Signers.of(proofs.shown)
+    """The checks that no later change of trust alters, and what :func:`judge` needs for the others.
+
+    What an image says by itself is remembered for a moment: it is asked when a write is recorded, and at the verdict.
+    """
+    said = next((said for asked, said in tuple(_SAID) if asked is image), None)
+    if said is None:
+        proofs = _proofs(image)
+        said = proofs.shown, _by_itself(image, proofs)
+        _SAID.append((image, said))
+    shown, checks = said
+    return [*checks, *_not_older(shown, known)], Signers.of(shown)
+
+
+_Shown = SecurityTeds | NotCanonical | None
+_SAID: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(maxlen=4)
 
 
 def judge(
@@ -328,19 +341,28 @@ ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed"
 
 
 def _octets(image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
+    return [*_by_itself(image, proofs), *_not_older(proofs.shown, known)]
+
+
+def _not_older(shown: _Shown, known: Known | None) -> list[Check]:
+    """Whether a datasheet is not older than what is known of its node."""
+    return [_epoch(shown, known), _sequence(shown, known)] if isinstance(shown, SecurityTeds) else []
+
+
+def _by_itself(image: Image, proofs: _Proofs) -> tuple[Check, ...]:
+    """The checks of an image for which nothing else has to be known."""
     checks, shown = [_form(image)], proofs.shown
     if shown is None:
-        return [*checks, Check("signed", "failed", "the image has no Security TEDS")]
+        return (*checks, Check("signed", "failed", "the image has no Security TEDS"))
     if isinstance(shown, NotCanonical):
         ours = security.has_profile_version(image.blocks[SECURITY])
         why = shown.message if ours else "the Security TEDS does not follow this profile: shown, never trusted"
-        return [*checks, Check("canonical form", "failed", why)]
+        return (*checks, Check("canonical form", "failed", why))
     checks += [Check("canonical form", "passed"), _algorithms(shown)]
     if not proofs.node_key:
         checks.append(Check("node key", "failed", "field 102 does not sign this key for this UUID"))
-    checks += [_epoch(shown, known), _sequence(shown, known)]
     if not shown.signed:
-        return [*checks, Check("signed", "failed", "this is the initial Security TEDS: nobody has signed it yet")]
+        return (*checks, Check("signed", "failed", "this is the initial Security TEDS: nobody has signed it yet"))
     checks += [
         Check("signed", "passed"),
         _check("signature", proofs.datasheet, _CHANGED),
@@ -348,7 +370,7 @@ def _octets(image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
         _unlisted(image, shown),
         _meta(image),
     ]
-    return checks
+    return tuple(checks)
 
 
 def possession(prove: Callable[[], None]) -> Check:

@@ -120,12 +120,19 @@ def verify_node(
         station.audit("verify", node.uuid, verified.verdict, why=why)
         return NodeVerdict(verified, "plain", utc_now(), by)
     more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
-    with station.durable("verify", more_follows=True):
-        judged = reading.keep(station, node, image, by=by, known=known, c=c, more=more)
-        row = station.nodes.reading(node.uuid)
-        if identity is not None or (row is not None and not row.in_session):
-            station.nodes.remember(node.uuid, **_facts(image, identity))
-        station.audit("verify", node.uuid, judged.verified.verdict)
+    c = (c or node.c) if node.sealed else None
+    with station.reading():
+        row, judged = reading.judge_reading(station, image, c, by=by, known=known, more=more)
+
+    def record() -> None:
+        with station.durable("verify"):
+            reading.keep_judged(station, row, judged, image)
+            kept = station.nodes.reading(image.uuid)
+            if identity is not None or (kept is not None and not kept.in_session):
+                station.nodes.remember(image.uuid, **_facts(image, identity))
+            station.audit("verify", image.uuid, judged.verified.verdict)
+
+    station.behind(record)  # a run tells its result when it is on the disk, and asks the hardware meanwhile
     return judged
 
 

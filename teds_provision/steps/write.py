@@ -92,7 +92,7 @@ def write(
                     keep(station, node, has, by="write", known=known)
             return Written(0, time.monotonic() - started, has)
     identity = node.proven or read_identity(node)
-    _require_newer(signed, identity, jump=jump, again=_again(station, image.uuid))
+    _require_newer(station, image.uuid, signed, identity, jump=jump)
     _require_charge(node, low)
     octets = 0
     for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
@@ -195,22 +195,22 @@ def _again(station: Station, uuid: bytes) -> str:
     return f"Sign it again for the node as it is now: teds-provision sign {uuid.hex()} --read-node"
 
 
-def _require_newer(signed: SecurityTeds, identity: Identity, *, jump: bool, again: str) -> None:
+def _require_newer(station: Station, uuid: bytes, signed: SecurityTeds, identity: Identity, *, jump: bool) -> None:
     if signed.sequence <= identity.sequence:
         raise PolicyRefused(
             f"The image has sequence {signed.sequence}; the node is already at {identity.sequence}.",
-            hint=again,
+            hint=_again(station, uuid),
         )
     if signed.key_epoch != identity.epoch:
         raise PolicyRefused(
             f"The image was signed for key epoch {signed.key_epoch}; the node is at {identity.epoch}.",
-            hint=again,
+            hint=_again(station, uuid),
         )
     if signed.sequence > identity.sequence + SEQUENCE_WINDOW and not jump:
         raise PolicyRefused(
             f"The image has sequence {signed.sequence}, far ahead of the node's {identity.sequence}: earlier"
             " data about this node may have been forged.",
-            hint=f"{again}. Or, if you know why: write UUID --sequence-jump --yes",
+            hint=f"{_again(station, uuid)}. Or, if you know why: write UUID --sequence-jump --yes",
         )
 
 

@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import fcntl
 import hashlib
+import mmap
 import os
 import struct
 import sys
@@ -111,17 +112,18 @@ class Wire:
         self._path = Path(tempfile.gettempdir()) / name
         self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._file, fcntl.LOCK_SH)  # says that it is used; turns are taken by another kind of lock
+        os.ftruncate(self._file, _UNTIL.size)  # as it is, or zero
+        self._shared = mmap.mmap(self._file, _UNTIL.size)
 
     def take(self, begin: float, duration: float) -> float:
         """Take the wire for so many seconds, at ``begin`` or as soon as it is free; returns the end (perf_counter)."""
         with self._turn:
             fcntl.lockf(self._file, fcntl.LOCK_EX)
             try:
-                read = os.pread(self._file, _UNTIL.size, 0)
-                taken = _UNTIL.unpack(read)[0] if len(read) == _UNTIL.size else 0.0
+                (taken,) = _UNTIL.unpack(self._shared[:])
                 if taken - begin < _LONGEST_QUEUE:  # else of a clock that began anew
                     begin = max(begin, taken)
-                os.pwrite(self._file, _UNTIL.pack(begin + duration), 0)
+                self._shared[:] = _UNTIL.pack(begin + duration)
             finally:
                 fcntl.lockf(self._file, fcntl.LOCK_UN)
         return begin + duration
@@ -133,6 +135,7 @@ class Wire:
         with self._turn, contextlib.suppress(OSError):
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._path.unlink(missing_ok=True)
+        self._shared.close()
         os.close(self._file)
         self._file = -1
 

@@ -114,13 +114,16 @@ class BusReader:
         return self._turn.locked() or (not self._leaning and time.monotonic() < self._helped_until)
 
     def _read_for(self, queue: SimpleQueue[Thing], until: float) -> None:
-        """Read frame after frame until the queue has something, or another thread waits for something too."""
-        while queue.empty() and not self._leaning:
-            if not self._read(0.0):
-                left = until - time.monotonic()
-                if left <= 0 or self._over:
-                    return
-                self._bus.wait(min(left, _ALIVE_SECONDS), self._woken)
+        """Read frame after frame until the queue has something, or another thread waits for something too.
+
+        A call of the system lets other threads have the interpreter, and then waits for them: there is none too many.
+        """
+        while queue.empty() and not self._leaning and not self._over:
+            left = until - time.monotonic()
+            if left <= 0:
+                return
+            self._bus.wait(min(left, _ALIVE_SECONDS), self._woken)
+            self._read(0.0)
 
     def _read_all(self) -> None:
         """The loop's turn: every frame that is there, unless another thread has come to read them."""

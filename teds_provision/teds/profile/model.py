@@ -139,7 +139,7 @@ class Profile:
     abstract: bool = False
     warnings: tuple[str, ...] = field(default=())
     composed: dict[tuple[object, ...], bytes] = field(init=False, default_factory=dict, repr=False, compare=False)
-    """TEDS that every node of this type has alike, as they were composed for the first one."""
+    """What is alike for every node of this type, as it was made for the first one: TEDS, and the profile's digest."""
 
     def channel(self, number: int) -> ChannelProfile | None:
         """Channel of that number, None where the type has none."""
