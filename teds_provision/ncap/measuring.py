@@ -218,7 +218,7 @@ class Measuring:
             rate=rate,
             kind=kind,
             trigger=trigger,
-            sinks=tuple(self._sinks.whole(spec) for spec in sinks),
+            sinks=tuple(dict.fromkeys(self._sinks.whole(spec) for spec in sinks)),
             actuators=actuators and match is None,  # actuators are never claimed for whoever comes
             match=match,
             frozen=frozen,

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from teds_provision.ncap.web.metrics import text
 from tests.e2e.desk import Desk
 from tests.ncap.service import Answer, Service, virtual
 from tests.pace import until
@@ -31,7 +32,7 @@ def open_service(tmp_path_factory: pytest.TempPathFactory, prepared: Path) -> It
 def hand(open_service: Service) -> str:
     uuid = virtual(open_service)
     with open_service.client() as asked:
-        asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20, "sinks": ["seen.csv"]})
+        asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20, "sinks": ["seen.csv", "seen.csv"]})
         until(lambda: (asked.node(uuid)["measuring"] or {}).get("samples"))
     return uuid
 
@@ -65,8 +66,24 @@ def test_metrics_are_prometheus_text_with_what_counts(
     samples = next(one for one in values if one.startswith("teds_samples_total"))
     assert hand in samples
     assert float(samples.rpartition(" ")[2]) > 0
-    assert any(one.startswith("teds_sink_written_total") and "seen.csv" in one for one in values)
+    assert any(one.startswith("teds_sink_written_total") and 'sink="seen.csv"' in one for one in values), "no folder"
+    names = [one.rpartition(" ")[0] for one in values]
+    assert len(names) == len(set(names)), "Prometheus takes no two samples of one series"
     assert any(one.startswith("teds_link_up") and one.endswith(" 1") for one in values)
+
+
+def test_a_counter_has_all_its_digits_and_a_series_one_line() -> None:
+    report = {"uuid": "ab" * 10, "state": "running", "samples": 1_234_567_891, "clock_error": 0.00012345678}
+    sink = {"name": "mqtt://lab", "measurement": "m", "written": 10**9 + 1, "dropped": 0, "state": "running"}
+    status = {
+        "version": "1", "station": {"name": "b"}, "links": [], "measurements": [{"id": "m", "nodes": [report]}],
+        "sinks": [sink, sink], "budget": {"used": 0.5}, "clients": 0,
+    }  # fmt: skip
+    lines = text(status).splitlines()
+    assert f'teds_samples_total{{node="{"ab" * 10}",measurement="m"}} 1234567891' in lines
+    assert lines.count('teds_sink_written_total{sink="mqtt://lab",measurement="m"} 1000000001') == 1
+    assert any(line.endswith("} 0.00012345678") for line in lines)
+    assert 'teds_node_measuring{node="' + "ab" * 10 + '",measurement="m"} 1' in lines
 
 
 def test_the_paths_of_clause_12(open_service: Service, hand: str, bearer: dict[str, str | None]) -> None:
@@ -83,7 +100,7 @@ def test_the_paths_of_clause_12(open_service: Service, hand: str, bearer: dict[s
     assert channels["channelIds"] == "1,2,3"
     assert "opening" in channels["transducerNames"]
     read = ask("TransducerAccess/readdata?TIMID=1&ChannelId=2&timeout=10&SamplingMode=5&responseFormat=json").json
-    assert 0 <= read["transducerData"] <= 0.11
+    assert -1e-12 < read["transducerData"] <= 0.11, "closed is 0 but for the last bit of a calibrated double"
     assert fields(ask(f"TransducerAccess/ReadData?timId={hand}&channelId=9"))["errorCode"] == "1"
     raw = fields(ask("TEDSManager/ReadRawTeds?timId=1&channelId=0&timeout=10&tedsType=1"))
     assert bytes.fromhex(hand) in base64.b64decode(raw["rawTEDS"])

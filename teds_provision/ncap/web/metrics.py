@@ -11,6 +11,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.sinks import for_readers
+from teds_provision.ncap.web.guard import CALLER, Caller
 
 TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 Line = tuple[str, dict[str, str], float]
@@ -41,24 +43,32 @@ _HELP: Final = {
 def route(daemon: Daemon) -> Route:
     """GET /metrics."""
 
-    def metrics(_request: Request) -> Response:
-        return Response(text(daemon.status(), daemon.plant.status()), media_type=TYPE)
+    def metrics(request: Request) -> Response:
+        caller: Caller = request.scope[CALLER]
+        status = for_readers(daemon.status()) if caller.read_only else daemon.status()
+        return Response(text(status, daemon.plant.status()), media_type=TYPE)
 
     return Route("/metrics", metrics)
 
 
 def text(status: dict[str, Any], plant: dict[str, Any] | None = None) -> str:
     """The status, and that of the plant where one was joined, as Prometheus reads it."""
-    lines: dict[str, list[str]] = {name: [] for name in _HELP}
+    lines: dict[str, dict[str, float]] = {name: {} for name in _HELP}  # of equal labels one line: two end a scrape
     for name, labels, value in chain(_lines(status), _registry(plant) if plant is not None else ()):
         inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in labels.items())
-        lines[name].append(f"{name}{{{inner}}} {value:g}" if inner else f"{name} {value:g}")
+        lines[name].setdefault(f"{name}{{{inner}}}" if inner else name, value)
     out = []
     for name, found in lines.items():
         if found:
             kind, words = _HELP[name]
-            out += [f"# HELP {name} {words}", f"# TYPE {name} {kind}", *found]
+            out += [f"# HELP {name} {words}", f"# TYPE {name} {kind}"]
+            out += [f"{what} {_number(value)}" for what, value in found.items()]
     return "\n".join(out) + "\n"
+
+
+def _number(value: float) -> str:
+    """All digits of it: a counter of a million with six of them stands still, and then jumps."""
+    return repr(int(value)) if float(value).is_integer() else repr(float(value))
 
 
 def _lines(status: dict[str, Any]) -> Iterator[Line]:
