@@ -137,7 +137,7 @@ def test_a_datasheet_of_another_type_makes_no_board_another_one_unless_it_is_sai
     path, body = f"/nodes/{hand}/teds", {"content": json.dumps(document).replace(asked.node("elbow")["uuid"], hand)}
     before = asked.node(hand)["sequence"]
     for where in (path, f"{path}?dry_run=1"):
-        assert "of another type" in refused(asked, 422, "wrong-board", "PUT", where, body)
+        assert "of a different type" in refused(asked, 422, "wrong-board", "PUT", where, body)
     assert asked.node(hand)["sequence"] == before
     assert asked.request("PUT", f"{path}?dry_run=1", {**body, "retype": True})["changes"]
     [noted] = asked.request("GET", f"/log?act=api&failed=1&uuid={hand}&limit=1")["entries"]
