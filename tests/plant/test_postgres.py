@@ -202,7 +202,7 @@ def test_a_database_without_schema_and_one_of_a_newer_version_are_told(cluster: 
     with pytest.raises(StoreFailure, match="schema 2"):
         newer.look()
     database.sql("drop schema registry cascade")
-    with pytest.raises(StoreFailure, match="no registry"):
+    with pytest.raises(StoreFailure, match="does not contain a registry"):
         newer.look()
     newer.close()
 

@@ -153,7 +153,7 @@ def test_a_grid_has_one_row_a_time_and_units_in_its_columns(tmp_path: Path) -> N
     assert row["hand/oil [K]"].tolist() == [0.25]
     [again] = convert(wide, tmp_path / "wide.parquet").files
     pd.testing.assert_frame_equal(pd.read_parquet(again), table)
-    with pytest.raises(UsageFailure, match="grid"):
+    with pytest.raises(UsageFailure, match="written with --wide"):
         convert(wide, tmp_path / "no.mcap")
 
 
