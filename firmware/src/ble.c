@@ -58,7 +58,7 @@ static void request(teds_node *node, uint8_t connection, teds_ble_line *line)
     teds_stored_reply *reply;
     teds_put16(transaction, line->transaction);
     reply = teds_answer(node, link_of(connection), &arrival, transaction, 2, line->request, line->total);
-    line->reply = (int8_t)(reply - node->replies);
+    line->reply = reply;
     line->sends = true;
     line->at = 0;
     line->sent_transaction = line->transaction;
@@ -109,7 +109,7 @@ size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[MOST_VAL
     if (line == NULL || !line->sends) {
         return 0;
     }
-    reply = &node->replies[line->reply];
+    reply = line->reply;
     room = (line->mtu - 3u < MOST_VALUE ? line->mtu - 3u : MOST_VALUE) - HEAD;
     left = (size_t)(reply->length - 1 - line->at);
     room = left < room ? left : room;
@@ -120,7 +120,7 @@ size_t teds_ble_notify(teds_node *node, uint8_t connection, uint8_t out[MOST_VAL
     line->at = (uint16_t)(line->at + room);
     if (room == left) {
         line->sends = false;
-        node->replies[line->reply].at = teds_now(node);
+        line->reply->at = teds_now(node);
         teds_node_reply_left(node, link_of(connection));
     }
     return HEAD + room;
@@ -141,12 +141,12 @@ uint16_t teds_ble_longest(const teds_node *node, teds_link link)
 void teds_ble_hears(teds_node *node, uint8_t connection, bool hears)
 {
     teds_ble_line *line = line_of(node, connection);
-    const int8_t session = teds_session_on(node, link_of(connection));
+    teds_session *session = teds_session_on(node, link_of(connection));
     if (line == NULL) {
         return;
     }
     line->hears = hears;
-    if (session >= 0 && !hears) {
+    if (session != NULL && !hears) {
         teds_streams_end(node, session, UINT32_MAX);
     }
 }
@@ -189,27 +189,27 @@ bool teds_ble_drops(teds_node *node, uint8_t connection)
     if (line == NULL) {
         return false;
     }
-    if (teds_session_on(node, link_of(connection)) >= 0) {
+    if (teds_session_on(node, link_of(connection)) != NULL) {
         line->silent_since = teds_now(node);
     }
     return teds_now(node) >= line->silent_since + STRANGER_NS;
 }
 
 /* The place of a stored reply is read in pieces, and may not be taken by another link meanwhile. */
-bool teds_ble_sends(const teds_node *node, int8_t place)
+bool teds_ble_sends(const teds_node *node, const teds_stored_reply *reply)
 {
     for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
-        if (node->ble.lines[i].used && node->ble.lines[i].sends && node->ble.lines[i].reply == place) {
+        if (node->ble.lines[i].used && node->ble.lines[i].sends && node->ble.lines[i].reply == reply) {
             return true;
         }
     }
     return false;
 }
 
-void teds_ble_forget(teds_node *node, int8_t place)
+void teds_ble_forget(teds_node *node, const teds_stored_reply *reply)
 {
     for (size_t i = 0; i < TEDS_BLE_CONNECTIONS; i++) {
-        if (node->ble.lines[i].reply == place) {
+        if (node->ble.lines[i].reply == reply) {
             node->ble.lines[i].sends = false;
         }
     }

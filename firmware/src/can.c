@@ -12,25 +12,30 @@
 #define CR_NS TEDS_SECOND
 #define MOST_OF_12_BITS 4095u
 #define LONGEST_SILENCE UINT64_C(30) /* s */
-#define EVERYONE_NS (UINT64_C(50) * 1000000u)
-#define START_NS (UINT64_C(500) * 1000000u)
+#define EVERYONE_NS 50000000u
+#define START_NS 500000000u
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
 #define A_MINUTE (60u * TEDS_SECOND >> UNIT_BITS)
 
-uint8_t teds_default_address(const uint8_t uuid[10])
+static uint32_t crc_of(const teds_node *node)
 {
-    return (uint8_t)(1 + teds_crc32(0, uuid, 10) % TEDS_LAST_ADDRESS);
+    return teds_crc32(0, node->identity.uuid, sizeof node->identity.uuid);
+}
+
+uint8_t teds_default_address(const teds_node *node)
+{
+    return (uint8_t)(1 + crc_of(node) % TEDS_LAST_ADDRESS);
 }
 
 static bool is_sending(const teds_line *line)
 {
-    return line->used && line->out_state != TEDS_OUT_IDLE;
+    return line->out_state != TEDS_OUT_IDLE;
 }
 
 bool teds_can_sending(const teds_node *node)
 {
-    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
-        if (is_sending(&node->can.lines[i])) {
+    for (const teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
+        if (is_sending(line)) {
             return true;
         }
     }
@@ -38,40 +43,38 @@ bool teds_can_sending(const teds_node *node)
 }
 
 /* A random wait of up to `most` ns; 0 where the chip has no randomness now. */
-static uint64_t spread(const teds_node *node, uint64_t most)
+static uint32_t spread(const teds_node *node, uint32_t most)
 {
     uint8_t octets[2];
     if (node->port->random(node->port->user, octets, sizeof octets) != 0) {
         return 0;
     }
-    return most * teds_get16(octets) >> 16;
+    return (most >> 16) * teds_get16(octets);
 }
 
 /* -- lines ------------------------------------------------------------------------------------------------------------ */
 
-static teds_line *line_of(teds_node *node, uint8_t source, uint64_t now)
+static teds_line *line_of(teds_node *node, uint8_t source)
 {
     teds_line *found = NULL;
-    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
-        teds_line *each = &node->can.lines[i];
-        if (each->used && each->source == source) {
-            each->touched = now;
+    node->can.touches++;
+    for (teds_line *each = node->lines; each < node->lines + TEDS_CAN_LINES; each++) {
+        if (each->source == source) {
+            each->touched = node->can.touches;
             return each;
         }
-        if (is_sending(each) || node->can.rx_line == (int8_t)i) {
+        if (is_sending(each) || node->can.rx_line == each) {
             continue;
         }
-        if (found == NULL || (found->used && (!each->used || each->touched < found->touched))) {
+        if (found == NULL || each->touched < found->touched) { /* 0: not used */
             found = each;
         }
     }
     if (found != NULL) {
         memset(found, 0, sizeof *found);
-        found->used = true;
         found->source = source;
         found->own = node->can.address;
-        found->touched = now;
-        found->out_reply = -1;
+        found->touched = node->can.touches;
     }
     return found;
 }
@@ -81,8 +84,8 @@ static void lose_all(teds_node *node)
     for (uint8_t source = FIRST_STATION; source <= LAST_STATION; source++) {
         teds_link_forget(node, source);
     }
-    memset(node->can.lines, 0, sizeof node->can.lines);
-    node->can.rx_line = -1;
+    memset(node->lines, 0, sizeof node->lines);
+    node->can.rx_line = NULL;
 }
 
 /* Two nodes under one address drive each other off the bus: a second of silence, doubling to half a minute. */
@@ -122,15 +125,25 @@ void teds_can_move(teds_node *node, uint8_t address)
 static void left(teds_node *node, teds_line *line)
 {
     line->out_state = TEDS_OUT_IDLE;
-    if (line->out_reply < 0) {
+    if (line->out_reply == NULL) {
         return;
     }
-    node->replies[line->out_reply].at = teds_now(node);
-    line->out_reply = -1;
+    line->out_reply->at = teds_now(node);
+    line->out_reply = NULL;
     teds_node_reply_left(node, line->source);
 }
 
 /* -- requests ----------------------------------------------------------------------------------------------------------- */
+
+/* A refusal in place of a flow control or of a reply, as one frame; the stored reply stays. */
+static void refuse(teds_line *line, uint8_t transaction, uint8_t reason, bool fd)
+{
+    line->refuses = reason;
+    line->refused = transaction;
+    if (TEDS_CAN_FD && !is_sending(line)) {
+        line->fd = fd;
+    }
+}
 
 static void request(teds_node *node, teds_line *line, const uint8_t *body, size_t length, bool fd, uint64_t tick)
 {
@@ -139,30 +152,25 @@ static void request(teds_node *node, teds_line *line, const uint8_t *body, size_
     teds_stored_reply *reply;
     if (is_sending(line)) { /* whoever asks again has not taken that answer up */
         left(node, line);
-        if (!line->used || line->own != own) {
+        if (line->source == 0 || line->own != own) {
             return; /* the node has moved: nobody answers at the old address */
         }
     }
     reply = teds_answer(node, line->source, &arrival, body, 1, body + 1, length - 1);
-    reply->octets[0] = body[0];
-    line->out_reply = (int8_t)(reply - node->replies);
-    teds_isotp_begin(line, reply->octets, reply->length, fd);
-}
-
-/* A refusal in place of a flow control, as one frame; the stored reply stays. */
-static void refuse(teds_line *line, uint8_t transaction, uint8_t reason, bool fd)
-{
-    const uint8_t single[6] = {5, transaction, 0, 0, 1, reason};
-    memcpy(line->single, single, sizeof single);
-    if (!is_sending(line)) {
-        line->fd = fd && TEDS_CAN_FD;
+    if (TEDS_PLACES_MAY_LACK && reply == NULL) {
+        refuse(line, body[0], TEDS_BUSY, fd);
+        return;
     }
+    reply->octets[0] = body[0];
+    line->out_reply = reply;
+    teds_isotp_begin(line, reply->octets, reply->length, fd);
 }
 
 static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *frame, uint64_t now)
 {
     teds_can *can = &node->can;
     size_t length = (size_t)(frame->data[0] & 15u) << 8 | frame->data[1], head = 2;
+    uint8_t reason = 0;
     if (frame->length < 8) {
         return;
     }
@@ -175,24 +183,25 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
     } else if (length < frame->length - 1u) {
         return; /* would fit one frame: not to be answered (ISO 15765-2) */
     }
-    if (length > sizeof can->rx) { /* always so of a length in 32 bits; what is taken is longer than its first frame */
-        refuse(line, frame->data[head], TEDS_TOO_LARGE, frame->fd);
+    if (length > sizeof node->rx) { /* always so of a length in 32 bits; what is taken is longer than its first frame */
+        reason = TEDS_TOO_LARGE;
+    } else if (can->rx_line != NULL && can->rx_line != line && now < can->rx_until) {
+        reason = TEDS_BUSY;
+    }
+    if (reason != 0) {
+        refuse(line, frame->data[head], reason, frame->fd);
         return;
     }
-    if (can->rx_line >= 0 && &can->lines[can->rx_line] != line && now < can->rx_until) {
-        refuse(line, frame->data[head], TEDS_BUSY, frame->fd);
-        return;
-    }
-    can->rx_line = (int8_t)(line - can->lines);
+    can->rx_line = line;
     can->rx_length = (uint16_t)length;
-    can->rx_at = (uint16_t)(frame->length - head);
+    can->rx_at = (uint16_t)(frame->length - 2u);
     can->rx_number = 1;
     can->rx_frame = frame->length;
     can->rx_block = TEDS_CAN_BLOCK;
     can->rx_until = now + CR_NS;
-    memcpy(can->rx, frame->data + head, can->rx_at);
+    memcpy(node->rx, frame->data + 2, can->rx_at);
     line->flow = 0x30;
-    if (!is_sending(line)) {
+    if (TEDS_CAN_FD && !is_sending(line)) {
         line->fd = frame->fd;
     }
 }
@@ -201,29 +210,30 @@ static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_f
 {
     teds_can *can = &node->can;
     uint8_t number = frame->data[0] & 15;
+    const uint8_t first = TEDS_CAN_FD ? can->rx_frame : 8;
     size_t octets = (size_t)(can->rx_length - can->rx_at);
-    if (can->rx_line < 0 || &can->lines[can->rx_line] != line) {
+    if (can->rx_line != line) {
         return;
     }
     if (number == ((can->rx_number + 15u) & 15u) && can->rx_at > 8) {
         return; /* the same frame twice: an error in its last bit doubles a frame on CAN */
     }
-    if (frame->length > can->rx_frame || (frame->length < can->rx_frame && frame->length - 1u < octets)) {
+    if (frame->length > first || (frame->length < first && frame->length - 1u < octets)) {
         return; /* only the last may be shorter than the first frame, none longer: ignored (ISO 15765-2) */
     }
     octets = octets < frame->length - 1u ? octets : frame->length - 1u;
     if (number != can->rx_number || now >= can->rx_until || octets == 0) {
-        can->rx_line = -1;
+        can->rx_line = NULL;
         return;
     }
-    memcpy(can->rx + can->rx_at, frame->data + 1, octets);
+    memcpy(node->rx + can->rx_at, frame->data + 1, octets);
     can->rx_at = (uint16_t)(can->rx_at + octets);
     can->rx_number = (uint8_t)((number + 1) & 15);
     can->rx_until = now + CR_NS;
     if (can->rx_at == can->rx_length) {
         line->flow = 0;
-        request(node, line, can->rx, can->rx_length, frame->fd, now);
-        can->rx_line = -1;
+        request(node, line, node->rx, can->rx_length, frame->fd, now);
+        can->rx_line = NULL;
     } else if (TEDS_CAN_BLOCK != 0 && --can->rx_block == 0) {
         can->rx_block = TEDS_CAN_BLOCK;
         line->flow = 0x30;
@@ -239,15 +249,15 @@ static void physical(teds_node *node, const teds_can_frame *frame, uint64_t tick
     if (own != node->can.address) {
         return;
     }
-    line = line_of(node, source, tick);
+    line = line_of(node, source);
     if (line == NULL || frame->length < 2) {
         return;
     }
     switch (frame->data[0] >> 4) {
     case 0:
         if (teds_isotp_single(frame->data, frame->length, &body, &octets)) {
-            if (node->can.rx_line == (int8_t)(line - node->can.lines)) {
-                node->can.rx_line = -1; /* a new message of the same station ends the one before */
+            if (node->can.rx_line == line) {
+                node->can.rx_line = NULL; /* a new message of the same station ends the one before */
             }
             request(node, line, body, octets, frame->fd, tick);
         }
@@ -271,11 +281,11 @@ static void functional(teds_node *node, const teds_can_frame *frame, uint64_t no
         memcmp(body + 1, identify, 6) != 0) {
         return; /* nothing else that is asked of everyone is answered */
     }
-    line = line_of(node, (uint8_t)frame->identifier, now);
+    line = line_of(node, (uint8_t)frame->identifier);
     if (line != NULL) { /* a newer one of the same station takes its place */
         line->asked = true;
         line->asked_transaction = body[0];
-        line->asked_fd = frame->fd;
+        line->asked_fd = TEDS_CAN_FD && frame->fd;
         line->asked_due = now + spread(node, EVERYONE_NS);
     }
 }
@@ -283,7 +293,7 @@ static void functional(teds_node *node, const teds_can_frame *frame, uint64_t no
 /* An answer to everyone that nobody takes up gives way to the next. */
 static bool may_answer_everyone(const teds_line *line)
 {
-    return !is_sending(line) || (line->out_reply < 0 && line->out_state == TEDS_OUT_WAITS);
+    return !is_sending(line) || (line->out_reply == NULL && line->out_state == TEDS_OUT_WAITS);
 }
 
 /* It leaves the stored reply alone. */
@@ -294,13 +304,13 @@ static void answer_everyone(teds_node *node, teds_line *line)
     line->everyone[1] = 1;
     teds_put16(line->everyone + 2, 23);
     teds_node_identify(node, line->everyone + 4);
-    line->out_reply = -1;
-    teds_isotp_begin(line, line->everyone, sizeof line->everyone, line->asked_fd);
+    line->out_reply = NULL;
+    teds_isotp_begin(line, line->everyone, sizeof line->everyone, TEDS_CAN_FD && line->asked_fd);
 }
 
 /* -- Announce and Claim ------------------------------------------------------------------------------------------------------ */
 
-static void announce_soon(teds_node *node, uint64_t now, uint64_t most)
+static void announce_soon(teds_node *node, uint64_t now, uint32_t most)
 {
     node->can.announces = true;
     node->can.announce_due = now + spread(node, most);
@@ -311,26 +321,27 @@ void teds_can_start(teds_node *node, uint64_t now)
     announce_soon(node, now > node->can.back_at ? now : node->can.back_at, START_NS);
 }
 
-static uint8_t next_free(const teds_node *node, uint8_t own)
+/* The next address that nobody was heard at; this one where every other is taken. */
+static uint8_t next_free(const teds_node *node)
 {
-    for (uint32_t step = 0; step < TEDS_LAST_ADDRESS - 1; step++) {
-        uint8_t address = (uint8_t)((own + step) % TEDS_LAST_ADDRESS + 1);
-        if ((node->can.heard[address >> 3] >> (address & 7) & 1) == 0) {
-            return address;
-        }
-    }
-    return own; /* every address is taken: nothing is better than here */
+    const uint8_t own = node->can.address;
+    uint8_t address = own;
+    do {
+        address = (uint8_t)(address < TEDS_LAST_ADDRESS ? address + 1 : 1);
+    } while (address != own && (node->can.heard[address >> 3] >> (address & 7) & 1) != 0);
+    return address;
 }
 
 static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now)
 {
     uint8_t address = (uint8_t)frame->identifier;
-    uint32_t crc, own = teds_crc32(0, node->uuid, 10);
+    uint32_t crc, own;
     bool stays = false;
     if (address != node->can.address || frame->length != 8 || frame->data[0] != 1 || frame->data[1] > 2) {
         return;
     }
     crc = teds_get32(frame->data + 2);
+    own = crc_of(node);
     if (crc == own) {
         return; /* a conflict for a person, or our own frame given back */
     }
@@ -339,7 +350,7 @@ static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now
     stays = teds_actuator_claimed(node);
 #endif
     if (crc < own && !stays) {
-        teds_can_move(node, next_free(node, node->can.address));
+        teds_can_move(node, next_free(node));
     }
 }
 
@@ -359,15 +370,13 @@ static bool may_announce(teds_node *node, uint64_t now)
 
 static void announce(const teds_node *node, teds_can_frame *frame)
 {
-    uint8_t identity[23];
-    teds_node_identify(node, identity);
     frame->identifier = ANNOUNCE | node->can.address;
     frame->fd = false;
     frame->length = 8;
     memset(frame->data, 0, 8);
     frame->data[0] = 1;
-    frame->data[1] = identity[11];
-    teds_put32(frame->data + 2, teds_crc32(0, node->uuid, 10));
+    frame->data[1] = teds_state_octet(node);
+    teds_put32(frame->data + 2, crc_of(node));
 }
 
 /* -- in and out ---------------------------------------------------------------------------------------------------------------- */
@@ -407,12 +416,25 @@ void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick)
 
 static void flow_control(teds_line *line, teds_can_frame *frame)
 {
-    frame->fd = line->fd;
+    frame->fd = TEDS_CAN_FD && line->fd;
     frame->data[0] = line->flow;
     frame->data[1] = TEDS_CAN_BLOCK;
     frame->data[2] = TEDS_CAN_STMIN;
     teds_can_pad(frame, 3);
     line->flow = 0;
+}
+
+static void refusal(teds_line *line, teds_can_frame *frame)
+{
+    frame->fd = TEDS_CAN_FD && line->fd;
+    frame->data[0] = 5;
+    frame->data[1] = line->refused;
+    frame->data[2] = 0;
+    frame->data[3] = 0;
+    frame->data[4] = 1;
+    frame->data[5] = line->refuses;
+    teds_can_pad(frame, 6);
+    line->refuses = 0;
 }
 
 /* What a line has to say now, flow controls first: somebody waits for them. */
@@ -423,11 +445,8 @@ static bool line_next(teds_node *node, teds_line *line, teds_can_frame *frame, u
         flow_control(line, frame);
         return true;
     }
-    if (line->single[0] != 0) {
-        frame->fd = line->fd;
-        memcpy(frame->data, line->single, sizeof line->single);
-        teds_can_pad(frame, sizeof line->single);
-        line->single[0] = 0;
+    if (line->refuses != 0) {
+        refusal(line, frame);
         return true;
     }
     if (line->asked && now >= line->asked_due && may_answer_everyone(line)) {
@@ -447,8 +466,8 @@ bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
     if (now < node->can.back_at) {
         return false;
     }
-    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
-        if (node->can.lines[i].used && line_next(node, &node->can.lines[i], frame, now)) {
+    for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
+        if (line->source != 0 && line_next(node, line, frame, now)) {
             return true;
         }
     }
@@ -468,26 +487,26 @@ bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
 
 uint64_t teds_can_poll(teds_node *node, uint64_t now)
 {
-    uint64_t due = node->can.announces ? node->can.announce_due : TEDS_NEVER;
-    if (node->can.rx_line >= 0) {
-        if (now >= node->can.rx_until) {
-            node->can.rx_line = -1;
+    teds_can *can = &node->can;
+    uint64_t due = can->announces ? can->announce_due : TEDS_NEVER;
+    if (can->rx_line != NULL) {
+        if (now >= can->rx_until) {
+            can->rx_line = NULL;
         } else {
-            due = node->can.rx_until < due ? node->can.rx_until : due;
+            teds_sooner(&due, can->rx_until);
         }
     }
-    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
-        teds_line *line = &node->can.lines[i];
-        if (is_sending(line) && line->out_state == TEDS_OUT_WAITS && now >= line->out_due) {
+    for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
+        if (line->out_state == TEDS_OUT_WAITS && now >= line->out_due) {
             left(node, line); /* its flow control failed to come */
         }
-        if (is_sending(line) && line->out_due < due) {
-            due = line->out_due;
+        if (is_sending(line)) {
+            teds_sooner(&due, line->out_due);
         }
-        if (line->used && line->asked && line->asked_due < due && may_answer_everyone(line)) {
-            due = line->asked_due;
+        if (line->asked && may_answer_everyone(line)) {
+            teds_sooner(&due, line->asked_due);
         }
-        if (line->used && (line->flow != 0 || line->single[0] != 0)) {
+        if (line->flow != 0 || line->refuses != 0) {
             due = now;
         }
     }

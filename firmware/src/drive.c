@@ -12,9 +12,9 @@ static uint32_t length_of(const teds_session *session)
     return HEAD + session->drive.octets;
 }
 
-int teds_drive(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_drive(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    teds_session *session = &node->sessions[origin->session];
+    teds_session *session = origin->session;
     uint8_t places[16], key[16];
     uint32_t octets = 0;
     const size_t count = command->length;
@@ -27,7 +27,7 @@ int teds_drive(teds_node *node, const teds_command *command, const teds_origin *
     }
     for (size_t i = 0; i < count; i++) {
         int place = teds_place_of(node, command->payload[i]);
-        if (!teds_is_claimed(node, origin, place)) {
+        if (!teds_is_claimed(origin, place)) {
             return -TEDS_WRONG_STATE;
         }
         places[i] = (uint8_t)place;
@@ -58,9 +58,8 @@ int teds_drive(teds_node *node, const teds_command *command, const teds_origin *
     return 4;
 }
 
-void teds_drive_end(teds_node *node, int8_t session, uint32_t places)
+void teds_drive_end(teds_session *own, uint32_t places)
 {
-    teds_session *own = &node->sessions[session];
     for (size_t i = 0; own->drive.used && i < own->drive.count; i++) {
         if ((places >> own->drive.places[i] & 1) != 0) {
             teds_wipe(&own->drive, sizeof own->drive);
@@ -120,13 +119,11 @@ static size_t fd_length(size_t octets)
 
 void teds_drive_message(teds_node *node, teds_link link, const uint8_t *octets, size_t length)
 {
-    int8_t number = teds_session_on(node, link);
-    teds_session *session;
-    if (number < 0) {
+    teds_session *session = teds_session_on(node, link);
+    if (session == NULL) {
         return;
     }
     (void)teds_operation_poll(node, teds_now(node)); /* a dead-man that ran out before this message is over */
-    session = &node->sessions[number];
     if (session->drive.used && length == length_of(session)) {
         memcpy(session->drive.message, octets, length);
         message(node, session);
@@ -135,14 +132,12 @@ void teds_drive_message(teds_node *node, teds_link link, const uint8_t *octets, 
 
 void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, size_t length)
 {
-    int8_t number = teds_session_on(node, link);
-    teds_session *session;
+    teds_session *session = teds_session_on(node, link);
     size_t room, due;
-    if (number < 0 || length < 1 || octets[0] > 7) {
+    if (session == NULL || length < 1 || octets[0] > 7) {
         return;
     }
     (void)teds_operation_poll(node, teds_now(node)); /* a dead-man that ran out before this frame is over */
-    session = &node->sessions[number];
     if (!session->drive.used) {
         return;
     }

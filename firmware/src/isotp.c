@@ -14,7 +14,7 @@ void teds_can_pad(teds_can_frame *frame, size_t used)
 {
     static const uint8_t lengths[] = {8, 12, 16, 20, 24, 32, 48, 64};
     size_t i = 0;
-    while (lengths[i] < used) {
+    while (TEDS_CAN_FD && lengths[i] < used) {
         i++;
     }
     memset(frame->data + used, PADDING, lengths[i] - used);
@@ -35,14 +35,13 @@ void teds_isotp_begin(teds_line *line, const uint8_t *octets, size_t length, boo
 
 static void first(teds_line *line, teds_can_frame *frame, uint64_t now)
 {
-    const size_t room = line->fd ? 64 : 8, most_single = line->fd ? 62 : 7;
+    const bool fd = TEDS_CAN_FD && line->fd; /* known to the compiler where only classic frames are built */
+    const size_t room = fd ? 64 : 8, most_single = fd ? 62 : 7;
     size_t at;
     if (line->out_length <= most_single) {
-        at = line->out_length <= 7 ? 1 : 2;
-        frame->data[0] = at == 1 ? (uint8_t)line->out_length : 0;
-        if (at == 2) {
-            frame->data[1] = (uint8_t)line->out_length;
-        }
+        at = !fd || line->out_length <= 7 ? 1 : 2;
+        frame->data[0] = 0;
+        frame->data[at - 1] = (uint8_t)line->out_length;
         memcpy(frame->data + at, line->out, line->out_length);
         teds_can_pad(frame, at + line->out_length);
         line->out_at = line->out_length;
@@ -61,7 +60,7 @@ static void first(teds_line *line, teds_can_frame *frame, uint64_t now)
 
 static void consecutive(teds_line *line, teds_can_frame *frame, uint64_t now)
 {
-    const size_t room = line->fd ? 63 : 7;
+    const size_t room = TEDS_CAN_FD && line->fd ? 63 : 7;
     size_t left = (size_t)(line->out_length - line->out_at);
     size_t octets = left < room ? left : room;
     frame->data[0] = (uint8_t)(0x20u | line->out_number);
@@ -80,7 +79,7 @@ static void consecutive(teds_line *line, teds_can_frame *frame, uint64_t now)
 
 bool teds_isotp_next(teds_line *line, teds_can_frame *frame, uint64_t now)
 {
-    frame->fd = line->fd;
+    frame->fd = TEDS_CAN_FD && line->fd;
     if (line->out_state == TEDS_OUT_FIRST) {
         first(line, frame, now);
         return true;

@@ -5,30 +5,72 @@
 #define STRANGER_NS TEDS_SECOND
 #define KEEP_NS (20u * TEDS_SECOND)
 
+uint64_t teds_now(const teds_node *node)
+{
+    return node->port->now(node->port->user);
+}
+
+void teds_sooner(uint64_t *due, uint64_t at)
+{
+    if (at < *due) {
+        *due = at;
+    }
+}
+
 /* -- permission: the first question asked of a command --------------------------------------------------------------- */
 
-static bool is_security_function(uint8_t function)
-{
-    return (function >= TEDS_REQUEST && function <= TEDS_CLOSE) ||
-           (function >= TEDS_IDENTIFY && function <= TEDS_DRIVE);
-}
+/* Commands, in the order of their names in the profile; any length where the handler asks for it in its own order. */
+#define ANY 255u
+typedef struct known {
+    uint8_t command_class, function, length;
+    teds_handler *run;
+} known;
 
-static bool is_teds_function(const teds_command *command)
-{
-    return command->command_class == TEDS_CLASS_COMMON && command->function >= TEDS_QUERY &&
-           command->function <= TEDS_UPDATE;
-}
+static teds_handler identify, prove, reset, set_can_address, list, close_session;
 
-/* A board without channels offers none of operation.md. */
-static bool measures(const teds_node *node, const teds_command *command)
-{
-#if TEDS_OPERATION
-    return node->port->channel_count > 0 && teds_operation_knows(command);
-#else
-    (void)node;
-    (void)command;
-    return false;
+static const known KNOWN[] = {
+    {TEDS_CLASS_SECURITY, TEDS_IDENTIFY, 0, identify}, /* asked most */
+    {TEDS_CLASS_COMMON, TEDS_QUERY, 1, teds_query},
+    {TEDS_CLASS_COMMON, TEDS_READ, 5, teds_read},
+    {TEDS_CLASS_COMMON, TEDS_WRITE, ANY, teds_write},
+    {TEDS_CLASS_COMMON, TEDS_UPDATE, 1, teds_update},
+    {TEDS_CLASS_SECURITY, TEDS_REQUEST, ANY, teds_request},
+    {TEDS_CLASS_SECURITY, TEDS_CONFIRM, ANY, teds_confirm},
+    {TEDS_CLASS_SECURITY, TEDS_OPEN, ANY, teds_open},
+    {TEDS_CLASS_SECURITY, TEDS_CLOSE, 0, close_session},
+    {TEDS_CLASS_SECURITY, TEDS_PROVE, 32, prove},
+    {TEDS_CLASS_SECURITY, TEDS_RESET, 32, reset},
+    {TEDS_CLASS_SECURITY, TEDS_SET_CAN_ADDRESS, 1, set_can_address},
+    {TEDS_CLASS_SECURITY, TEDS_LIST, 0, list},
+#if TEDS_OPERATION /* from here on those of operation.md */
+    {TEDS_CLASS_SECURITY, TEDS_SAMPLE, ANY, teds_sample},
+    {TEDS_CLASS_SECURITY, TEDS_SET, ANY, teds_set},
+    {TEDS_CLASS_SECURITY, TEDS_SUBSCRIBE, ANY, teds_subscribe},
+    {TEDS_CLASS_SECURITY, TEDS_STOP, 1, teds_stop},
+    {TEDS_CLASS_SECURITY, TEDS_CLOCK, 0, teds_clock},
+    {TEDS_CLASS_SECURITY, TEDS_ARM, 18, teds_arm},
+    {TEDS_CLASS_SECURITY, TEDS_POWER, 0, teds_power_state},
+    {TEDS_CLASS_SECURITY, TEDS_OPERATION_STATE, 0, teds_operation_state},
+    {TEDS_CLASS_SECURITY, TEDS_DRIVE, ANY, teds_drive},
+    {TEDS_CLASS_EITHER, 1, ANY, teds_operate},
+    {TEDS_CLASS_EITHER, 2, ANY, teds_idle},
+    {TEDS_CLASS_OPERATE, 1, ANY, teds_read_data_set},
+    {TEDS_CLASS_OPERATE, 2, ANY, teds_write_data_set},
+    {TEDS_CLASS_COMMON, TEDS_SELF_TEST, ANY, teds_self_test},
 #endif
+};
+#define MEASURES 13u /* place of the first of operation.md */
+
+/* NULL: no such command here. A board without channels offers none of operation.md. */
+static const known *look_up(const teds_node *node, const teds_command *command)
+{
+    const size_t count = node->port->channel_count > 0 ? sizeof KNOWN / sizeof KNOWN[0] : MEASURES;
+    for (size_t i = 0; i < count; i++) {
+        if (KNOWN[i].command_class == command->command_class && KNOWN[i].function == command->function) {
+            return &KNOWN[i];
+        }
+    }
+    return NULL;
 }
 
 /* No stranger's point arithmetic may hold up the values of a claimed actuator. */
@@ -52,11 +94,10 @@ static int hold_strangers_back(teds_node *node)
     if (!teds_streams_running(node)) {
         return 0;
     }
-    if (node->stranger_seen && now < node->stranger_at + STRANGER_NS) {
+    if (now < node->strangers_again) {
         return -TEDS_BUSY;
     }
-    node->stranger_seen = true;
-    node->stranger_at = now;
+    node->strangers_again = now + STRANGER_NS;
 #else
     (void)node;
 #endif
@@ -73,7 +114,7 @@ static int plain_security(teds_node *node, const teds_command *command, const te
         if (teds_in_factory(node)) {
             return -TEDS_WRONG_STATE;
         }
-        return command->length == 89 ? spare_actuators(node) : 0;
+        return command->length == TEDS_OPEN_OCTETS ? spare_actuators(node) : 0;
     case TEDS_SEALED:
         return !teds_in_factory(node) && teds_any_on(node, origin->link) ? 0 : -TEDS_WRONG_STATE;
     case TEDS_IDENTIFY: return 0;
@@ -84,42 +125,41 @@ static int plain_security(teds_node *node, const teds_command *command, const te
     }
 }
 
-static int plain(teds_node *node, const teds_command *command)
+static int plain(teds_node *node, const teds_command *command, const teds_origin *origin)
 {
-    if (!is_teds_function(command) || command->function > TEDS_READ) {
+    if (command->command_class == TEDS_CLASS_SECURITY) {
+        return plain_security(node, command, origin);
+    }
+    if (command->command_class != TEDS_CLASS_COMMON || command->function < TEDS_QUERY || command->function > TEDS_READ) {
         return -TEDS_NOT_PERMITTED;
     }
     return command->function == TEDS_READ ? hold_strangers_back(node) : 0;
 }
 
-static int inner_security(const teds_node *node, const teds_command *command)
+static int inner(const teds_command *command)
 {
-    if (command->function == TEDS_OPEN || command->function == TEDS_SEALED) {
+    if (command->command_class == TEDS_CLASS_SECURITY &&
+        (command->function == TEDS_OPEN || command->function == TEDS_SEALED)) {
         return -TEDS_NOT_PERMITTED;
     }
-    return command->function >= TEDS_SAMPLE && !measures(node, command) ? -TEDS_UNKNOWN_COMMAND : 0;
+    return command->known == NULL ? -TEDS_UNKNOWN_COMMAND : 0;
 }
 
 static int permitted(teds_node *node, const teds_command *command, const teds_origin *origin)
 {
-    int refused = 0;
-    const bool inside = origin->session >= 0;
-    if (command->command_class == TEDS_CLASS_SECURITY) {
-        if (command->channel != 0 || !is_security_function(command->function)) {
-            return -TEDS_UNKNOWN_COMMAND;
-        }
-        refused = inside ? inner_security(node, command) : plain_security(node, command, origin);
-    } else if (!inside) {
-        refused = plain(node, command);
-    } else if (!measures(node, command) && !is_teds_function(command)) {
-        refused = -TEDS_UNKNOWN_COMMAND;
+    const uint8_t function = command->function;
+    int refused;
+    if (command->command_class == TEDS_CLASS_SECURITY &&
+        (command->channel != 0 || function == 0 || function == TEDS_NO_FUNCTION || function > TEDS_DRIVE)) {
+        return -TEDS_UNKNOWN_COMMAND;
     }
+    refused = origin->session != NULL ? inner(command) : plain(node, command, origin);
 #if TEDS_OPERATION
-    if (!refused && ((command->command_class == TEDS_CLASS_COMMON &&
-                      (command->function == TEDS_WRITE || command->function == TEDS_UPDATE)) ||
-                     (command->command_class == TEDS_CLASS_SECURITY && command->function == TEDS_SET_CAN_ADDRESS))) {
-        refused = teds_demand_configuration(
-            node, origin, command->command_class == TEDS_CLASS_COMMON && command->function == TEDS_WRITE);
+    if (!refused && command->command_class == TEDS_CLASS_COMMON &&
+        (function == TEDS_WRITE || function == TEDS_UPDATE)) {
+        refused = teds_demand_configuration(node, origin, function == TEDS_WRITE);
+    } else if (!refused && command->command_class == TEDS_CLASS_SECURITY && function == TEDS_SET_CAN_ADDRESS) {
+        refused = teds_demand_configuration(node, origin, false);
     }
 #endif
     return refused;
@@ -127,49 +167,54 @@ static int permitted(teds_node *node, const teds_command *command, const teds_or
 
 /* -- class 128, the small ones ---------------------------------------------------------------------------------------- */
 
+uint8_t teds_state_octet(const teds_node *node)
+{
+    return teds_in_factory(node) ? 0 : (node->state.flags & TEDS_PROVISIONED) != 0 ? 2 : 1;
+}
+
 void teds_node_identify(const teds_node *node, uint8_t out[23])
 {
     const teds_state *state = &node->state;
     out[0] = 1;
-    memcpy(out + 1, node->uuid, 10);
-    out[11] = teds_in_factory(node) ? 0 : (state->flags & TEDS_PROVISIONED) != 0 ? 2 : 1;
+    memcpy(out + 1, node->identity.uuid, 10);
+    out[11] = teds_state_octet(node);
     teds_put32(out + 12, state->epoch);
     teds_put32(out + 16, state->sequence);
     teds_put16(out + 20, TEDS_MAX_MESSAGE);
     out[22] = node->can.address;
 }
 
-static int identify(const teds_node *node, const teds_command *command, uint8_t *out)
+static int identify(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    if (command->length != 0) {
-        return -TEDS_BAD_FORM;
-    }
+    (void)command;
+    (void)origin;
     teds_node_identify(node, out);
     return 23;
 }
 
-static int prove(const teds_node *node, const teds_command *command, uint8_t *out)
+static int close_session(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    const teds_part parts[] = {{(const uint8_t *)"TEDS1 prove", 12}, {node->uuid, 10}, {command->payload, 32}};
-    uint8_t hash[32];
-    if (command->length != 32) {
-        return -TEDS_BAD_FORM;
-    }
-    teds_sha256_parts(node, parts, 3, hash);
-    return teds_sign(node, hash, out) == 0 ? 64 : -TEDS_FAILURE;
+    (void)node;
+    (void)command;
+    (void)out;
+    origin->after = TEDS_AFTER_END_SESSION;
+    return 0;
+}
+
+static int prove(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
+{
+    const teds_part parts[] = {{(const uint8_t *)"TEDS1 prove", 12}, {node->identity.uuid, 10}, {command->payload, 32}};
+    (void)origin;
+    return teds_sign(node, parts, 3, out) == 0 ? 64 : -TEDS_FAILURE;
 }
 
 static int reset(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    uint8_t epoch[4], hash[32];
+    uint8_t epoch[4];
     const teds_part parts[] = {
-        {(const uint8_t *)"TEDS1 reset", 12}, {node->uuid, 10}, {epoch, 4}, {command->payload, 32}};
-    if (command->length != 32) {
-        return -TEDS_BAD_FORM;
-    }
+        {(const uint8_t *)"TEDS1 reset", 12}, {node->identity.uuid, 10}, {epoch, 4}, {command->payload, 32}};
     teds_put32(epoch, node->state.epoch);
-    teds_sha256_parts(node, parts, 4, hash);
-    if (teds_sign(node, hash, out) != 0) {
+    if (teds_sign(node, parts, 4, out) != 0) {
         return -TEDS_FAILURE;
     }
     if (!teds_in_factory(node)) {
@@ -187,87 +232,49 @@ static int reset(teds_node *node, const teds_command *command, teds_origin *orig
     return 64;
 }
 
-static int set_can_address(teds_node *node, const teds_command *command, const teds_origin *origin)
+static int set_can_address(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     teds_state state = node->state;
     uint64_t now = teds_now(node);
     int failed;
-    if (command->length != 1 || command->payload[0] == 0 || command->payload[0] > TEDS_LAST_ADDRESS) {
+    (void)out;
+    if (command->payload[0] == 0 || command->payload[0] > TEDS_LAST_ADDRESS) {
         return -TEDS_BAD_FORM;
     }
     if (command->payload[0] != state.address) {
-        if (node->address_written && now < node->address_written_at + ADDRESS_NS) {
+        if (now < node->address_again) {
             return -TEDS_BUSY;
         }
         state.address = command->payload[0];
-        failed = teds_store_state(node, &state);
+        failed = teds_store_write(node, &state, NULL);
         if (failed) {
             return failed;
         }
-        node->address_written = true;
-        node->address_written_at = now;
+        node->address_again = now + ADDRESS_NS;
     }
     node->can.moves_to = command->payload[0]; /* when the reply has left */
     node->can.moves_link = origin->link;
     return 0;
 }
 
-static int list(const teds_node *node, const teds_command *command, uint8_t *out)
+static int list(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    int32_t after = -1;
-    uint16_t id;
-    int length = 0, more;
-    if (command->length != 0) {
-        return -TEDS_BAD_FORM;
-    }
-    for (; (more = teds_next_id(node, after, &id)) > 0; after = id) {
+    int32_t id = -1;
+    int length = 0;
+    (void)command;
+    (void)origin;
+    while ((id = teds_next_id(node, id, TEDS_STORED | TEDS_NOT_STORED)) < TEDS_NO_ID) {
         if ((size_t)length + 3 > TEDS_ROOM) {
             return -TEDS_TOO_LARGE;
         }
-        teds_put16(out + length, id >> 8);
+        teds_put16(out + length, (uint16_t)(id >> 8));
         out[length + 2] = (uint8_t)id;
         length += 3;
     }
-    return more < 0 ? -TEDS_FAILURE : length;
+    return id == TEDS_NO_ID ? length : -TEDS_FAILURE;
 }
 
 /* -- routing ---------------------------------------------------------------------------------------------------------- */
-
-/* A command that is permitted and whose length is right, other than Sealed. */
-static int run_known(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
-{
-    if (is_teds_function(command)) {
-        switch (command->function) {
-        case TEDS_QUERY: return teds_query(node, command, out);
-        case TEDS_READ: return teds_read(node, command, out);
-        case TEDS_WRITE: return teds_write(node, command, origin);
-        default: return teds_update(node, command, origin, out);
-        }
-    }
-    if (command->command_class == TEDS_CLASS_SECURITY && command->function < TEDS_SAMPLE) {
-        switch (command->function) {
-        case TEDS_REQUEST: return teds_request(node, command, origin, out);
-        case TEDS_CONFIRM: return teds_confirm(node, command, origin);
-        case TEDS_OPEN: return teds_open(node, command, origin, out);
-        case TEDS_IDENTIFY: return identify(node, command, out);
-        case TEDS_PROVE: return prove(node, command, out);
-        case TEDS_RESET: return reset(node, command, origin, out);
-        case TEDS_SET_CAN_ADDRESS: return set_can_address(node, command, origin);
-        case TEDS_LIST: return list(node, command, out);
-        default: /* Close */
-            if (command->length != 0) {
-                return -TEDS_BAD_FORM;
-            }
-            origin->after = TEDS_AFTER_END_SESSION;
-            return 0;
-        }
-    }
-#if TEDS_OPERATION
-    return teds_operation_run(node, command, origin, out);
-#else
-    return -TEDS_UNKNOWN_COMMAND;
-#endif
-}
 
 static int cut(teds_node *node, const uint8_t *frame, size_t length, const teds_origin *origin, teds_command *command)
 {
@@ -280,11 +287,29 @@ static int cut(teds_node *node, const uint8_t *frame, size_t length, const teds_
     command->function = frame[3];
     command->payload = frame + 6;
     command->length = length - 6;
+    command->known = look_up(node, command);
     refused = permitted(node, command, origin);
     if (refused) {
         return refused;
     }
-    return teds_get16(frame + 4) == command->length ? 0 : -TEDS_BAD_FORM;
+    if (teds_get16(frame + 4) != command->length) {
+        return -TEDS_BAD_FORM;
+    }
+    return command->known == NULL || command->known->length == ANY || command->known->length == command->length
+               ? 0
+               : -TEDS_BAD_FORM;
+}
+
+/* A command that is permitted and whose length is right, other than Sealed. */
+static int run(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
+{
+#if TEDS_OPERATION
+    if (command->known >= KNOWN + MEASURES) {
+        /* what is due by now goes first: a lease or dead-man that ran out, samples taken before a Stop */
+        (void)teds_operation_poll(node, teds_now(node));
+    }
+#endif
+    return command->known->run(node, command, origin, out);
 }
 
 /* The reply frame around a handler's outcome, whose payload stands at reply + 3. */
@@ -324,14 +349,14 @@ static int sealed(teds_node *node, const teds_command *command, teds_origin *ori
     if (outcome) {
         return outcome;
     }
-    if (taken.session < 0) {
+    if (taken.session == NULL) {
         outcome = -TEDS_NO_ROOM;
     } else {
         teds_command within;
         origin->session = taken.session;
         outcome = cut(node, inner, taken.length, origin, &within);
         if (!outcome) {
-            outcome = run_known(node, &within, origin, reply + 3);
+            outcome = run(node, &within, origin, reply + 3);
         }
         if (taken.counter == UINT32_MAX && origin->after == TEDS_AFTER_NOTHING) {
             origin->after = TEDS_AFTER_END_SESSION;
@@ -345,19 +370,15 @@ static int sealed(teds_node *node, const teds_command *command, teds_origin *ori
 size_t teds_node_handle(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *frame,
                         size_t length, uint8_t *reply)
 {
-    teds_origin origin = {link, arrival, -1, TEDS_AFTER_NOTHING};
+    teds_origin origin = {link, arrival, NULL, TEDS_AFTER_NOTHING};
     teds_command command;
     int outcome;
     size_t octets;
-    teds_sessions_expire(node, teds_now(node));
-    if (length > TEDS_MAX_MESSAGE) {
-        return close_reply(reply, -TEDS_TOO_LARGE);
-    }
-    outcome = cut(node, frame, length, &origin, &command);
-    if (!outcome && command.command_class == TEDS_CLASS_SECURITY && command.function == TEDS_SEALED) {
-        outcome = sealed(node, &command, &origin, reply + 3);
-    } else if (!outcome) {
-        outcome = run_known(node, &command, &origin, reply + 3);
+    (void)teds_sessions_poll(node, teds_now(node));
+    outcome = length > TEDS_MAX_MESSAGE ? -TEDS_TOO_LARGE : cut(node, frame, length, &origin, &command);
+    if (!outcome) {
+        outcome = command.known != NULL ? run(node, &command, &origin, reply + 3)
+                                        : sealed(node, &command, &origin, reply + 3);
     }
     octets = close_reply(reply, outcome);
     run_after(node, &origin);
@@ -366,63 +387,59 @@ size_t teds_node_handle(teds_node *node, teds_link link, const teds_arrival *arr
 
 /* -- stored replies ----------------------------------------------------------------------------------------------------- */
 
-static bool is_being_sent(const teds_node *node, int8_t place)
+static bool is_being_sent(const teds_node *node, const teds_stored_reply *reply)
 {
-    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
-        if (node->can.lines[i].used && node->can.lines[i].out_state != TEDS_OUT_IDLE &&
-            node->can.lines[i].out_reply == place) {
+    for (const teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
+        if (line->out_state != TEDS_OUT_IDLE && line->out_reply == reply) {
             return true;
         }
     }
 #if TEDS_NFC
-    if (node->nfc.answered && node->nfc.reply == place) {
+    if (node->nfc.answered && node->nfc.reply == reply) {
         return true;
     }
 #endif
 #if TEDS_BLE
-    return teds_ble_sends(node, place);
+    return teds_ble_sends(node, reply);
 #else
     return false;
 #endif
 }
 
 /* A link's place: its own, a free one, the oldest of those whose link has no session; of these rather one that is not
- * being sent. There is always one: there are more places than sessions. */
+ * being sent. NULL: every place is that of a session, in a build that has no place more than sessions. */
 teds_stored_reply *teds_reply_place(teds_node *node, teds_link link)
 {
-    teds_stored_reply *found = NULL;
-    bool found_sent = true;
-    for (int8_t i = 0; i < TEDS_REPLIES; i++) {
-        if (node->replies[i].used && node->replies[i].link == link) {
-            return &node->replies[i];
+    enum { FREE, TAKEN, SENT, NONE } best = NONE;
+    teds_stored_reply *found = node->replies;
+    for (teds_stored_reply *each = node->replies; each < node->replies + TEDS_REPLIES; each++) {
+        if (each->used && each->link == link) {
+            return each;
         }
     }
-    for (int8_t i = 0; i < TEDS_REPLIES; i++) {
-        teds_stored_reply *each = &node->replies[i];
-        bool sent = is_being_sent(node, i);
-        if (each->used && teds_session_on(node, each->link) >= 0) {
+    for (teds_stored_reply *each = node->replies; each < node->replies + TEDS_REPLIES; each++) {
+        const unsigned rank = !each->used ? FREE : is_being_sent(node, each) ? SENT : TAKEN;
+        if (each->used && teds_session_on(node, each->link) != NULL) {
             continue;
         }
-        if (found == NULL || (found->used && !each->used) ||
-            (found->used && ((found_sent && !sent) || (found_sent == sent && each->at < found->at)))) {
+        if (rank < best || (rank == best && each->at < found->at)) {
             found = each;
-            found_sent = sent;
+            best = rank;
         }
     }
-    if (found == NULL) {
-        found = &node->replies[0];
+    if (TEDS_PLACES_MAY_LACK && best == NONE) {
+        return NULL;
     }
-    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
-        teds_line *line = &node->can.lines[i];
-        if (line->out_state != TEDS_OUT_IDLE && line->out_reply == (int8_t)(found - node->replies)) {
+    for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
+        if (line->out_reply == found) {
             line->out_state = TEDS_OUT_IDLE;
         }
     }
 #if TEDS_NFC
-    node->nfc.answered = node->nfc.answered && node->nfc.reply != (int8_t)(found - node->replies);
+    node->nfc.answered = node->nfc.answered && node->nfc.reply != found;
 #endif
 #if TEDS_BLE
-    teds_ble_forget(node, (int8_t)(found - node->replies));
+    teds_ble_forget(node, found);
 #endif
     found->used = true;
     found->stored = false;
@@ -449,6 +466,9 @@ teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arriv
     const teds_part parts[] = {{transaction, transaction_length}, {frame, length < TEDS_MAX_MESSAGE ? length : TEDS_MAX_MESSAGE}};
     teds_stored_reply *place = teds_reply_place(node, link);
     uint8_t digest[32];
+    if (TEDS_PLACES_MAY_LACK && place == NULL) {
+        return NULL;
+    }
     teds_sha256_parts(node, parts, 2, digest);
     if (!place->stored || memcmp(digest, place->digest, 32) != 0 || teds_now(node) >= place->at + KEEP_NS ||
         always_anew(frame, length)) {
@@ -472,10 +492,9 @@ int teds_node_init(teds_node *node, const teds_config *config, const teds_port *
     memset(node, 0, sizeof *node);
     node->config = config;
     node->port = port;
-    node->can.rx_line = -1;
     if (port->unit == 0 || port->unit > 32 || (port->unit & (port->unit - 1)) != 0 ||
         port->slot_octets < TEDS_STAGING + 256u || port->identity_octets < 192 ||
-        (config->nfc.present && config->nfc.max_ndef != 0 && config->nfc.max_ndef < 160)) {
+        (TEDS_NFC && config->nfc.present && config->nfc.max_ndef != 0 && config->nfc.max_ndef < 160)) {
         return TEDS_E_USAGE;
     }
 #if TEDS_OPERATION
@@ -512,25 +531,6 @@ void teds_node_reply_left(teds_node *node, teds_link link)
     }
 }
 
-void teds_link_forget(teds_node *node, teds_link link)
-{
-    teds_session_end(node, teds_session_on(node, link));
-    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (node->half_open[i].used && node->half_open[i].link == link) {
-            teds_wipe(&node->half_open[i], sizeof node->half_open[i]);
-        }
-    }
-    for (size_t i = 0; i < TEDS_REPLIES; i++) {
-        if (node->replies[i].used && node->replies[i].link == link) {
-            node->replies[i].used = false;
-            node->replies[i].stored = false;
-        }
-    }
-    if (node->pending.used && node->pending.link == link) {
-        teds_pending_forget(node);
-    }
-}
-
 void teds_node_link_lost(teds_node *node, teds_link link)
 {
     teds_link_forget(node, link);
@@ -555,39 +555,35 @@ int teds_node_reset_by_hand(teds_node *node)
 
 uint64_t teds_node_poll(teds_node *node, uint64_t now)
 {
-    uint64_t due, next = TEDS_NEVER;
-    teds_sessions_expire(node, now);
+    uint64_t next = TEDS_NEVER;
 #if TEDS_OPERATION
     next = teds_operation_poll(node, now);
 #endif
 #if TEDS_NFC
     teds_nfc_poll(node);
 #endif
-    due = teds_can_poll(node, now);
-    next = due < next ? due : next;
-    due = teds_store_poll(node, now);
-    next = due < next ? due : next;
-    due = teds_sessions_due(node);
-    return due < next ? due : next;
+    teds_sooner(&next, teds_can_poll(node, now));
+    teds_store_poll(node, now);
+#if TEDS_NFC
+    if (node->old_slot_due && now < node->nfc.busy_until) {
+        teds_sooner(&next, node->nfc.busy_until);
+    }
+#endif
+    teds_sooner(&next, teds_sessions_poll(node, now)); /* last: what ran above may have opened one */
+    return next;
 }
 
 bool teds_idle_work(teds_node *node)
 {
-    const teds_port *port = node->port;
-    if (node->one_time.ready || port->p256_make(port->user, TEDS_KEY_AGREES, &node->one_time.key,
-                                                node->one_time.point) != 0) {
-        return false;
-    }
-    node->one_time.ready = true;
-    return true;
+    return !node->one_time.ready && teds_one_time_make(node) == 0;
 }
 
 uint64_t teds_node_missed(const teds_node *node)
 {
 #if TEDS_OPERATION
     uint64_t missed = node->missed;
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        missed += node->streams[i].used ? node->streams[i].missed : 0;
+    for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        missed += each->used ? each->missed : 0;
     }
     return missed;
 #else

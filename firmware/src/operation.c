@@ -7,17 +7,6 @@
 #define MOST_SAMPLE 64u
 #define MILLI UINT64_C(1000000)
 
-bool teds_operation_knows(const teds_command *command)
-{
-    switch (command->command_class) {
-    case TEDS_CLASS_SECURITY: return command->function >= TEDS_SAMPLE && command->function <= TEDS_DRIVE;
-    case TEDS_CLASS_EITHER:
-    case TEDS_CLASS_OPERATE: return command->function == 1 || command->function == 2;
-    case TEDS_CLASS_COMMON: return command->function == TEDS_SELF_TEST;
-    default: return false;
-    }
-}
-
 /* -- the board --------------------------------------------------------------------------------------------------------- */
 
 static const teds_channel *facts(const teds_node *node, int place)
@@ -110,47 +99,14 @@ bool teds_channels_good(const teds_port *port)
 void teds_operation_start(teds_node *node)
 {
     for (size_t i = 0; i < node->port->channel_count; i++) {
-        node->actuator_of[i] = -1;
+        node->actuator_of[i] = NULL;
         if (is_actuator(node, (int)i)) {
             go_safe(node, (int)i);
         }
     }
-    node->can.data_stream = -1;
 }
 
 /* -- what the stored Channel TEDS says ----------------------------------------------------------------------------------- */
-
-typedef struct walk {
-    const teds_node *node;
-    teds_source source;
-    uint32_t at, end, width;
-} walk;
-
-static uint32_t number_at(const walk *in, uint32_t at, uint32_t octets)
-{
-    uint8_t read[4] = {0};
-    if (octets - 1 > 3 || at + octets > in->source.length ||
-        teds_source_read(in->node, &in->source, at, read + 4 - octets, octets) != 0) {
-        return UINT32_MAX;
-    }
-    return teds_get32(read);
-}
-
-/* The next tuple: its type, and where its value lies; false at the end or where one runs past it. */
-static bool next_tuple(walk *in, uint8_t *type, uint32_t *value, uint32_t *length)
-{
-    if (in->at + 1 + in->width > in->end) {
-        return false;
-    }
-    *type = (uint8_t)number_at(in, in->at, 1);
-    *length = number_at(in, in->at + 1, in->width);
-    *value = in->at + 1 + in->width;
-    if (*length > in->end - *value) {
-        return false;
-    }
-    in->at = *value + *length;
-    return true;
-}
 
 /* Float32 seconds as ns, less 1 ppm; 0 where it is not positive or no number. */
 static uint64_t period_of(uint32_t bits)
@@ -171,7 +127,7 @@ static uint64_t period_of(uint32_t bits)
 int teds_channel_fits(const teds_node *node, int place, uint64_t *period)
 {
     const teds_channel *own = facts(node, place);
-    walk in = {.node = node, .at = 10, .width = 1};
+    teds_walk in = {.node = node, .at = 10, .width = 1};
     uint32_t value, length, kind = UINT32_MAX, model = UINT32_MAX, octets = UINT32_MAX, halt = UINT32_MAX;
     uint8_t type;
     *period = 0;
@@ -179,23 +135,23 @@ int teds_channel_fits(const teds_node *node, int place, uint64_t *period)
         return 0;
     }
     in.end = in.source.length - 2;
-    in.at = number_at(&in, 5, 1) == 5 ? 11 : 10;
-    in.width = number_at(&in, in.at - 1, 1);
+    in.at = teds_number_at(&in, 5, 1) == 5 ? 11 : 10;
+    in.width = teds_number_at(&in, in.at - 1, 1);
     in.width = in.width >= 1 && in.width <= 4 ? in.width : 1;
-    while (next_tuple(&in, &type, &value, &length)) {
+    while (teds_next_tuple(&in, &type, &value, &length)) {
         if (type == 11) {
-            kind = number_at(&in, value, length);
+            kind = teds_number_at(&in, value, length);
         } else if (type == 36) {
-            halt = number_at(&in, value, length);
+            halt = teds_number_at(&in, value, length);
         } else if (type == 23 && length == 4) {
-            *period = period_of(number_at(&in, value, 4));
+            *period = period_of(teds_number_at(&in, value, 4));
         } else if (type == 18) {
-            walk within = in;
+            teds_walk within = in;
             within.at = value;
             within.end = value + length;
-            while (next_tuple(&within, &type, &value, &length)) {
-                model = type == 40 ? number_at(&in, value, length) : model;
-                octets = type == 41 ? number_at(&in, value, length) : octets;
+            while (teds_next_tuple(&within, &type, &value, &length)) {
+                model = type == 40 ? teds_number_at(&in, value, length) : model;
+                octets = type == 41 ? teds_number_at(&in, value, length) : octets;
             }
         }
     }
@@ -207,16 +163,11 @@ int teds_channel_fits(const teds_node *node, int place, uint64_t *period)
 
 /* -- claims ---------------------------------------------------------------------------------------------------------------- */
 
-uint32_t teds_claims_of(const teds_node *node, int8_t session)
-{
-    return node->sessions[session].used ? node->sessions[session].claims : 0;
-}
-
 static uint32_t all_claims(const teds_node *node)
 {
     uint32_t claims = 0;
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        claims |= teds_claims_of(node, i);
+    for (const teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        claims |= each->claims;
     }
     return claims;
 }
@@ -224,43 +175,38 @@ static uint32_t all_claims(const teds_node *node)
 bool teds_actuator_claimed(const teds_node *node)
 {
     for (size_t i = 0; i < node->port->channel_count; i++) {
-        if (is_actuator(node, (int)i) && node->actuator_of[i] >= 0) {
+        if (is_actuator(node, (int)i) && node->actuator_of[i] != NULL) {
             return true;
         }
     }
     return false;
 }
 
-void teds_claims_end(teds_node *node, int8_t session, uint32_t places, bool stopped)
+void teds_claims_end(teds_node *node, teds_session *session, uint32_t places, bool stopped)
 {
-    uint32_t going = teds_claims_of(node, session) & places;
+    uint32_t going = session->claims & places;
     if (going == 0) {
         return;
     }
     for (int i = 0; i < (int)node->port->channel_count; i++) {
         if ((going >> i & 1) != 0 && is_actuator(node, i)) {
-            node->actuator_of[i] = -1;
+            node->actuator_of[i] = NULL;
             go_safe(node, i);
             node->stopped |= stopped ? UINT32_C(1) << i : 0;
         }
     }
-    node->sessions[session].claims &= ~going;
+    session->claims &= ~going;
     teds_streams_end(node, session, going);
-    teds_drive_end(node, session, going);
-    if (node->sessions[session].claims == 0) {
-        memset(node->sessions[session].arms, 0, sizeof node->sessions[session].arms);
+    teds_drive_end(session, going);
+    if (session->claims == 0) {
+        memset(session->arms, 0, sizeof session->arms);
     }
-}
-
-void teds_operation_session_ended(teds_node *node, int8_t session)
-{
-    teds_claims_end(node, session, UINT32_MAX, false);
 }
 
 static void release_all(teds_node *node)
 {
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        teds_claims_end(node, i, UINT32_MAX, false);
+    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        teds_claims_end(node, each, UINT32_MAX, false);
     }
 }
 
@@ -274,11 +220,11 @@ void teds_everything_safe(teds_node *node)
     }
 }
 
-void teds_yield_sensors(teds_node *node, int8_t session)
+void teds_yield_sensors(teds_node *node, teds_session *session)
 {
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (i != session) {
-            teds_claims_end(node, i, UINT32_MAX, false); /* no actuator is claimed: that was demanded before */
+    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        if (each != session) {
+            teds_claims_end(node, each, UINT32_MAX, false); /* no actuator is claimed: that was demanded before */
         }
     }
 }
@@ -287,7 +233,7 @@ void teds_yield_sensors(teds_node *node, int8_t session)
 int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool writes)
 {
     (void)teds_operation_poll(node, teds_now(node));
-    if (origin->session >= 0 && teds_claims_of(node, origin->session) != 0) {
+    if (origin->session != NULL && origin->session->claims != 0) {
         return -TEDS_WRONG_STATE;
     }
     if (all_claims(node) == 0 || (writes && origin->arrival->kind == TEDS_AT_NFC && !teds_actuator_claimed(node))) {
@@ -303,7 +249,7 @@ uint64_t teds_operation_poll(teds_node *node, uint64_t now)
         release_all(node);
     }
     for (int i = 0; i < (int)node->port->channel_count; i++) {
-        if (is_actuator(node, i) && node->actuator_of[i] >= 0) {
+        if (is_actuator(node, i) && node->actuator_of[i] != NULL) {
             if (now >= node->deadline[i]) {
                 teds_claims_end(node, node->actuator_of[i], UINT32_C(1) << i, true);
             } else if (node->deadline[i] < due) {
@@ -311,11 +257,11 @@ uint64_t teds_operation_poll(teds_node *node, uint64_t now)
             }
         }
     }
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (teds_claims_of(node, i) != 0) {
-            at = node->sessions[i].good_at + node->sessions[i].lease;
+    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        if (each->claims != 0) {
+            at = each->good_at + each->lease;
             if (now >= at) {
-                teds_claims_end(node, i, UINT32_MAX, false);
+                teds_claims_end(node, each, UINT32_MAX, false);
             } else if (at < due) {
                 due = at;
             }
@@ -348,16 +294,17 @@ static bool has_sensors(const teds_node *node)
     return false;
 }
 
-static int operate(teds_node *node, const teds_command *command, const teds_origin *origin)
+int teds_operate(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
     bool acting = place >= 0 && is_actuator(node, place);
-    teds_session *session = &node->sessions[origin->session];
-    teds_source security = {0};
+    teds_session *session = origin->session;
+    teds_source security;
     uint8_t digest[32], lease;
     uint16_t dead_man = 0;
     uint32_t wanted;
     uint64_t period;
+    (void)out;
     if (place < 0 && (command->channel != 0 || !has_sensors(node))) {
         return -TEDS_UNKNOWN_COMMAND;
     }
@@ -380,7 +327,7 @@ static int operate(teds_node *node, const teds_command *command, const teds_orig
     if (lease < 1 || lease > 60 || dead_man < 20 || dead_man > 10000) {
         return -TEDS_OUT_OF_RANGE;
     }
-    if (acting && node->actuator_of[place] >= 0) {
+    if (acting && node->actuator_of[place] != NULL) {
         return node->actuator_of[place] == origin->session ? -TEDS_WRONG_STATE : -TEDS_BUSY;
     }
     if ((power_of(node).flags & TEDS_POWER_TOO_LOW) != 0 || (place >= 0 && has_fault(node, place))) {
@@ -401,9 +348,10 @@ static int operate(teds_node *node, const teds_command *command, const teds_orig
     return 0;
 }
 
-static int idle(teds_node *node, const teds_command *command, const teds_origin *origin)
+int teds_idle(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
+    (void)out;
     if (command->channel != 0 && place < 0) {
         return -TEDS_UNKNOWN_COMMAND;
     }
@@ -414,19 +362,17 @@ static int idle(teds_node *node, const teds_command *command, const teds_origin 
     return 0;
 }
 
-static int operation(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_operation_state(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     int length = 1;
-    if (command->length != 0) {
-        return -TEDS_BAD_FORM;
-    }
+    (void)command;
     out[0] = all_claims(node) != 0;
     for (int i = 0; i < (int)node->port->channel_count; i++) {
         uint32_t state = is_actuator(node, i) ? 1 : facts(node, i)->kind == TEDS_EVENT_SENSOR ? 8 : 0;
         uint8_t claimant = 0;
-        for (int8_t s = 0; s < TEDS_SESSIONS; s++) {
-            if ((teds_claims_of(node, s) >> i & 1) != 0) {
-                state |= s == origin->session ? 2 : 4;
+        for (size_t s = 0; s < TEDS_SESSIONS; s++) {
+            if ((node->sessions[s].claims >> i & 1) != 0) {
+                state |= &node->sessions[s] == origin->session ? 2 : 4;
                 claimant = node->sessions[s].link > claimant ? node->sessions[s].link : claimant;
             }
         }
@@ -456,12 +402,12 @@ int teds_channel_list(const uint8_t *octets, size_t length, size_t most)
     return 0;
 }
 
-bool teds_is_claimed(const teds_node *node, const teds_origin *origin, int place)
+bool teds_is_claimed(const teds_origin *origin, int place)
 {
-    return place >= 0 && (teds_claims_of(node, origin->session) >> place & 1) != 0;
+    return place >= 0 && (origin->session->claims >> place & 1) != 0;
 }
 
-static int read_data_set(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_read_data_set(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
     if (place < 0) {
@@ -470,7 +416,7 @@ static int read_data_set(const teds_node *node, const teds_command *command, con
     if (command->length != 4) {
         return -TEDS_BAD_FORM;
     }
-    if (!teds_is_claimed(node, origin, place)) {
+    if (!teds_is_claimed(origin, place)) {
         return -TEDS_WRONG_STATE;
     }
     if (teds_get32(command->payload) != 0) {
@@ -484,7 +430,7 @@ static int read_data_set(const teds_node *node, const teds_command *command, con
     return 4 + facts(node, place)->octets;
 }
 
-static int sample(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_sample(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     uint8_t channels[MOST_SAMPLE]; /* a copy: the reply grows over the command */
     const size_t count = command->length;
@@ -497,7 +443,7 @@ static int sample(const teds_node *node, const teds_command *command, const teds
     memcpy(channels, command->payload, count);
     for (size_t i = 0; i < count; i++) {
         int place = teds_place_of(node, channels[i]);
-        if (!teds_is_claimed(node, origin, place)) {
+        if (!teds_is_claimed(origin, place)) {
             return -TEDS_WRONG_STATE;
         }
         length += facts(node, place)->octets;
@@ -549,17 +495,18 @@ int teds_apply(teds_node *node, const uint8_t *pairs, size_t length)
     return 0;
 }
 
-static int write_data_set(teds_node *node, const teds_command *command, const teds_origin *origin)
+int teds_write_data_set(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     uint8_t pair[256];
     int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
+    (void)out;
     if (place < 0) {
         return -TEDS_UNKNOWN_COMMAND;
     }
     if (command->length != 4u + facts(node, place)->octets) {
         return -TEDS_BAD_FORM;
     }
-    if (!teds_is_claimed(node, origin, place)) {
+    if (!teds_is_claimed(origin, place)) {
         return -TEDS_WRONG_STATE;
     }
     if (!is_actuator(node, place)) {
@@ -573,12 +520,13 @@ static int write_data_set(teds_node *node, const teds_command *command, const te
     return teds_apply(node, pair, command->length - 3);
 }
 
-static int set(teds_node *node, const teds_command *command, const teds_origin *origin)
+int teds_set(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     const uint8_t *pairs = command->payload;
     uint32_t seen = 0;
     size_t at = 0;
     int place;
+    (void)out;
     if (command->length == 0) {
         return -TEDS_BAD_FORM;
     }
@@ -596,7 +544,7 @@ static int set(teds_node *node, const teds_command *command, const teds_origin *
         seen |= UINT32_C(1) << place;
         at += 1u + facts(node, place)->octets;
     }
-    if ((seen & ~teds_claims_of(node, origin->session)) != 0) {
+    if ((seen & ~origin->session->claims) != 0) {
         return -TEDS_WRONG_STATE;
     }
     for (place = 0; place < (int)node->port->channel_count; place++) {
@@ -607,10 +555,11 @@ static int set(teds_node *node, const teds_command *command, const teds_origin *
     return teds_apply(node, pairs, command->length);
 }
 
-static int self_test(teds_node *node, const teds_command *command, const teds_origin *origin)
+int teds_self_test(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
     uint32_t wanted = place < 0 ? UINT32_MAX : UINT32_C(1) << place;
+    (void)out;
     if (command->channel != 0 && place < 0) {
         return -TEDS_UNKNOWN_COMMAND;
     }
@@ -620,8 +569,8 @@ static int self_test(teds_node *node, const teds_command *command, const teds_or
     if (command->payload[0] != 0) {
         return -TEDS_OUT_OF_RANGE;
     }
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (i != origin->session && (teds_claims_of(node, i) & wanted) != 0) {
+    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        if (each != origin->session && (each->claims & wanted) != 0) {
             return -TEDS_BUSY;
         }
     }
@@ -633,12 +582,11 @@ static int self_test(teds_node *node, const teds_command *command, const teds_or
     return 0;
 }
 
-static int power(const teds_node *node, const teds_command *command, uint8_t *out)
+int teds_power_state(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    teds_power now = power_of(node);
-    if (command->length != 0) {
-        return -TEDS_BAD_FORM;
-    }
+    const teds_power now = power_of(node);
+    (void)command;
+    (void)origin;
     out[0] = now.flags;
     out[1] = now.level;
     teds_put16(out + 2, now.voltage);
@@ -647,12 +595,10 @@ static int power(const teds_node *node, const teds_command *command, uint8_t *ou
     return 7;
 }
 
-static int clock_of(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_clock(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    const teds_session *session = &node->sessions[origin->session];
-    if (command->length != 0) {
-        return -TEDS_BAD_FORM;
-    }
+    const teds_session *session = origin->session;
+    (void)command;
     teds_put64(out, origin->arrival->tick);
     teds_put64(out + 16, session->mark);
     teds_put32(out + 24, node->port->step);
@@ -660,32 +606,6 @@ static int clock_of(const teds_node *node, const teds_command *command, const te
     teds_put32(out + 30, session->drive.used && session->drive.seen ? session->drive.last : UINT32_MAX);
     teds_put64(out + 8, teds_now(node));
     return 34;
-}
-
-int teds_operation_run(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
-{
-    /* what is due by now goes first: a lease or dead-man that ran out, samples taken before a Stop */
-    (void)teds_operation_poll(node, teds_now(node));
-    switch (command->command_class) {
-    case TEDS_CLASS_EITHER:
-        return command->function == 1 ? operate(node, command, origin) : idle(node, command, origin);
-    case TEDS_CLASS_OPERATE:
-        return command->function == 1 ? read_data_set(node, command, origin, out)
-                                      : write_data_set(node, command, origin);
-    case TEDS_CLASS_COMMON: return self_test(node, command, origin);
-    default: break;
-    }
-    switch (command->function) {
-    case TEDS_SAMPLE: return sample(node, command, origin, out);
-    case TEDS_SET: return set(node, command, origin);
-    case TEDS_SUBSCRIBE: return teds_subscribe(node, command, origin, out);
-    case TEDS_STOP: return teds_stop(node, command, origin, out);
-    case TEDS_CLOCK: return clock_of(node, command, origin, out);
-    case TEDS_ARM: return teds_arm(node, command, origin);
-    case TEDS_POWER: return power(node, command, out);
-    case TEDS_OPERATION_STATE: return operation(node, command, origin, out);
-    default: return teds_drive(node, command, origin, out);
-    }
 }
 
 #else

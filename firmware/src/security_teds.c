@@ -1,23 +1,20 @@
 /* The Security TEDS (security-teds.md, 1): the initial one, and the canonical form of a signed one. Octets alone. */
 #include "inside.h"
 
-static const uint8_t TEDSID[6] = {3, 4, 0, 128, 1, 1};
-
-uint16_t teds_checksum(uint32_t sum)
+/* Checksum of a TEDS whose `length` octets stand before it. */
+uint16_t teds_checksum(const uint8_t *octets, size_t length)
 {
+    uint32_t sum = 0;
+    for (size_t i = 0; i < length; i++) {
+        sum += octets[i];
+    }
     return (uint16_t)(0xFFFFu - (sum & 0xFFFFu));
 }
 
 bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length)
 {
-    uint32_t sum = 0;
-    if (length < 12 || teds_get32(teds) != length - 4) {
-        return false;
-    }
-    for (size_t i = 0; i < length - 2; i++) {
-        sum += teds[i];
-    }
-    if (teds_get16(teds + length - 2) != teds_checksum(sum) || teds[4] != 3) {
+    if (length < 12 || teds_get32(teds) != length - 4 ||
+        teds_get16(teds + length - 2) != teds_checksum(teds, length - 2) || teds[4] != 3) {
         return false;
     }
     if (teds[5] == 4) {
@@ -28,7 +25,7 @@ bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length)
 
 static const char SIXTY_FOUR[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 
-void teds_base64(const uint8_t *octets, size_t length, uint8_t *out)
+static void base64(const uint8_t *octets, size_t length, uint8_t *out)
 {
     for (size_t at = 0; at < length; at += 3) {
         uint32_t three = (uint32_t)octets[at] << 16;
@@ -43,16 +40,8 @@ void teds_base64(const uint8_t *octets, size_t length, uint8_t *out)
 
 static int six_bits(uint8_t letter)
 {
-    if (letter >= 'A' && letter <= 'Z') {
-        return letter - 'A';
-    }
-    if (letter >= 'a' && letter <= 'z') {
-        return letter - 'a' + 26;
-    }
-    if (letter >= '0' && letter <= '9') {
-        return letter - '0' + 52;
-    }
-    return letter == '+' ? 62 : letter == '/' ? 63 : -1;
+    const char *at = memchr(SIXTY_FOUR, letter, 64);
+    return at != NULL ? (int)(at - SIXTY_FOUR) : -1;
 }
 
 /* 88 letters of canonical base64 to `length` octets, 64 or 65: padded, spare bits zero. `out` has room for 66. */
@@ -77,40 +66,26 @@ static bool from_base64(const uint8_t *text, size_t length, uint8_t *out)
     return out[65] == 0 && (length == 65 || out[64] == 0);
 }
 
-static uint8_t *tuple(uint8_t *at, uint8_t type, const uint8_t *octets, uint8_t length)
-{
-    at[0] = type;
-    at[1] = length;
-    memcpy(at + 2, octets, length);
-    return at + 2 + length;
-}
+/* The initial one is a head, fields 101 and 102 in base64 with a head of two octets each, and a tail. */
+#define TEXT_OCTETS 88u
+#define TAIL_AT (TEDS_INITIAL_OCTETS - 2 - sizeof TAIL)
+static const uint8_t HEAD[] = {0, 0, 0, TEDS_INITIAL_OCTETS - 4, 3, 4, 0, 128, 1, 1, 1, 1, 4, 2, 1, 2, 3, 1, 0,
+                               4, 1, 1, 5, 0, 6, 8, 0, 0, 0, 0, 0, 0, 0, 0, 101, TEXT_OCTETS};
+static const uint8_t TAIL[] = {105, 1, 1, 106, 4, 0, 0, 0, 0, 107, 4, 0, 0, 0, 0, 109, 1, 2, 110, 1, 2};
 
 void teds_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS])
 {
-    static const uint8_t values[] = {1, 1, 4, 2, 1, 2, 3, 1, 0, 4, 1, 1, 5, 0, 6, 8, 0, 0, 0, 0, 0, 0, 0, 0};
-    static const uint8_t version = 1, suite = 2, agreement = 2;
-    uint8_t number[4], text[88];
-    uint8_t *at = out + 4;
-    uint32_t sum = 0;
-    memcpy(at, TEDSID, 6);
-    memcpy(at + 6, values, sizeof values);
-    at += 6 + sizeof values;
-    teds_base64(node->point, 65, text);
-    at = tuple(at, 101, text, 88);
-    teds_base64(node->signature, 64, text);
-    at = tuple(at, 102, text, 88);
-    at = tuple(at, 105, &version, 1);
-    teds_put32(number, node->state.sequence);
-    at = tuple(at, 106, number, 4);
-    teds_put32(number, node->state.epoch);
-    at = tuple(at, 107, number, 4);
-    at = tuple(at, 109, &suite, 1);
-    at = tuple(at, 110, &agreement, 1);
-    teds_put32(out, (uint32_t)(at - out) - 4 + 2);
-    for (const uint8_t *each = out; each < at; each++) {
-        sum += *each;
-    }
-    teds_put16(at, teds_checksum(sum));
+    uint8_t *at = out + sizeof HEAD;
+    memcpy(out, HEAD, sizeof HEAD);
+    base64(node->identity.point, 65, at);
+    at[TEXT_OCTETS] = 102;
+    at[TEXT_OCTETS + 1] = TEXT_OCTETS;
+    base64(node->identity.signature, 64, at + TEXT_OCTETS + 2);
+    at = out + TAIL_AT;
+    memcpy(at, TAIL, sizeof TAIL);
+    teds_put32(at + 5, node->state.sequence);
+    teds_put32(at + 11, node->state.epoch);
+    teds_put16(at + sizeof TAIL, teds_checksum(out, TEDS_INITIAL_OCTETS - 2));
 }
 
 /* RFC 3629: no overlong forms, no surrogates, nothing above U+10FFFF. */
@@ -141,65 +116,46 @@ static bool is_utf8(const uint8_t *text, size_t length)
     return true;
 }
 
-/* The value that the profile wants in a field of one octet; -1 for another field. */
-static int own_value(uint8_t type)
+/* Fields that a signed one holds, each once and ascending: type, length, the value of one octet that the profile wants.
+ * 108 stands between 107 and 109, as often as there are blocks. */
+static const uint8_t FIELDS[][3] = {
+    {1, 1, 4},          {2, 1, 2},          {3, 1, 0},          {4, 1, 1},          {5, 64, 0},         {6, 8, 0},
+    {100, TEXT_OCTETS}, {101, TEXT_OCTETS}, {102, TEXT_OCTETS}, {103, TEXT_OCTETS}, {104, TEXT_OCTETS}, {105, 1, 1},
+    {106, 4, 0},        {107, 4, 0},        {109, 1, 2},        {110, 1, 2},
+};
+#define FIELD_COUNT (sizeof FIELDS / sizeof FIELDS[0])
+
+/* 88 letters: a signature (100, 102, 104) or a point (101, 103). What is only compared stands where 103 comes afterwards,
+ * so that no more of them lie on the stack than are needed. */
+static bool take_text(const teds_node *node, teds_signed *out, uint8_t type, const uint8_t *text)
 {
-    switch (type) {
-    case 1: return 4;
-    case 2: return 2;
-    case 3: return 0;
-    case 4: return 1;
-    case 105: return 1;
-    case 109: return 2;
-    case 110: return 2;
-    default: return -1;
+    const uint8_t *own = type == 101 ? node->identity.point : node->identity.signature;
+    const size_t length = 64u + (type & 1u);
+    uint8_t *octets = out->decoded[type == 100 ? TEDS_SIGNATURE : type == 104 ? TEDS_STATION_SIGNATURE : TEDS_STATION];
+    if (!from_base64(text, length, octets)) {
+        return false;
     }
+    if ((type == 101 || type == 102) && memcmp(octets, own, length) != 0) {
+        out->others = true;
+    }
+    return true;
 }
 
-/* Fields that a signed one must hold, as bits: 1 to 6, and 100 to 110 without 108 from bit 8 on. */
-#define MUST_HOLD (0x7Eu | ((0x7FFu << 8) & ~(1u << 16)))
-
-static bool take_field(teds_signed *out, uint8_t type, const uint8_t *value, size_t length, size_t at)
+static bool take_field(const teds_node *node, teds_signed *out, const uint8_t wanted[3], const uint8_t *value,
+                       size_t length)
 {
-    uint8_t scratch[66];
-    if (own_value(type) >= 0) {
-        return length == 1 && value[0] == own_value(type);
+    const uint8_t type = wanted[0];
+    if (type == 5) {
+        return length <= wanted[1] && is_utf8(value, length);
     }
-    switch (type) {
-    case 5: return length <= 64 && is_utf8(value, length);
-    case 6: return length == 8;
-    case 100:
-        out->signature_at = at;
-        if (length != 88 || !from_base64(value, 64, scratch)) {
-            return false;
-        }
-        memcpy(out->signature, scratch, 64);
-        return true;
-    case 101:
-        out->node_key = value;
-        return length == 88 && from_base64(value, 65, scratch);
-    case 102:
-        out->node_signature = value;
-        return length == 88 && from_base64(value, 64, scratch);
-    case 103:
-        if (length != 88 || !from_base64(value, 65, scratch)) {
-            return false;
-        }
-        memcpy(out->station, scratch, 65);
-        return true;
-    case 104:
-        if (length != 88 || !from_base64(value, 64, scratch)) {
-            return false;
-        }
-        memcpy(out->station_signature, scratch, 64);
-        return true;
-    case 106:
-        out->sequence = length == 4 ? teds_get32(value) : 0;
-        return length == 4;
-    case 107:
-        out->epoch = length == 4 ? teds_get32(value) : 0;
-        return length == 4;
-    default: return type > 110; /* 111 to 255 are skipped */
+    if (length != wanted[1]) {
+        return false;
+    }
+    switch (length) {
+    case 1: return value[0] == wanted[2];
+    case 4: out->numbers[type - 106] = teds_get32(value); return true;
+    case TEXT_OCTETS: return take_text(node, out, type, value);
+    default: return true;
     }
 }
 
@@ -219,33 +175,34 @@ static bool take_block(teds_signed *out, const uint8_t *tuple_at, size_t length)
     return true;
 }
 
-bool teds_security_parse(const uint8_t *block, size_t length, teds_signed *out)
+bool teds_security_parse(const teds_node *node, const uint8_t *block, size_t length, teds_signed *out)
 {
-    uint32_t there = 0;
+    size_t at = 6, next = 0;
     uint8_t last = 0;
-    size_t at = 6;
     memset(out, 0, sizeof *out);
-    if (length < 6 || memcmp(block, TEDSID, 6) != 0) {
+    if (length < 6 || memcmp(block, HEAD + 4, 6) != 0) {
         return false;
     }
     while (at < length) {
         uint8_t type = block[at];
         size_t octets = at + 1 < length ? block[at + 1] : 256;
-        if (at + 2 + octets > length) {
+        if (at + 2 + octets > length || type < last || (type == last && type != 108)) {
             return false;
         }
         if (type == 108) {
-            if (last > 108 || !take_block(out, block + at, octets)) {
+            if (!take_block(out, block + at, octets)) {
                 return false;
             }
-        } else {
-            if (type <= last || !take_field(out, type, block + at + 2, octets, at)) {
+        } else if (type <= 110) { /* 111 to 255 are skipped */
+            if (next == FIELD_COUNT || type != FIELDS[next][0] ||
+                !take_field(node, out, FIELDS[next], block + at + 2, octets)) {
                 return false;
             }
-            there |= type <= 6 ? 1u << type : type <= 110 ? 1u << (type - 92) : 0;
+            out->signature_at = type == 100 ? at : out->signature_at;
+            next++;
         }
         last = type;
         at += 2 + octets;
     }
-    return (there & MUST_HOLD) == MUST_HOLD;
+    return next == FIELD_COUNT;
 }

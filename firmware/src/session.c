@@ -4,18 +4,17 @@
 
 #define HALF_OPEN_NS (60u * TEDS_SECOND)
 #define IDLE_NS (600u * TEDS_SECOND)
-#define OPEN_OCTETS 89u
 #define LABEL(text) {(const uint8_t *)(text), sizeof(text)}
 #define MAC_LABEL(text) {(const uint8_t *)(text), sizeof(text) - 1u}
 
-int8_t teds_session_on(const teds_node *node, teds_link link)
+teds_session *teds_session_on(teds_node *node, teds_link link)
 {
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (node->sessions[i].used && node->sessions[i].link == link) {
-            return i;
+    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        if (each->used && each->link == link) {
+            return each;
         }
     }
-    return -1;
+    return NULL;
 }
 
 static teds_half_open *half_open_on(teds_node *node, teds_link link)
@@ -28,75 +27,82 @@ static teds_half_open *half_open_on(teds_node *node, teds_link link)
     return NULL;
 }
 
-bool teds_any_on(const teds_node *node, teds_link link)
+bool teds_any_on(teds_node *node, teds_link link)
 {
-    if (teds_session_on(node, link) >= 0) {
-        return true;
-    }
-    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (node->half_open[i].used && node->half_open[i].link == link) {
-            return true;
-        }
-    }
-    return false;
+    return teds_session_on(node, link) != NULL || half_open_on(node, link) != NULL;
 }
 
-void teds_session_end(teds_node *node, int8_t session)
+void teds_session_end(teds_node *node, teds_session *session)
 {
-    teds_session *own;
-    if (session < 0 || !node->sessions[session].used) {
+    if (session == NULL || !session->used) {
         return;
     }
-    own = &node->sessions[session];
 #if TEDS_OPERATION
-    teds_operation_session_ended(node, session);
+    teds_claims_end(node, session, UINT32_MAX, false);
 #endif
-    if (own->staged) {
+    if (node->staging_of == session) {
         teds_staging_drop(node);
     }
     if (node->pending.used && node->pending.session == session) {
         teds_pending_forget(node);
     }
-    teds_wipe(own, sizeof *own);
+    teds_wipe(session, sizeof *session);
+}
+
+void teds_link_forget(teds_node *node, teds_link link)
+{
+    teds_half_open *half = half_open_on(node, link);
+    teds_session_end(node, teds_session_on(node, link));
+    if (half != NULL) {
+        teds_wipe(half, sizeof *half);
+    }
+    for (teds_stored_reply *each = node->replies; each < node->replies + TEDS_REPLIES; each++) {
+        if (each->link == link) {
+            each->used = false;
+        }
+    }
+    if (node->pending.link == link) {
+        teds_pending_forget(node);
+    }
 }
 
 void teds_end_everything(teds_node *node)
 {
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        teds_session_end(node, i);
+    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        teds_session_end(node, each);
     }
     teds_wipe(node->half_open, sizeof node->half_open);
     teds_pending_forget(node);
 }
 
-void teds_sessions_expire(teds_node *node, uint64_t now)
+/* Whether that time has come; if not, something is due then. */
+static bool is_over(uint64_t at, uint64_t now, uint64_t *due)
 {
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (node->sessions[i].used && now >= node->sessions[i].good_at + IDLE_NS) {
+    if (now >= at) {
+        return true;
+    }
+    teds_sooner(due, at);
+    return false;
+}
+
+uint64_t teds_sessions_poll(teds_node *node, uint64_t now)
+{
+    uint64_t due = TEDS_NEVER;
+    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
+        teds_session *session = &node->sessions[i];
+        teds_half_open *half = &node->half_open[i];
+        if (session->used && is_over(session->good_at + IDLE_NS, now, &due)) {
 #if TEDS_OPERATION
             (void)teds_operation_poll(node, now); /* a dead-man that stopped an actuator before is told, this end is not */
 #endif
-            teds_session_end(node, i);
+            teds_session_end(node, session);
         }
-        if (node->half_open[i].used && now >= node->half_open[i].at + HALF_OPEN_NS) {
-            teds_wipe(&node->half_open[i], sizeof node->half_open[i]);
+        if (half->used && is_over(half->until, now, &due)) {
+            teds_wipe(half, sizeof *half);
         }
     }
-    if (node->pending.used && now >= node->pending.at + HALF_OPEN_NS) {
+    if (node->pending.used && is_over(node->pending.until, now, &due)) {
         teds_pending_forget(node);
-    }
-}
-
-uint64_t teds_sessions_due(const teds_node *node)
-{
-    uint64_t due = node->pending.used ? node->pending.at + HALF_OPEN_NS : TEDS_NEVER;
-    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (node->sessions[i].used && node->sessions[i].good_at + IDLE_NS < due) {
-            due = node->sessions[i].good_at + IDLE_NS;
-        }
-        if (node->half_open[i].used && node->half_open[i].at + HALF_OPEN_NS < due) {
-            due = node->half_open[i].at + HALF_OPEN_NS;
-        }
     }
     return due;
 }
@@ -104,41 +110,37 @@ uint64_t teds_sessions_due(const teds_node *node)
 static void keep_half_open(teds_node *node, teds_link link, const teds_keys *keys)
 {
     teds_half_open *place = half_open_on(node, link);
-    for (size_t i = 0; place == NULL && i < TEDS_SESSIONS; i++) {
-        if (!node->half_open[i].used) {
-            place = &node->half_open[i];
-        }
-    }
-    if (place == NULL) { /* beyond its room the oldest goes */
+    if (place == NULL) { /* a free one, whose time is 0; beyond its room the oldest goes */
         place = &node->half_open[0];
         for (size_t i = 1; i < TEDS_SESSIONS; i++) {
-            if (node->half_open[i].at < place->at) {
+            if (node->half_open[i].until < place->until) {
                 place = &node->half_open[i];
             }
         }
     }
     place->used = true;
     place->link = link;
-    place->at = teds_now(node);
+    place->until = teds_now(node) + HALF_OPEN_NS;
     place->keys = *keys;
 }
 
 /* Keys of the session and the node's tag, from Es, the node's one-time key and K. */
-static int derive(const teds_node *node, const uint8_t es[65], const teds_one_time *own, const uint8_t key_id[8],
-                  teds_keys *keys, uint8_t tag[16])
+static int derive(const teds_node *node, const uint8_t es[65], const uint8_t key_id[8], teds_keys *keys,
+                  uint8_t tag[16])
 {
     const teds_port *port = node->port;
-    const teds_part info[] = {LABEL("TEDS1 session"), {node->uuid, 10}, {es, 65}, {own->point, 65}};
+    const teds_one_time *own = &node->one_time;
+    uint8_t z[32], okm[96];
+    const teds_part parts[] = {
+        {z, 32}, LABEL("TEDS1 session"), {node->identity.uuid, 10}, {es, 65}, {own->point, 65}};
     const teds_part tagged[] = {MAC_LABEL("node open"), {key_id, 8}, {es, 65}, {own->point, 65}};
-    uint8_t z[32], okm[96], mac[32];
-    int failed = port->p256_ecdh(port->user, &own->key, es, z) != 0 ||
-                 teds_hkdf(node, node->state.key, 16, z, 32, info, 4, okm, 96) != 0 ||
-                 port->hmac(port->user, okm + 32, 32, tagged, 4, mac) != 0;
+    const int failed = port->p256_ecdh(port->user, &own->key, es, z) != 0 ||
+                       teds_hkdf(node, node->state.agreed.key, parts, 5, okm, 96) != 0 ||
+                       teds_mac(node, okm + 32, 32, tagged, 4, tag) != 0;
     if (!failed) {
         memcpy(keys->to_node, okm, 16);
         memcpy(keys->to_station, okm + 16, 16);
         memcpy(keys->messages, okm + 64, 32);
-        memcpy(tag, mac, 16);
     }
     teds_wipe(z, sizeof z);
     teds_wipe(okm, sizeof okm);
@@ -146,76 +148,75 @@ static int derive(const teds_node *node, const uint8_t es[65], const teds_one_ti
 }
 
 /* keyId and mac before the point: a stranger costs no point arithmetic, and each Open is good once. */
-static int check_open(teds_node *node, const uint8_t *payload, uint8_t key_id[8])
+static int check_open(teds_node *node, const uint8_t *payload)
 {
     const uint8_t *es = payload + 8;
-    uint8_t counter[8], mac[32];
-    const teds_part parts[] = {MAC_LABEL("station open"), {node->uuid, 10}, {counter, 8}, {es, 65}};
-    teds_key_id(node, node->state.key, key_id);
+    uint8_t counter[8], key_id[32], mac[16];
+    const teds_part named[] = {LABEL("TEDS1 key id"), {node->state.agreed.key, 16}};
+    const teds_part parts[] = {MAC_LABEL("station open"), {node->identity.uuid, 10}, {counter, 8}, {es, 65}};
+    teds_sha256_parts(node, named, 2, key_id); /* its first 8 octets */
     if (!teds_equal(payload, key_id, 8)) {
         return -TEDS_UNKNOWN_KEY;
     }
     teds_put64(counter, node->opens);
-    if (node->port->hmac(node->port->user, node->state.key, 16, parts, 4, mac) != 0) {
+    if (teds_mac(node, node->state.agreed.key, 16, parts, 4, mac) != 0) {
         return -TEDS_FAILURE;
     }
     if (!teds_equal(payload + 73, mac, 16)) {
         return -TEDS_BAD_TAG;
     }
     node->opens++;
-    return teds_point_good(node, es) && memcmp(es, node->state.station, 65) != 0 ? 0 : -TEDS_BAD_POINT;
+    return teds_point_good(node, es) && memcmp(es, node->state.agreed.station, 65) != 0 ? 0 : -TEDS_BAD_POINT;
 }
 
-int teds_open(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_open(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     const uint8_t *payload = command->payload;
-    uint8_t key_id[8];
-    teds_one_time own = {0};
     teds_keys keys;
     int failed;
     if (command->length == 0) {
         teds_put64(out, node->opens);
         return 8;
     }
-    if (command->length != OPEN_OCTETS) {
+    if (command->length != TEDS_OPEN_OCTETS) {
         return -TEDS_BAD_FORM;
     }
-    failed = check_open(node, payload, key_id);
+    failed = check_open(node, payload);
     if (failed) {
         return failed;
     }
-    failed = teds_one_time_take(node, &own) != 0;
+    failed = teds_one_time_make(node) != 0;
     if (!failed) {
-        memcpy(out, own.point, 65);
-        failed = derive(node, payload + 8, &own, key_id, &keys, out + 65);
+        memcpy(out, node->one_time.point, 65);
+        failed = derive(node, payload + 8, payload, &keys, out + 65);
     }
     if (!failed) {
         keep_half_open(node, origin->link, &keys);
     }
     teds_wipe(&keys, sizeof keys);
-    teds_one_time_wipe(node, &own);
+    teds_one_time_drop(node);
     return failed ? -TEDS_FAILURE : 81;
 }
 
 /* A place for the session that a half-open Open becomes: its link's own, a free one, that of the session without a
- * claim which was silent longest; -1 where all have claims. */
-static int8_t make_room(teds_node *node, teds_link link)
+ * claim which was silent longest; NULL where all have claims. */
+static teds_session *make_room(teds_node *node, teds_link link)
 {
-    int8_t place = teds_session_on(node, link);
-    if (place >= 0) {
+    teds_session *place = teds_session_on(node, link);
+    if (place != NULL) {
         return place;
     }
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (!node->sessions[i].used) {
-            return i;
+    for (teds_session *each = node->sessions; each < node->sessions + TEDS_SESSIONS; each++) {
+        if (!each->used) {
+            return each;
         }
 #if TEDS_OPERATION
-        if (teds_claims_of(node, i) != 0) {
+        if (each->claims != 0) {
             continue;
         }
 #endif
-        if (place < 0 || node->sessions[i].good_at < node->sessions[place].good_at) {
-            place = i;
+        if (place == NULL || each->good_at < place->good_at) {
+            place = each;
         }
     }
     return place;
@@ -245,7 +246,7 @@ static int unseal(const teds_node *node, const teds_keys *keys, const uint8_t *p
 int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *payload,
                      size_t length, uint8_t *plain, teds_taken *taken)
 {
-    int8_t session = teds_session_on(node, link);
+    teds_session *session = teds_session_on(node, link);
     teds_half_open *half = half_open_on(node, link);
     const teds_keys *keys = NULL;
     uint32_t last = 0;
@@ -253,9 +254,9 @@ int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arriva
     if (length < 36) {
         return -TEDS_BAD_FORM;
     }
-    if (session >= 0) {
-        keys = &node->sessions[session].keys;
-        last = node->sessions[session].counter;
+    if (session != NULL) {
+        keys = &session->keys;
+        last = session->counter;
         inner = unseal(node, keys, payload, length, plain);
     }
     if (inner >= 0) {
@@ -276,20 +277,19 @@ int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arriva
     memcpy(taken->to_station, keys->to_station, 16);
     if (half != NULL) {
         session = make_room(node, link);
-        if (session >= 0) {
-            teds_session *own = &node->sessions[session];
+        if (session != NULL) {
             teds_session_end(node, session);
-            own->used = true;
-            own->link = link;
-            own->kind = arrival->kind;
-            own->keys = half->keys;
+            session->used = true;
+            session->link = link;
+            session->kind = arrival->kind;
+            session->keys = half->keys;
         }
         teds_wipe(half, sizeof *half);
     }
     taken->session = session;
-    if (session >= 0) {
-        node->sessions[session].counter = taken->counter;
-        node->sessions[session].good_at = teds_now(node);
+    if (session != NULL) {
+        session->counter = taken->counter;
+        session->good_at = teds_now(node);
     }
     return 0;
 }

@@ -41,10 +41,9 @@ static uint64_t share(uint64_t count, uint64_t gap, uint64_t instants)
     return (count * gap * TEDS_SECOND + instants - 1) / instants;
 }
 
-static teds_stream *find(teds_node *node, int8_t session, uint8_t number)
+static teds_stream *find(teds_node *node, const teds_session *session, uint8_t number)
 {
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        teds_stream *each = &node->streams[i];
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
         if (each->used && each->session == session && each->number == number) {
             return each;
         }
@@ -55,26 +54,25 @@ static teds_stream *find(teds_node *node, int8_t session, uint8_t number)
 static void end(teds_node *node, teds_stream *stream)
 {
     node->missed += stream->missed;
-    if (node->can.data_stream == (int8_t)(stream - node->streams)) {
-        node->can.data_stream = -1; /* what was not sent yet is taken back */
+    if (node->can.data_stream == stream) {
+        node->can.data_stream = NULL; /* what was not sent yet is taken back */
     }
     teds_wipe(stream, sizeof *stream);
 }
 
 bool teds_streams_running(const teds_node *node)
 {
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        if (node->streams[i].used) {
+    for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        if (each->used) {
             return true;
         }
     }
     return false;
 }
 
-void teds_streams_end(teds_node *node, int8_t session, uint32_t places)
+void teds_streams_end(teds_node *node, teds_session *session, uint32_t places)
 {
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        teds_stream *each = &node->streams[i];
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
         bool touched = false;
         for (size_t c = 0; each->used && c < each->count; c++) {
             touched = touched || (places >> each->channels[c] & 1) != 0;
@@ -85,11 +83,11 @@ void teds_streams_end(teds_node *node, int8_t session, uint32_t places)
     }
 }
 
-void teds_streams_ready(teds_node *node, int8_t session)
+void teds_streams_ready(teds_node *node, teds_session *session)
 {
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        if (node->streams[i].used && node->streams[i].session == session) {
-            node->streams[i].ready = true;
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        if (each->used && each->session == session) {
+            each->ready = true;
         }
     }
 }
@@ -125,7 +123,7 @@ static int check_channels(const teds_node *node, const teds_command *command, co
     bool acts = false, events = false, others = false;
     for (size_t i = 0; i < in->count; i++) {
         int place = teds_place_of(node, command->payload[21 + i]);
-        if (place < 0 || (teds_claims_of(node, origin->session) >> place & 1) == 0) {
+        if (place < 0 || (origin->session->claims >> place & 1) == 0) {
             return -TEDS_WRONG_STATE;
         }
         in->places[i] = (uint8_t)place;
@@ -162,14 +160,12 @@ static bool on_bus(const teds_stream *stream, bool ble)
 static int check_budget(const teds_node *node, const asked *in, uint64_t count, bool ble, const teds_stream *old)
 {
     uint64_t gap = in->gap > 0 ? in->gap : 1, sum = 0;
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        const teds_stream *each = &node->streams[i];
+    for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
         if (on_bus(each, ble) && each != old && each->gap > gap) {
             gap = each->gap;
         }
     }
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        const teds_stream *each = &node->streams[i];
+    for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
         if (on_bus(each, ble) && each != old) {
             sum += share(frames(each->length, each->fd, ble), gap, span(each));
         }
@@ -194,9 +190,9 @@ static teds_stream *room_for(teds_node *node, teds_stream *old)
     if (old != NULL) {
         return old;
     }
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        if (!node->streams[i].used) {
-            return &node->streams[i];
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        if (!each->used) {
+            return each;
         }
     }
     return NULL;
@@ -226,9 +222,9 @@ static uint32_t longest(const teds_node *node, const teds_origin *origin)
     return TEDS_MESSAGE;
 }
 
-int teds_subscribe(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_subscribe(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    teds_session *session = &node->sessions[origin->session];
+    teds_session *session = origin->session;
     const bool fd = origin->arrival->fd && TEDS_CAN_FD, ble = origin->arrival->kind == TEDS_AT_BLE;
     uint64_t now = teds_now(node);
     teds_stream *old, *stream;
@@ -302,13 +298,9 @@ int teds_subscribe(teds_node *node, const teds_command *command, const teds_orig
     return 12;
 }
 
-int teds_stop(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+int teds_stop(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    teds_stream *stream;
-    if (command->length != 1) {
-        return -TEDS_BAD_FORM;
-    }
-    stream = find(node, origin->session, command->payload[0]);
+    teds_stream *stream = find(node, origin->session, command->payload[0]);
     if (stream == NULL) {
         return -TEDS_WRONG_STATE;
     }
@@ -388,7 +380,7 @@ static bool is_free(const teds_node *node, bool ble, uint64_t now)
 #else
     (void)ble;
 #endif
-    return node->can.data_stream < 0 && now >= node->can.data_free_at;
+    return node->can.data_stream == NULL && now >= node->can.data_free_at;
 }
 
 static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
@@ -495,8 +487,7 @@ static void take_all_events(teds_node *node, uint64_t now)
         }
         in = events->in;
         lost = events->lost;
-        for (size_t i = 0; i < TEDS_STREAMS; i++) {
-            teds_stream *each = &node->streams[i];
+        for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
             if (each->used && each->kind == EVENT && each->pattern == 0 && !each->waits && each->channels[0] == place) {
                 take_events(events, each, in, (uint16_t)(lost - events->told), now);
             }
@@ -510,23 +501,22 @@ static void take_all_events(teds_node *node, uint64_t now)
 void teds_streams_sample(teds_node *node, uint64_t now)
 {
     take_all_events(node, now);
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        teds_stream *each = &node->streams[i];
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
         if (each->used) {
             sample_stream(node, each, now);
-            if (each->ended && !each->full && node->can.data_stream != (int8_t)i) {
+            if (each->ended && !each->full && node->can.data_stream != each) {
                 end(node, each); /* the last counter was sent */
             }
         }
     }
 }
 
-uint64_t teds_streams_due(const teds_node *node)
+uint64_t teds_streams_due(teds_node *node)
 {
     uint64_t due = teds_data_due(node);
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        if (node->streams[i].used) {
-            uint64_t at = next_instant(&node->streams[i]);
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        if (each->used) {
+            uint64_t at = next_instant(each);
             due = at < due ? at : due;
         }
     }
@@ -535,24 +525,23 @@ uint64_t teds_streams_due(const teds_node *node)
 
 /* -- data messages ------------------------------------------------------------------------------------------------------------ */
 
-/* Of messages that wait, the one of the smaller n * period goes next; -1: none. */
-static int8_t choice(const teds_node *node, bool ble)
+/* Of messages that wait, the one of the smaller n * period goes next; NULL: none. */
+static teds_stream *choice(teds_node *node, bool ble)
 {
-    int8_t chosen = -1;
-    for (int8_t i = 0; i < TEDS_STREAMS; i++) {
-        const teds_stream *each = &node->streams[i];
-        if (on_bus(each, ble) && each->ready && each->full && (chosen < 0 || span(each) < span(&node->streams[chosen]))) {
-            chosen = i;
+    teds_stream *chosen = NULL;
+    for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        if (on_bus(each, ble) && each->ready && each->full && (chosen == NULL || span(each) < span(chosen))) {
+            chosen = each;
         }
     }
     return chosen;
 }
 
-uint64_t teds_data_due(const teds_node *node)
+uint64_t teds_data_due(teds_node *node)
 {
-    uint64_t due = node->can.data_stream >= 0 || choice(node, false) >= 0 ? node->can.data_free_at : TEDS_NEVER;
+    uint64_t due = node->can.data_stream != NULL || choice(node, false) != NULL ? node->can.data_free_at : TEDS_NEVER;
 #if TEDS_BLE
-    if (choice(node, true) >= 0 && node->ble.data_free_at < due) {
+    if (choice(node, true) != NULL && node->ble.data_free_at < due) {
         due = node->ble.data_free_at;
     }
 #endif
@@ -578,13 +567,13 @@ static bool seal(const teds_node *node, teds_stream *stream, uint8_t *out)
 static bool begin(teds_node *node)
 {
     teds_can *can = &node->can;
-    int8_t chosen = choice(node, false);
-    if (chosen < 0 || !seal(node, &node->streams[chosen], can->data)) {
+    teds_stream *chosen = choice(node, false);
+    if (chosen == NULL || !seal(node, chosen, can->data)) {
         return false;
     }
     can->data_stream = chosen;
     can->data_at = 0;
-    can->data_length = node->streams[chosen].length;
+    can->data_length = chosen->length;
     can->data_segment = 0;
     return true;
 }
@@ -592,8 +581,8 @@ static bool begin(teds_node *node)
 static uint64_t gap_of_bus(const teds_node *node, bool ble)
 {
     uint64_t gap = 1;
-    for (size_t i = 0; i < TEDS_STREAMS; i++) {
-        gap = on_bus(&node->streams[i], ble) && node->streams[i].gap > gap ? node->streams[i].gap : gap;
+    for (const teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
+        gap = on_bus(each, ble) && each->gap > gap ? each->gap : gap;
     }
     return gap * MICRO;
 }
@@ -601,17 +590,15 @@ static uint64_t gap_of_bus(const teds_node *node, bool ble)
 #if TEDS_BLE
 size_t teds_data_notify(teds_node *node, teds_link *link, uint8_t *out, uint64_t now)
 {
-    const int8_t chosen = choice(node, true);
-    teds_stream *stream;
-    if (chosen < 0 || !is_free(node, true, now)) {
+    teds_stream *stream = choice(node, true);
+    if (stream == NULL || !is_free(node, true, now)) {
         return 0;
     }
-    stream = &node->streams[chosen];
     if (!seal(node, stream, out + 1)) {
         return 0;
     }
     out[0] = stream->number;
-    *link = node->sessions[stream->session].link;
+    *link = stream->session->link;
     node->ble.data_free_at = now + gap_of_bus(node, true);
     return 1u + stream->length;
 }
@@ -623,13 +610,13 @@ bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now)
     const teds_stream *stream;
     size_t octets, room;
     uint32_t s;
-    if (now < can->data_free_at || (can->data_stream < 0 && !begin(node))) {
+    if (now < can->data_free_at || (can->data_stream == NULL && !begin(node))) {
         return false;
     }
-    stream = &node->streams[can->data_stream];
+    stream = can->data_stream;
     room = stream->fd ? 64 : 8;
     octets = (size_t)(can->data_length - can->data_at) < room ? (size_t)(can->data_length - can->data_at) : room;
-    s = (node->sessions[stream->session].link & 7u) << 5 | (uint32_t)stream->number << 3 | can->data_segment;
+    s = (stream->session->link & 7u) << 5 | (uint32_t)stream->number << 3 | can->data_segment;
     frame->identifier = DATA | s << 8 | can->address;
     frame->fd = stream->fd;
     memcpy(frame->data, can->data + can->data_at, octets);
@@ -641,20 +628,18 @@ bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now)
     can->data_at = (uint16_t)(can->data_at + octets);
     can->data_segment = (uint8_t)(can->data_segment % 7 + 1);
     if (can->data_at == can->data_length) {
-        can->data_stream = -1;
+        can->data_stream = NULL;
     }
     return true;
 }
 
 /* -- trigger ------------------------------------------------------------------------------------------------------------------- */
 
-int teds_arm(teds_node *node, const teds_command *command, const teds_origin *origin)
+int teds_arm(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
     const uint8_t *payload = command->payload;
-    teds_session *session = &node->sessions[origin->session];
-    if (command->length != 18) {
-        return -TEDS_BAD_FORM;
-    }
+    teds_session *session = origin->session;
+    (void)out;
     if (payload[16] > 60 || payload[17] > 2) {
         return -TEDS_OUT_OF_RANGE;
     }
@@ -667,13 +652,12 @@ int teds_arm(teds_node *node, const teds_command *command, const teds_origin *or
     return 0;
 }
 
-static void act(teds_node *node, int8_t session, size_t action, uint64_t tick)
+static void act(teds_node *node, teds_session *session, size_t action, uint64_t tick)
 {
     uint32_t acting = 0;
-    node->sessions[session].mark = tick;
+    session->mark = tick;
     if (action == 1) {
-        for (size_t i = 0; i < TEDS_STREAMS; i++) {
-            teds_stream *each = &node->streams[i];
+        for (teds_stream *each = node->streams; each < node->streams + TEDS_STREAMS; each++) {
             if (each->used && each->session == session && each->waits) {
                 each->waits = false;
                 each->start = tick + AFTER_MARK_NS;
@@ -690,20 +674,20 @@ static void act(teds_node *node, int8_t session, size_t action, uint64_t tick)
 void teds_trigger(teds_node *node, teds_link link, const uint8_t *token, uint64_t tick)
 {
     const teds_part parts[] = {{(const uint8_t *)"TEDS1 trigger", 14}, {token, 8}};
-    int8_t session = teds_session_on(node, link);
+    teds_session *session = teds_session_on(node, link);
     uint64_t now = teds_now(node);
     uint8_t seen[32];
-    if (session < 0) {
+    if (session == NULL) {
         return;
     }
     teds_sha256_parts(node, parts, 2, seen);
     for (size_t i = 0; i < 3; i++) {
-        if (node->sessions[session].arms[i].armed && now >= node->sessions[session].arms[i].until) {
-            node->sessions[session].arms[i].armed = false;
+        if (session->arms[i].armed && now >= session->arms[i].until) {
+            session->arms[i].armed = false;
         }
-        if (node->sessions[session].arms[i].armed &&
-            teds_equal(seen, node->sessions[session].arms[i].commitment, 16)) {
-            node->sessions[session].arms[i].armed = false;
+        if (session->arms[i].armed &&
+            teds_equal(seen, session->arms[i].commitment, 16)) {
+            session->arms[i].armed = false;
             act(node, session, i, tick);
         }
     }

@@ -12,10 +12,12 @@
 /* head of a slot: magic 4, version 1, flags 1, address 1, 0, counter 4, octets of all but the CRC 4, octets of records 4,
  * epoch 4, sequence 4, key 16, station 65, CA 65, zeros; then records: id 2, 0 0, length 4, TEDS; CRC-32 ends the slot */
 #define HEAD_OCTETS 192u
+#define NUMBERS_OCTETS 28u /* of the head, up to the key */
 #define RECORD_OCTETS 8u
 #define UNIT_MOST 32u
+#define PIECE 64u
 #define STAGED_NS (60u * TEDS_SECOND)
-static const uint8_t IDENTITY_MAGIC[5] = {'T', 'I', 'D', 'N', 1};
+static const uint8_t IDENTITY_MAGIC[8] = {'T', 'I', 'D', 'N', 1, 0, 0, 0};
 static const uint8_t SLOT_MAGIC[5] = {'T', 'S', 'L', 'T', 1};
 
 /* -- writing one area, unit by unit --------------------------------------------------------------------------------- */
@@ -27,8 +29,9 @@ typedef struct writing {
     uint8_t fill, buffer[UNIT_MOST];
 } writing;
 
-static void put(writing *into, const uint8_t *octets, size_t length)
+static void put(writing *into, const void *data, size_t length)
 {
+    const uint8_t *octets = data;
     into->crc = teds_crc32(into->crc, octets, length);
     for (size_t i = 0; i < length && !into->failed; i++) {
         into->buffer[into->fill++] = octets[i];
@@ -60,19 +63,26 @@ static int close_area(writing *into, uint32_t total)
 
 static uint32_t whole_units(const teds_port *port, uint32_t octets)
 {
-    return (octets + port->unit - 1) / port->unit * port->unit;
+    return (octets + port->unit - 1) & ~(uint32_t)(port->unit - 1); /* a power of two */
 }
 
-/* Whether an area is blank; the rest of a torn slot may lie anywhere in it. */
-static int is_blank(const teds_port *port, int area, uint32_t octets, bool *blank)
+static int read_area(const teds_port *port, int area, uint32_t at, void *out, size_t length)
 {
-    uint8_t piece[64];
+    return port->read(port->user, area, at, out, length);
+}
+
+/* Whether an area is blank; the rest of a torn slot may lie anywhere in it. CRC-32 of its first `octets` on the way. */
+static int look_over(const teds_port *port, int area, uint32_t octets, bool *blank, uint32_t *crc)
+{
+    uint8_t piece[PIECE];
     *blank = true;
-    for (uint32_t at = 0; at < octets && *blank; at += sizeof piece) {
-        size_t length = octets - at < sizeof piece ? octets - at : sizeof piece;
-        if (port->read(port->user, area, at, piece, length) != 0) {
+    *crc = 0;
+    for (uint32_t at = 0; at < octets; at += sizeof piece) {
+        const size_t length = octets - at < sizeof piece ? octets - at : sizeof piece;
+        if (read_area(port, area, at, piece, length) != 0) {
             return TEDS_E_FLASH;
         }
+        *crc = teds_crc32(*crc, piece, length);
         for (size_t i = 0; i < length; i++) {
             *blank = *blank && piece[i] == port->erased;
         }
@@ -83,19 +93,13 @@ static int is_blank(const teds_port *port, int area, uint32_t octets, bool *blan
 /* CRC-32 of the first `total` - 4 octets against the 4 that follow. */
 static int crc_good(const teds_port *port, int area, uint32_t total, bool *good)
 {
-    uint8_t piece[64];
-    uint32_t crc = 0;
-    for (uint32_t at = 0; at < total - 4; at += sizeof piece) {
-        size_t length = total - 4 - at < sizeof piece ? total - 4 - at : sizeof piece;
-        if (port->read(port->user, area, at, piece, length) != 0) {
-            return TEDS_E_FLASH;
-        }
-        crc = teds_crc32(crc, piece, length);
-    }
-    if (port->read(port->user, area, total - 4, piece, 4) != 0) {
+    uint8_t last[4];
+    uint32_t crc;
+    bool blank;
+    if (look_over(port, area, total - 4, &blank, &crc) != 0 || read_area(port, area, total - 4, last, 4) != 0) {
         return TEDS_E_FLASH;
     }
-    *good = teds_get32(piece) == crc;
+    *good = teds_get32(last) == crc;
     return 0;
 }
 
@@ -103,70 +107,57 @@ static int crc_good(const teds_port *port, int area, uint32_t total, bool *good)
 
 static int make_identity(teds_node *node)
 {
-    static const uint8_t zeros[3] = {0};
     const teds_port *port = node->port;
-    const teds_part parts[] = {{(const uint8_t *)"TEDS1 node key", 15}, {node->uuid, 10}, {node->point, 65}};
+    teds_identity *own = &node->identity;
+    const teds_part parts[] = {{(const uint8_t *)"TEDS1 node key", 15}, {own->uuid, 10}, {own->point, 65}};
     writing into = {.port = port, .area = TEDS_IDENTITY};
-    uint8_t hash[32];
-    bool good = false;
-    memcpy(node->uuid, node->config->uuid, 10);
-    if (port->p256_make(port->user, TEDS_KEY_SIGNS, &node->key, node->point) != 0) {
+    memcpy(own->uuid, node->config->uuid, 10);
+    if (port->p256_make(port->user, TEDS_KEY_SIGNS, &own->key, own->point) != 0) {
         return TEDS_E_RANDOM;
     }
-    teds_sha256_parts(node, parts, 3, hash);
-    if (teds_sign(node, hash, node->signature) != 0) {
+    if (teds_sign(node, parts, 3, own->signature) != 0) {
         return TEDS_E_CRYPTO;
     }
     put(&into, IDENTITY_MAGIC, sizeof IDENTITY_MAGIC);
-    put(&into, zeros, 3);
-    put(&into, node->uuid, 10);
-    put(&into, node->key.octets, 32);
-    put(&into, node->point, 65);
-    put(&into, node->signature, 64);
-    if (close_area(&into, IDENTITY_OCTETS) != 0 || crc_good(port, TEDS_IDENTITY, IDENTITY_OCTETS, &good) != 0) {
-        return TEDS_E_FLASH;
-    }
-    return good ? 0 : TEDS_E_FLASH;
+    put(&into, own, sizeof *own);
+    return close_area(&into, IDENTITY_OCTETS) != 0 ? TEDS_E_FLASH : 0;
 }
 
 static int load_identity(teds_node *node)
 {
     const teds_port *port = node->port;
-    uint8_t block[IDENTITY_OCTETS];
-    bool blank, good = false;
-    if (is_blank(port, TEDS_IDENTITY, port->identity_octets, &blank) != 0) {
+    uint8_t magic[sizeof IDENTITY_MAGIC];
+    uint32_t crc;
+    bool blank, good;
+    int failed;
+    if (look_over(port, TEDS_IDENTITY, port->identity_octets, &blank, &crc) != 0) {
         return TEDS_E_FLASH;
     }
-    if (blank) {
-        return make_identity(node);
+    failed = blank ? make_identity(node) : 0;
+    if (failed) {
+        return failed;
     }
-    if (port->read(port->user, TEDS_IDENTITY, 0, block, sizeof block) != 0 ||
+    if (read_area(port, TEDS_IDENTITY, 0, magic, sizeof magic) != 0 ||
+        read_area(port, TEDS_IDENTITY, sizeof magic, &node->identity, sizeof node->identity) != 0 ||
         crc_good(port, TEDS_IDENTITY, IDENTITY_OCTETS, &good) != 0) {
         return TEDS_E_FLASH;
     }
-    if (!good || memcmp(block, IDENTITY_MAGIC, sizeof IDENTITY_MAGIC) != 0) {
-        return TEDS_E_IDENTITY;
+    if (good && memcmp(magic, IDENTITY_MAGIC, sizeof magic) == 0) {
+        return 0;
     }
-    memcpy(node->uuid, block + 8, 10);
-    memcpy(node->key.octets, block + 18, 32);
-    memcpy(node->point, block + 50, 65);
-    memcpy(node->signature, block + 115, 64);
-    teds_wipe(block, sizeof block);
-    return 0;
+    return blank ? TEDS_E_FLASH : TEDS_E_IDENTITY; /* blank: it does not read back as it was written just now */
 }
 
 /* -- slots ---------------------------------------------------------------------------------------------------------- */
 
-/* Whether a slot is good; its counter. */
-static int look(const teds_port *port, int area, bool *good, uint32_t *counter)
+/* Whether a slot is good; the numbers of its head. */
+static int look(const teds_port *port, int area, uint8_t head[NUMBERS_OCTETS], bool *good)
 {
-    uint8_t head[20];
     uint32_t total;
     *good = false;
-    if (port->read(port->user, area, 0, head, sizeof head) != 0) {
+    if (read_area(port, area, 0, head, NUMBERS_OCTETS) != 0) {
         return TEDS_E_FLASH;
     }
-    *counter = teds_get32(head + 8);
     total = teds_get32(head + 12);
     if (memcmp(head, SLOT_MAGIC, sizeof SLOT_MAGIC) != 0 || total < HEAD_OCTETS + 4 || total > port->slot_octets ||
         teds_get32(head + 16) > total - HEAD_OCTETS - 4) {
@@ -175,60 +166,52 @@ static int look(const teds_port *port, int area, bool *good, uint32_t *counter)
     return crc_good(port, area, total, good);
 }
 
-static int take_slot(teds_node *node, int area)
+static int take_slot(teds_node *node, int area, const uint8_t head[NUMBERS_OCTETS])
 {
-    const teds_port *port = node->port;
     teds_state *state = &node->state;
-    uint8_t head[HEAD_OCTETS];
-    if (port->read(port->user, area, 0, head, sizeof head) != 0) {
-        return TEDS_E_FLASH;
-    }
     state->flags = head[5];
     state->address = head[6];
     node->slot = (uint8_t)area;
     node->slot_counter = teds_get32(head + 8);
-    node->records_at = HEAD_OCTETS;
     node->records_end = HEAD_OCTETS + teds_get32(head + 16);
     state->epoch = teds_get32(head + 20);
     state->sequence = teds_get32(head + 24);
-    memcpy(state->key, head + 28, 16);
-    memcpy(state->station, head + 44, 65);
-    memcpy(state->ca, head + 109, 65);
-    teds_wipe(head, sizeof head);
-    return 0;
+    return read_area(node->port, area, NUMBERS_OCTETS, &state->agreed, sizeof state->agreed) != 0 ? TEDS_E_FLASH : 0;
 }
 
 int teds_store_load(teds_node *node)
 {
     const teds_port *port = node->port;
+    uint8_t head[2][NUMBERS_OCTETS];
     bool good[2], blank;
-    uint32_t counter[2];
-    int taken, failed = load_identity(node);
+    uint32_t crc;
+    int failed = load_identity(node);
+    node->records_end = HEAD_OCTETS;
     if (failed) {
         return failed;
     }
     for (int i = 0; i < 2; i++) {
-        if (look(port, TEDS_SLOT_A + i, &good[i], &counter[i]) != 0) {
+        if (look(port, TEDS_SLOT_A + i, head[i], &good[i]) != 0) {
             return TEDS_E_FLASH;
         }
     }
     if (good[0] && good[1]) {
-        good[counter[0] > counter[1] ? 1 : 0] = false;
+        good[teds_get32(head[0] + 8) > teds_get32(head[1] + 8) ? 1 : 0] = false;
     }
-    taken = good[0] ? TEDS_SLOT_A : good[1] ? TEDS_SLOT_B : 0;
-    for (int area = TEDS_SLOT_A; area <= TEDS_SLOT_B; area++) {
-        if (area == taken) {
+    for (int i = 0; i < 2; i++) {
+        if (good[i]) {
             continue;
         }
-        if (is_blank(port, area, port->slot_octets, &blank) != 0 || (!blank && port->erase(port->user, area) != 0)) {
+        if (look_over(port, TEDS_SLOT_A + i, port->slot_octets, &blank, &crc) != 0 ||
+            (!blank && port->erase(port->user, TEDS_SLOT_A + i) != 0)) {
             return TEDS_E_FLASH;
         }
     }
-    if (taken) {
-        return take_slot(node, taken);
+    if (good[0] || good[1]) {
+        return take_slot(node, good[0] ? TEDS_SLOT_A : TEDS_SLOT_B, head[good[0] ? 0 : 1]);
     }
     node->slot = TEDS_SLOT_B; /* nothing is stored: A is written first */
-    node->state.address = teds_default_address(node->uuid);
+    node->state.address = teds_default_address(node);
     return 0;
 }
 
@@ -249,169 +232,133 @@ int teds_make_blank(teds_node *node)
     return 0;
 }
 
-uint64_t teds_store_poll(teds_node *node, uint64_t now)
+void teds_store_poll(teds_node *node, uint64_t now)
 {
-    bool sends = teds_can_sending(node);
-    uint64_t due = TEDS_NEVER;
+    bool waits = teds_can_sending(node);
 #if TEDS_NFC
-    if (now < node->nfc.busy_until) {
-        sends = true;
-        due = node->nfc.busy_until;
-    }
+    waits = waits || now < node->nfc.busy_until;
 #else
     (void)now;
 #endif
 #if TEDS_BLE
-    for (int8_t i = 0; i < TEDS_REPLIES; i++) {
-        sends = sends || teds_ble_sends(node, i);
+    for (const teds_stored_reply *each = node->replies; each < node->replies + TEDS_REPLIES; each++) {
+        waits = waits || teds_ble_sends(node, each);
     }
 #endif
-    if (!node->old_slot_due || sends) {
-        return node->old_slot_due ? due : TEDS_NEVER;
+    if (node->old_slot_due && !waits) {
+        node->old_slot_due = false; /* where it fails, the next Write or start erases it */
+        (void)teds_make_blank(node);
     }
-    node->old_slot_due = false; /* where it fails, the next Write or start erases it */
-    (void)teds_make_blank(node);
-    return TEDS_NEVER;
 }
 
-/* The record at `at`: 1, and `at` is behind it; 0 at the end; -1 where flash cannot be read, which is not the end. */
-static int next_record(const teds_node *node, uint32_t *at, uint16_t *id, teds_source *source)
+/* The record at `at`, or false at the end. Moves `at` behind it; where flash cannot be read it stays before the end. */
+static bool next_record(const teds_node *node, uint32_t *at, uint16_t *id, teds_source *source)
 {
     uint8_t head[RECORD_OCTETS];
-    if (*at + RECORD_OCTETS > node->records_end) {
-        return 0;
-    }
-    if (node->port->read(node->port->user, node->slot, *at, head, sizeof head) != 0) {
-        return -1;
+    if (*at + RECORD_OCTETS > node->records_end || read_area(node->port, node->slot, *at, head, sizeof head) != 0) {
+        return false;
     }
     *id = teds_get16(head);
-    memset(source, 0, sizeof *source);
-    source->length = teds_get32(head + 4);
-    source->at = *at + RECORD_OCTETS;
+    *source = (teds_source){.length = teds_get32(head + 4), .at = *at + RECORD_OCTETS};
     *at = source->at + source->length;
-    return *at <= node->records_end ? 1 : -1;
+    return *at <= node->records_end;
 }
 
 static bool find_stored(const teds_node *node, uint16_t id, teds_source *out)
 {
-    uint32_t at = node->records_at;
+    uint32_t at = HEAD_OCTETS;
     uint16_t each;
-    int more;
-    while ((more = next_record(node, &at, &each, out)) > 0) {
+    while (next_record(node, &at, &each, out)) {
         if (each == id) {
             return true;
         }
     }
-    memset(out, 0, sizeof *out);
-    out->unreadable = more < 0; /* nobody knows whether it is there: reading it fails, so that it is no 18 */
-    out->length = out->unreadable ? 12 : 0;
+    /* where nobody knows whether it is there, reading it fails, so that it is no 18 */
+    *out = (teds_source){.unreadable = at != node->records_end, .length = 12};
     return out->unreadable;
 }
 
-static int copy_record(const teds_node *node, writing *into, uint16_t id, const teds_source *source,
-                       const uint8_t *staged, size_t staged_length)
+static void copy_record(const teds_node *node, writing *into, uint16_t id, const teds_source *source)
 {
-    uint8_t head[RECORD_OCTETS] = {0}, piece[64];
-    uint32_t length = staged != NULL ? (uint32_t)staged_length : source->length;
+    uint8_t head[RECORD_OCTETS] = {0}, piece[PIECE];
     teds_put16(head, id);
-    teds_put32(head + 4, length);
+    teds_put32(head + 4, source->length);
     put(into, head, sizeof head);
-    if (staged != NULL) {
-        put(into, staged, staged_length);
-        return into->failed;
-    }
-    for (uint32_t at = 0; at < length && !into->failed; at += sizeof piece) {
-        size_t octets = length - at < sizeof piece ? length - at : sizeof piece;
+    for (uint32_t at = 0; at < source->length && !into->failed; at += sizeof piece) {
+        size_t octets = source->length - at < sizeof piece ? source->length - at : sizeof piece;
         into->failed = teds_source_read(node, source, at, piece, octets);
         put(into, piece, octets);
     }
-    return into->failed;
 }
 
-/* The records of the new slot, ascending: written to `into`, or (NULL) only counted in `octets`. Not 0: flash failed. */
-static int records(const teds_node *node, writing *into, teds_keep keep, const void *what, bool staged,
-                   uint32_t *octets)
+static bool find_staged(const teds_node *node, uint16_t id, teds_source *out);
+
+/* The records of the new slot, ascending: written to `into`, or (NULL) only counted. -1: the old slot cannot be read. */
+static int32_t records(const teds_node *node, writing *into, const teds_state *state, const teds_signed *commit)
 {
-    int32_t after = -1;
-    *octets = 0;
-    for (;;) {
-        uint32_t at = node->records_at, found = UINT32_MAX;
-        uint16_t id;
-        teds_source each = {0}, source = {0};
-        const uint8_t *image = NULL;
-        size_t length = 0;
-        int more;
-        while ((more = next_record(node, &at, &id, &each)) > 0) {
-            if (id > after && id < found && keep(what, id)) {
-                found = id;
-                source = each;
+    const unsigned among = commit != NULL ? TEDS_STORED | TEDS_STAGED : TEDS_STORED;
+    int32_t id = -1, octets = 0;
+    while ((id = teds_next_id(node, id, among)) < TEDS_NO_ID) {
+        teds_source source;
+        if (commit == NULL || !find_staged(node, (uint16_t)id, &source)) {
+            if (commit != NULL ? !teds_lists(commit, (uint16_t)id)
+                               : id == (int32_t)TEDS_SECURITY_ID && (state->flags & TEDS_PROVISIONED) == 0) {
+                continue;
+            }
+            if (!find_stored(node, (uint16_t)id, &source)) {
+                return -1;
             }
         }
-        if (more < 0) {
-            return more; /* a record that is not seen would be left out */
+        octets += (int32_t)(RECORD_OCTETS + source.length);
+        if (into != NULL) {
+            copy_record(node, into, (uint16_t)id, &source);
         }
-        if (staged && teds_next_staged(node, after, &id) && id <= found) {
-            found = id;
-            image = teds_staged(node, id, &length);
-        }
-        if (found == UINT32_MAX) {
-            return 0;
-        }
-        *octets += RECORD_OCTETS + (image != NULL ? (uint32_t)length : source.length);
-        if (into != NULL && copy_record(node, into, (uint16_t)found, &source, image, length) != 0) {
-            return into->failed;
-        }
-        after = (int32_t)found;
     }
+    return id == TEDS_NO_ID ? octets : -1;
 }
 
-int teds_store_write(teds_node *node, const teds_state *state, teds_keep keep, const void *what, bool staged)
+int teds_store_write(teds_node *node, const teds_state *state, const teds_signed *commit)
 {
     const teds_port *port = node->port;
-    uint32_t octets, total;
-    uint8_t head[HEAD_OCTETS] = {0};
+    const int32_t octets = records(node, NULL, state, commit);
+    uint32_t total;
+    uint8_t head[NUMBERS_OCTETS] = {0};
     writing into = {.port = port, .area = free_slot(node)};
     bool good = false;
-    int failed;
-    if (records(node, NULL, keep, what, staged, &octets) != 0) {
+    if (octets < 0) {
         return -TEDS_FAILURE;
     }
-    total = whole_units(port, HEAD_OCTETS + octets + 4);
+    total = whole_units(port, HEAD_OCTETS + (uint32_t)octets + 4);
     if (total > port->slot_octets) {
         return -TEDS_TOO_LARGE;
     }
-    failed = teds_make_blank(node);
-    if (failed) {
-        return failed;
+    if (teds_make_blank(node) != 0) {
+        return -TEDS_FAILURE;
     }
     memcpy(head, SLOT_MAGIC, sizeof SLOT_MAGIC);
     head[5] = state->flags;
     head[6] = state->address;
     teds_put32(head + 8, node->slot_counter + 1);
     teds_put32(head + 12, total);
-    teds_put32(head + 16, octets);
+    teds_put32(head + 16, (uint32_t)octets);
     teds_put32(head + 20, state->epoch);
     teds_put32(head + 24, state->sequence);
-    memcpy(head + 28, state->key, 16);
-    memcpy(head + 44, state->station, 65);
-    memcpy(head + 109, state->ca, 65);
-    node->free_slot_dirty = true;
+    node->free_slot_dirty = true; /* from here on; afterwards it is the old one */
     put(&into, head, sizeof head);
-    teds_wipe(head, sizeof head);
-    if (records(node, &into, keep, what, staged, &octets) != 0 || close_area(&into, total) != 0 ||
-        crc_good(port, into.area, total, &good) != 0 || !good) {
-        teds_wipe(into.buffer, sizeof into.buffer);
+    put(&into, &state->agreed, sizeof state->agreed);
+    put_zeros(&into, HEAD_OCTETS);
+    good = records(node, &into, state, commit) == octets && close_area(&into, total) == 0 &&
+           crc_good(port, into.area, total, &good) == 0 && good;
+    teds_wipe(into.buffer, sizeof into.buffer);
+    if (!good) {
         /* A slot that is whole and cannot be read back now would count at the next start: it has to go. */
         (void)teds_make_blank(node);
         return -TEDS_FAILURE;
     }
-    teds_wipe(into.buffer, sizeof into.buffer);
     node->state = *state;
     node->slot = (uint8_t)into.area;
     node->slot_counter++;
-    node->records_at = HEAD_OCTETS;
-    node->records_end = HEAD_OCTETS + octets;
-    node->free_slot_dirty = true; /* the old one */
+    node->records_end = HEAD_OCTETS + (uint32_t)octets;
     node->old_slot_due = true;
     return 0;
 }
@@ -423,30 +370,43 @@ bool teds_storable(uint16_t channel, uint8_t code)
     return channel <= 255 && ((code >= 1 && code <= 17) || (code >= 128 && code <= 135));
 }
 
+static uint16_t id_of(const teds_fixed *each)
+{
+    return (uint16_t)((uint32_t)each->channel << 8 | each->code);
+}
+
 static bool find_fixed(const teds_node *node, uint16_t id, teds_source *out)
 {
     for (size_t i = 0; i < node->config->fixed_count; i++) {
         const teds_fixed *each = &node->config->fixed[i];
-        if (((uint32_t)each->channel << 8 | each->code) == id) {
-            memset(out, 0, sizeof *out);
-            out->octets = each->octets;
-            out->length = each->length;
-            out->read_only = true;
+        if (id_of(each) == id) {
+            *out = (teds_source){.octets = each->octets, .length = each->length, .read_only = true};
             return true;
         }
     }
     return false;
 }
 
+static bool find_staged(const teds_node *node, uint16_t id, teds_source *out)
+{
+    size_t length;
+    *out = (teds_source){.octets = teds_staged(node, id, &length)};
+    out->length = (uint32_t)length;
+    return out->octets != NULL;
+}
+
 bool teds_find(const teds_node *node, uint16_t id, teds_source *out)
 {
     if (id == TEDS_SECURITY_ID && (node->state.flags & TEDS_PROVISIONED) == 0) {
-        memset(out, 0, sizeof *out);
-        out->initial = true;
-        out->length = TEDS_INITIAL_OCTETS;
+        *out = (teds_source){.initial = true, .length = TEDS_INITIAL_OCTETS};
         return true;
     }
     return find_fixed(node, id, out) || find_stored(node, id, out);
+}
+
+bool teds_find_new(const teds_node *node, uint16_t id, teds_source *out)
+{
+    return find_staged(node, id, out) || teds_find(node, id, out);
 }
 
 int teds_source_read(const teds_node *node, const teds_source *source, uint32_t at, uint8_t *out, size_t length)
@@ -464,13 +424,13 @@ int teds_source_read(const teds_node *node, const teds_source *source, uint32_t 
         memcpy(out, source->octets + at, length);
         return 0;
     }
-    return node->port->read(node->port->user, node->slot, source->at + at, out, length);
+    return read_area(node->port, node->slot, source->at + at, out, length);
 }
 
 int teds_source_hash(const teds_node *node, const teds_source *source, uint8_t out[32])
 {
     const teds_port *port = node->port;
-    uint8_t piece[64];
+    uint8_t piece[PIECE];
     teds_sha256 state;
     int failed = 0;
     port->sha256_start(port->user, &state);
@@ -483,22 +443,78 @@ int teds_source_hash(const teds_node *node, const teds_source *source, uint8_t o
     return failed;
 }
 
-int teds_next_id(const teds_node *node, int32_t after, uint16_t *out)
+static void nearer(uint32_t id, int32_t after, int32_t *found)
 {
-    uint32_t at = node->records_at, found = UINT32_MAX;
+    if ((int32_t)id > after && (int32_t)id < *found) {
+        *found = (int32_t)id;
+    }
+}
+
+int32_t teds_next_id(const teds_node *node, int32_t after, unsigned among)
+{
+    int32_t found = TEDS_NO_ID;
+    uint32_t at = HEAD_OCTETS;
     uint16_t id;
     teds_source source;
-    int more;
-    while ((more = next_record(node, &at, &id, &source)) > 0) {
-        found = id > after && id < found ? id : found;
+    if ((among & TEDS_STORED) != 0) {
+        while (next_record(node, &at, &id, &source)) {
+            nearer(id, after, &found);
+        }
+        if (at != node->records_end) {
+            return TEDS_UNREADABLE;
+        }
     }
-    for (size_t i = 0; i < node->config->fixed_count; i++) {
-        uint32_t each = (uint32_t)node->config->fixed[i].channel << 8 | node->config->fixed[i].code;
-        found = (int32_t)each > after && each < found ? each : found;
+    if ((among & TEDS_NOT_STORED) != 0) {
+        for (size_t i = 0; i < node->config->fixed_count; i++) {
+            nearer(id_of(&node->config->fixed[i]), after, &found);
+        }
+        nearer(TEDS_SECURITY_ID, after, &found);
     }
-    found = (int32_t)TEDS_SECURITY_ID > after && TEDS_SECURITY_ID < found ? TEDS_SECURITY_ID : found;
-    *out = (uint16_t)found;
-    return more < 0 ? more : found != UINT32_MAX;
+    if ((among & TEDS_STAGED) != 0) {
+        for (at = 0; at < node->staging_end; at += 4u + teds_get16(node->staging + at + 2)) {
+            nearer(teds_get16(node->staging + at), after, &found);
+        }
+    }
+    return found;
+}
+
+/* -- tuples --------------------------------------------------------------------------------------------------------- */
+
+/* UINT32_MAX: it does not fit, or cannot be read. */
+static uint32_t number(const teds_walk *in, uint32_t at, uint32_t octets)
+{
+    uint32_t value = 0;
+    for (; octets > 0; octets--, at++) {
+        uint8_t octet;
+        if (value > 0xFFFFFF || at >= in->source.length ||
+            teds_source_read(in->node, &in->source, at, &octet, 1) != 0) {
+            return UINT32_MAX;
+        }
+        value = value << 8 | octet;
+    }
+    return value;
+}
+
+#if TEDS_OPERATION
+uint32_t teds_number_at(const teds_walk *in, uint32_t at, uint32_t octets)
+{
+    return octets >= 1 && octets <= 4 ? number(in, at, octets) : UINT32_MAX;
+}
+#endif
+
+bool teds_next_tuple(teds_walk *in, uint8_t *type, uint32_t *value, uint32_t *length)
+{
+    if (in->at + 1 + in->width > in->end) {
+        return false;
+    }
+    *type = (uint8_t)number(in, in->at, 1);
+    *length = number(in, in->at + 1, in->width);
+    *value = in->at + 1 + in->width;
+    if (*length > in->end - *value) {
+        return false;
+    }
+    in->at = *value + *length;
+    return true;
 }
 
 /* -- staging: id 2, length 2, image; one after another --------------------------------------------------------------- */
@@ -515,34 +531,10 @@ const uint8_t *teds_staged(const teds_node *node, uint16_t id, size_t *length)
     return NULL;
 }
 
-bool teds_next_staged(const teds_node *node, int32_t after, uint16_t *out)
-{
-    uint32_t found = UINT32_MAX;
-    for (size_t at = 0; at + 4 <= node->staging_end; at += 4u + teds_get16(node->staging + at + 2)) {
-        uint16_t id = teds_get16(node->staging + at);
-        found = id > after && id < found ? id : found;
-    }
-    *out = (uint16_t)found;
-    return found != UINT32_MAX;
-}
-
 void teds_staging_drop(teds_node *node)
 {
     node->staging_end = 0;
-    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
-        node->sessions[i].staged = false;
-    }
-}
-
-/* Another session's staging: its place, -1 where there is none. */
-static int8_t staged_elsewhere(const teds_node *node, int8_t session)
-{
-    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
-        if (i != session && node->sessions[i].used && node->sessions[i].staged) {
-            return i;
-        }
-    }
-    return -1;
+    node->staging_of = NULL;
 }
 
 /* Put `length` octets at `offset` of an image; what lay behind them is dropped. */
@@ -567,15 +559,10 @@ static int stage(teds_node *node, uint16_t id, uint32_t offset, const uint8_t *o
 /* Whether List could name one more, sealed; `own`: what is staged is this session's. */
 static bool can_list(const teds_node *node, uint16_t id, bool own)
 {
-    teds_source source;
-    int32_t after = -1;
-    uint16_t each;
-    size_t staged = 0, count = teds_find(node, id, &source) || (own && teds_staged(node, id, &staged) != NULL) ? 0 : 1;
-    for (; teds_next_id(node, after, &each) > 0; after = each) {
-        count++;
-    }
-    for (after = -1; own && teds_next_staged(node, after, &each); after = each) {
-        count += teds_find(node, each, &source) ? 0u : 1u;
+    const unsigned among = own ? TEDS_STORED | TEDS_NOT_STORED | TEDS_STAGED : TEDS_STORED | TEDS_NOT_STORED;
+    size_t count = 1;
+    for (int32_t each = -1; (each = teds_next_id(node, each, among)) < TEDS_NO_ID;) {
+        count += each != id ? 1 : 0;
     }
     return 3 * count <= TEDS_ROOM;
 }
@@ -583,53 +570,50 @@ static bool can_list(const teds_node *node, uint16_t id, bool own)
 /* -- commands -------------------------------------------------------------------------------------------------------- */
 
 /* The TEDS that a command names: its id, or a reason negated. */
-static int named(const teds_command *command, bool octets_good)
+static int named(const teds_command *command)
 {
-    if (!octets_good) {
-        return -TEDS_BAD_FORM;
-    }
     if (!teds_storable(command->channel, command->payload[0])) {
         return -TEDS_NO_SUCH_TEDS;
     }
     return (int)((uint32_t)command->channel << 8 | command->payload[0]);
 }
 
-static int status(uint16_t id, bool read_only, bool there, uint32_t size, uint16_t checksum, uint8_t *out)
+/* What Query and Update say of a stored TEDS, or of the staged image in its place. */
+static int status_of(const teds_node *node, uint16_t id, bool staged, uint8_t *out)
 {
     static const uint32_t text = 1u << 2 | 1u << 4 | 1u << 6 | 1u << 10 | 1u << 11 | 1u << 14 | 1u << 15;
-    uint8_t code = (uint8_t)id;
-    uint32_t attributes = code >= 128 ? 0x40u : (text >> (code & 31u) & 1u) != 0 ? 0x10u : 0;
-    attributes |= (read_only ? 1u : 0u) | (there ? 0u : 2u);
-    out[0] = (uint8_t)attributes;
+    const uint8_t code = (uint8_t)id;
+    teds_source source;
+    const bool there = staged ? teds_find_new(node, id, &source) : teds_find(node, id, &source);
+    if (!there) {
+        source.length = 0;
+        source.read_only = false;
+    }
+    out[0] = code >= 128 ? 0x40 : (text >> (code & 31u) & 1u) != 0 ? 0x10 : 0;
+    out[0] |= (uint8_t)((source.read_only ? 1u : 0u) | (there ? 0u : 2u));
     out[1] = 0;
-    teds_put32(out + 2, size);
-    teds_put16(out + 6, checksum);
+    teds_put32(out + 2, source.length);
+    teds_put16(out + 6, 0);
+    if (source.length >= 2 && teds_source_read(node, &source, source.length - 2, out + 6, 2) != 0) {
+        return -TEDS_FAILURE;
+    }
     teds_put32(out + 8, TEDS_STAGING - 4);
     return 12;
 }
 
-static int status_of(const teds_node *node, uint16_t id, uint8_t *out)
+int teds_query(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    teds_source source = {0};
-    uint8_t last[2] = {0, 0};
-    bool there = teds_find(node, id, &source);
-    if (there && source.length >= 2 && teds_source_read(node, &source, source.length - 2, last, 2) != 0) {
-        return -TEDS_FAILURE;
-    }
-    return status(id, source.read_only && there, there, there ? source.length : 0, teds_get16(last), out);
+    const int id = named(command);
+    (void)origin;
+    return id < 0 ? id : status_of(node, (uint16_t)id, false, out);
 }
 
-int teds_query(const teds_node *node, const teds_command *command, uint8_t *out)
+int teds_read(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    int id = named(command, command->length == 1);
-    return id < 0 ? id : status_of(node, (uint16_t)id, out);
-}
-
-int teds_read(const teds_node *node, const teds_command *command, uint8_t *out)
-{
-    int id = named(command, command->length == 5);
+    const int id = named(command);
     teds_source source;
     uint32_t offset, octets;
+    (void)origin;
     if (id < 0) {
         return id;
     }
@@ -647,15 +631,16 @@ int teds_read(const teds_node *node, const teds_command *command, uint8_t *out)
     return (int)(4 + octets);
 }
 
-int teds_write(teds_node *node, const teds_command *command, teds_origin *origin)
+int teds_write(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    int id = named(command, command->length >= 5), failed;
-    int8_t other = staged_elsewhere(node, origin->session);
-    teds_session *session = &node->sessions[origin->session];
-    uint64_t now = teds_now(node);
+    const int id = command->length >= 5 ? named(command) : -TEDS_BAD_FORM;
+    const bool elsewhere = node->staging_of != NULL && node->staging_of != origin->session;
+    const uint64_t now = teds_now(node);
     teds_source source;
     uint32_t offset;
-    size_t staged = 0;
+    size_t staged = 0, octets;
+    int failed;
+    (void)out;
     if (id < 0) {
         return id;
     }
@@ -663,30 +648,31 @@ int teds_write(teds_node *node, const teds_command *command, teds_origin *origin
         return -TEDS_NOT_PERMITTED;
     }
     offset = teds_get32(command->payload + 1);
-    if (other < 0) {
+    octets = command->length - 5;
+    if (!elsewhere) {
         (void)teds_staged(node, (uint16_t)id, &staged);
     }
     if (offset > staged) {
         return -TEDS_BAD_FORM;
     }
-    if (other >= 0 && now < node->sessions[other].staged_at + STAGED_NS) {
+    if (elsewhere && now < node->staged_until) {
         return -TEDS_BUSY;
     }
-    if (!can_list(node, (uint16_t)id, other < 0) || (other >= 0 && 4 + command->length - 5 > TEDS_STAGING)) {
+    if (!can_list(node, (uint16_t)id, !elsewhere) || (elsewhere && 4 + octets > TEDS_STAGING)) {
         return -TEDS_TOO_LARGE; /* which changes no staging */
     }
     if (teds_make_blank(node) != 0) {
         return -TEDS_FAILURE;
     }
-    if (other >= 0) {
+    if (elsewhere) {
         teds_staging_drop(node);
     }
-    failed = stage(node, (uint16_t)id, offset, command->payload + 5, command->length - 5);
+    failed = stage(node, (uint16_t)id, offset, command->payload + 5, octets);
     if (failed) {
         return failed;
     }
-    session->staged = true;
-    session->staged_at = now;
+    node->staging_of = origin->session;
+    node->staged_until = now + STAGED_NS;
 #if TEDS_OPERATION
     if (origin->arrival->kind == TEDS_AT_NFC) {
         teds_yield_sensors(node, origin->session);
@@ -697,29 +683,29 @@ int teds_write(teds_node *node, const teds_command *command, teds_origin *origin
 
 int teds_update(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
 {
-    int id = named(command, command->length == 1), length, failed = 0;
+    const int id = named(command);
     const uint8_t *image;
     size_t octets = 0;
+    int length, failed;
     if (id < 0) {
         return id;
     }
-    if (staged_elsewhere(node, origin->session) >= 0) {
+    if (node->staging_of != NULL && node->staging_of != origin->session) {
         return -TEDS_BUSY;
     }
     image = teds_staged(node, (uint16_t)id, &octets);
-    if (image == NULL) {
-        return id == (int)TEDS_SECURITY_ID && node->staging_end > 0 ? -TEDS_WRONG_STATE
-                                                                    : status_of(node, (uint16_t)id, out);
+    if (image == NULL && id == (int)TEDS_SECURITY_ID && node->staging_end > 0) {
+        return -TEDS_WRONG_STATE;
     }
-    node->sessions[origin->session].staged_at = teds_now(node);
+    length = status_of(node, (uint16_t)id, true, out); /* a commit that succeeds stores what was staged */
+    if (image == NULL) {
+        return length;
+    }
+    node->staged_until = teds_now(node) + STAGED_NS;
     if (id == (int)TEDS_SECURITY_ID) {
-        uint16_t checksum = octets >= 2 ? teds_get16(image + octets - 2) : 0;
         failed = teds_commit(node);
-        length = status((uint16_t)id, false, true, (uint32_t)octets, checksum, out);
     } else {
         failed = teds_own_check((uint8_t)id, image, octets) ? 0 : -TEDS_BAD_FORM;
-        length = failed ? 0
-                        : status((uint16_t)id, false, true, (uint32_t)octets, teds_get16(image + octets - 2), out);
     }
     return failed ? failed : length;
 }

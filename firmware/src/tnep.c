@@ -164,7 +164,7 @@ static size_t room(const teds_node *node)
 
 static void say_part(teds_node *node, uint16_t offset)
 {
-    const teds_stored_reply *reply = &node->replies[node->nfc.reply];
+    const teds_stored_reply *reply = node->nfc.reply;
     const uint16_t total = (uint16_t)(reply->length - 1);
     piece own = {ANSWER, node->nfc.answered_transaction, total, offset < total ? offset : total, NULL, room(node)};
     own.body = reply->octets + 1 + own.offset;
@@ -209,7 +209,7 @@ static void collect(teds_node *node, const piece *came)
         teds_stored_reply *reply;
         teds_put16(transaction, nfc->transaction);
         reply = teds_answer(node, TEDS_LINK_NFC, &arrival, transaction, 2, nfc->request, nfc->total);
-        nfc->reply = (int8_t)(reply - node->replies);
+        nfc->reply = reply;
         nfc->answered = true;
         nfc->answered_transaction = nfc->transaction;
         teds_node_reply_left(node, TEDS_LINK_NFC);

@@ -44,6 +44,17 @@ static void high(uint8_t *s)
 }
 """
 """n - s for a low s."""
+HKDF: Final = """
+static int hkdf_of(const teds_node *node, const uint8_t *salt, size_t salt_length, const uint8_t *ikm,
+                   size_t ikm_length, const teds_part *info, size_t count, uint8_t *out, size_t length)
+{
+    const teds_part part = {ikm, ikm_length};
+    uint8_t prk[32];
+    return node->port->hmac(node->port->user, salt, salt_length, &part, 1, prk) != 0 ||
+           teds_hkdf_expand(node, prk, info, count, out, length) != 0;
+}
+"""
+"""HKDF whose salt may have any length."""
 
 
 CHANGES: Final[dict[str, Change]] = {
@@ -60,17 +71,20 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_TRANSCRIPT_WITHOUT_ONE_TIME": Change("agree.c", "{reply_head, 85}", "{reply_head, 20}"),
     "FAULT_Z_HALVES_SWAPPED": Change(
         "agree.c",
-        "&own->key, payload + 194, z) != 0 ||\n                 port->p256_ecdh(port->user, &own->key, payload, z + 32)",
-        "&own->key, payload + 194, z + 32) != 0 ||\n                 port->p256_ecdh(port->user, &own->key, payload, z)",
+        "&own->key, payload + 194, z) != 0 ||\n                       port->p256_ecdh(port->user, &own->key, payload, z + 32)",
+        "&own->key, payload + 194, z + 32) != 0 ||\n                       port->p256_ecdh(port->user, &own->key, payload, z)",
     ),
-    "FAULT_Z_ONE_TIME_ALONE": Change(
-        "agree.c", "teds_hkdf(node, nonce, 16, z, 64, info", "teds_hkdf(node, nonce, 16, z, 32, info"
-    ),
+    "FAULT_Z_ONE_TIME_ALONE": Change("agree.c", "{{z, 64}, LABEL", "{{z, 32}, LABEL"),
     "FAULT_SALT_AND_IKM_SWAPPED": Change(
-        "agree.c", "teds_hkdf(node, nonce, 16, z, 64, info", "teds_hkdf(node, z, 64, nonce, 16, info"
+        "agree.c",
+        "teds_hkdf(node, nonce, parts, 3, okm, 48)",
+        "hkdf_of(node, z, 64, nonce, 16, parts + 1, 2, okm, 48)",
+        HKDF,
     ),
     "FAULT_INFO_LABEL_WITHOUT_00": Change("agree.c", 'LABEL("TEDS1 link key")', 'MAC_LABEL("TEDS1 link key")'),
-    "FAULT_M_OF_16_OCTETS": Change("agree.c", "okm + 16, 32, for_node, 2, mac)", "okm + 16, 16, for_node, 2, mac)"),
+    "FAULT_M_OF_16_OCTETS": Change(
+        "agree.c", "okm + 16, 32, for_node, 2, node_tag)", "okm + 16, 16, for_node, 2, node_tag)"
+    ),
     "FAULT_MAC_LABEL_WITH_00": Change("agree.c", '{MAC_LABEL("node"), {script, 32}}', '{LABEL("node"), {script, 32}}'),
     "FAULT_TAGS_SWAPPED": Change(
         "agree.c", '{MAC_LABEL("node"), {script, 32}}', '{MAC_LABEL("station"), {script, 32}}'
@@ -78,8 +92,10 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_SIGN_LABEL_WITHOUT_00": Change("agree.c", 'LABEL("TEDS1 agree")', 'MAC_LABEL("TEDS1 agree")'),
     "FAULT_SIGN_NOT_HASHED": Change(
         "agree.c",
-        "failed = teds_sign(node, hash, out + 101) != 0;",
-        "failed = teds_sign(node, script, out + 101) != 0;",
+        "failed = teds_sign(node, agreed, 2, out + 101) != 0;",
+        "(void)agreed;\n        node->port->p256_sign(node->port->user, &node->identity.key, script, out + 101);\n"
+        "        if (out[133] & 0x80) {\n            high(out + 133);\n        }",
+        HIGH,
     ),
     "FAULT_CONFIRM_LABEL_WITH_00": Change(
         "agree.c", '{MAC_LABEL("station"), {script, 32}}', '{LABEL("station"), {script, 32}}'
@@ -104,8 +120,8 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_PROVE_LABEL_WITHOUT_00": Change("node.c", '"TEDS1 prove", 12', '"TEDS1 prove", 11'),
     "FAULT_PROVE_ANY_CHALLENGE": Change(
         "node.c",
-        "{command->payload, 32}};\n    uint8_t hash[32];\n    if (command->length != 32) {",
-        "{command->payload, 32}};\n    uint8_t hash[32];\n    if (command->length < 32) {",
+        "TEDS_PROVE, 32, prove}",
+        "TEDS_PROVE, ANY, prove}",
     ),
     "FAULT_RESET_WITHOUT_EPOCH": Change(
         "node.c", "{epoch, 4}, {command->payload, 32}};", "{epoch, 0}, {command->payload, 32}};"
@@ -113,7 +129,9 @@ CHANGES: Final[dict[str, Change]] = {
     # -- sessions
     "FAULT_OPEN_INFO_LABEL_WITHOUT_00": Change("session.c", 'LABEL("TEDS1 session")', 'MAC_LABEL("TEDS1 session")'),
     "FAULT_OPEN_POINTS_SWAPPED": Change(
-        "session.c", "{node->uuid, 10}, {es, 65}, {own->point, 65}};", "{node->uuid, 10}, {own->point, 65}, {es, 65}};"
+        "session.c",
+        "{node->identity.uuid, 10}, {es, 65}, {own->point, 65}};",
+        "{node->identity.uuid, 10}, {own->point, 65}, {es, 65}};",
     ),
     "FAULT_SESSION_KEYS_SWAPPED": Change(
         "session.c",
@@ -125,8 +143,8 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_C_GROWS_BY_2": Change("session.c", "node->opens++;", "node->opens += 2;"),
     "FAULT_BAD_POINT_COSTS_NO_C": Change(
         "session.c",
-        "    node->opens++;\n    return teds_point_good(node, es) && memcmp(es, node->state.station, 65) != 0 ? 0 : -TEDS_BAD_POINT;",
-        "    if (!teds_point_good(node, es) || memcmp(es, node->state.station, 65) == 0) return -TEDS_BAD_POINT;\n"
+        "    node->opens++;\n    return teds_point_good(node, es) && memcmp(es, node->state.agreed.station, 65) != 0 ? 0 : -TEDS_BAD_POINT;",
+        "    if (!teds_point_good(node, es) || memcmp(es, node->state.agreed.station, 65) == 0) return -TEDS_BAD_POINT;\n"
         "    node->opens++;\n    return 0;",
     ),
     "FAULT_PKCS7_NO_FULL_BLOCK": Change(
@@ -140,19 +158,17 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_ANY_COUNTER": Change("session.c", "if (taken->counter <= last) {", "if (false) {"),
     "FAULT_LAST_COUNTER": Change("node.c", "if (taken.counter == UINT32_MAX && ", "if (false && "),
     "FAULT_CLOSE_IGNORED": Change(
-        "node.c", "            origin->after = TEDS_AFTER_END_SESSION;\n            return 0;", "            return 0;"
+        "node.c", "    origin->after = TEDS_AFTER_END_SESSION;\n    return 0;", "    (void)origin;\n    return 0;"
     ),
     # -- frames and states
-    "FAULT_HEADER_LENGTH_IGNORED": Change(
-        "node.c", "return teds_get16(frame + 4) == command->length ? 0 : -TEDS_BAD_FORM;", "return 0;"
-    ),
+    "FAULT_HEADER_LENGTH_IGNORED": Change("node.c", "if (teds_get16(frame + 4) != command->length) {", "if (false) {"),
     "FAULT_IDENTIFY_ANY_PAYLOAD": Change(
         "node.c",
-        "    if (command->length != 0) {\n        return -TEDS_BAD_FORM;\n    }\n    teds_node_identify",
-        "    teds_node_identify",
+        "TEDS_IDENTIFY, 0, identify}",
+        "TEDS_IDENTIFY, ANY, identify}",
     ),
     "FAULT_ADDRESS_240": Change("node.c", "command->payload[0] > TEDS_LAST_ADDRESS", "command->payload[0] > 240"),
-    "FAULT_ADDRESS_AGAIN": Change("node.c", "node->address_written && now", "false && now"),
+    "FAULT_ADDRESS_AGAIN": Change("node.c", "if (now < node->address_again) {", "if (false) {"),
     # -- writing
     "FAULT_WRITE_KEEPS_REST": Change(
         "teds_store.c",
@@ -162,31 +178,31 @@ CHANGES: Final[dict[str, Change]] = {
         "    before = 0;\n",
     ),
     "FAULT_STAGING_FOR_EVER": Change(
-        "session.c", "    if (own->staged) {\n        teds_staging_drop(node);\n    }\n", ""
+        "session.c", "    if (node->staging_of == session) {\n        teds_staging_drop(node);\n    }\n", ""
     ),
     "FAULT_OWN_CHECK": Change("commit.c", "if (!teds_own_check((uint8_t)id, image, length)) {", "if (false) {"),
-    "FAULT_DIGEST_NOT_LOOKED_AT": Change(
-        "commit.c", "            memcmp(hash, block + 3, 32) != 0) {", "            false) {"
-    ),
+    "FAULT_DIGEST_NOT_LOOKED_AT": Change("commit.c", "|| memcmp(hash, block + 3, 32) != 0) {", ") {"),
     "FAULT_DATASHEET_LABEL_WITHOUT_00": Change("commit.c", '"TEDS1 datasheet", 16', '"TEDS1 datasheet", 15'),
     "FAULT_META_OF_ANOTHER": Change("commit.c", "if (!metas_good(node, teds)) {", "if (false) {"),
     "FAULT_OLD_SEQUENCE": Change(
-        "commit.c", "teds->sequence <= node->state.sequence || ahead > SEQUENCE_WINDOW", "false"
+        "commit.c", "sequence <= node->state.sequence || sequence - node->state.sequence > SEQUENCE_WINDOW", "false"
     ),
-    "FAULT_ANY_VALUES": Change(
-        "security_teds.c", "return length == 1 && value[0] == own_value(type);", "return length == 1;"
+    "FAULT_ANY_VALUES": Change("security_teds.c", "case 1: return value[0] == wanted[2];", "case 1: return true;"),
+    "FAULT_UTF8_NOT_CHECKED": Change(
+        "security_teds.c", "length <= wanted[1] && is_utf8(value, length)", "length <= wanted[1]"
     ),
-    "FAULT_UTF8_NOT_CHECKED": Change("security_teds.c", "length <= 64 && is_utf8(value, length)", "length <= 64"),
-    "FAULT_REFUSES_111": Change("security_teds.c", "default: return type > 110; /*", "default: return false; /*"),
+    "FAULT_REFUSES_111": Change("security_teds.c", "} else if (type <= 110) { /*", "} else { /*"),
     "FAULT_RESET_FORGETS_EPOCH": Change("commit.c", "    state.epoch = node->state.epoch;\n", ""),
     "FAULT_RESET_TAKES_TEDS": Change(
-        "commit.c", "    return id != TEDS_SECURITY_ID;", "    (void)id;\n    return false;"
+        "teds_store.c",
+        ": id == (int32_t)TEDS_SECURITY_ID && (state->flags & TEDS_PROVISIONED) == 0) {",
+        ": (state->flags & TEDS_KEYED) == 0) {",
     ),
     "FAULT_NODE_KEY_WITHOUT_UUID": Change(
-        "teds_store.c", '"TEDS1 node key", 15}, {node->uuid, 10}', '"TEDS1 node key", 15}, {node->uuid, 0}'
+        "teds_store.c", '"TEDS1 node key", 15}, {own->uuid, 10}', '"TEDS1 node key", 15}, {own->uuid, 0}'
     ),
     "FAULT_STALE_INITIAL": Change(
-        "security_teds.c", "teds_put32(number, node->state.epoch);", "teds_put32(number, 0);"
+        "security_teds.c", "teds_put32(at + 11, node->state.epoch);", "teds_put32(at + 11, 0);"
     ),
     "FAULT_LEASE_0": Change("operation.c", "if (lease < 1 || ", "if ("),
     # -- sessions, once more
@@ -197,7 +213,7 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_REPLY_COUNTER_LITTLE_ENDIAN": Change(
         "session.c", "teds_put32(payload, counter);", "memcpy(payload, &counter, 4);"
     ),
-    "FAULT_KEY_ID_LABEL_WITHOUT_00": Change("agree.c", 'LABEL("TEDS1 key id")', 'MAC_LABEL("TEDS1 key id")'),
+    "FAULT_KEY_ID_LABEL_WITHOUT_00": Change("session.c", 'LABEL("TEDS1 key id")', 'MAC_LABEL("TEDS1 key id")'),
     "FAULT_OPEN_MAC_LABEL_WITH_00": Change("session.c", 'MAC_LABEL("station open")', 'LABEL("station open")'),
     "FAULT_OPEN_TAG_LABEL_WITH_00": Change("session.c", 'MAC_LABEL("node open")', 'LABEL("node open")'),
     "FAULT_OPEN_MAC_COUNTER_LITTLE_ENDIAN": Change(
@@ -205,8 +221,9 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_OPEN_SALT_AND_IKM_SWAPPED": Change(
         "session.c",
-        "teds_hkdf(node, node->state.key, 16, z, 32, info, 4, okm, 96)",
-        "teds_hkdf(node, z, 32, node->state.key, 16, info, 4, okm, 96)",
+        "teds_hkdf(node, node->state.agreed.key, parts, 5, okm, 96)",
+        "hkdf_of(node, z, 32, node->state.agreed.key, 16, parts + 1, 4, okm, 96)",
+        HKDF,
     ),
     "FAULT_PADDING_ZEROS": Change(
         "session.c", "memset(payload + 4 + inner, (int)count, count);", "memset(payload + 4 + inner, 0, count);"
@@ -247,50 +264,52 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_Z_LITTLE_ENDIAN": Change(
         "agree.c",
-        "                 derive(node, z, out, script, out + 85) != 0;",
-        "                 (turned(z), turned(z + 32), derive(node, z, out, script, out + 85)) != 0;",
+        "teds_hkdf(node, nonce, parts, 3, okm, 48) != 0",
+        "(turned(z), turned(z + 32), teds_hkdf(node, nonce, parts, 3, okm, 48)) != 0",
         "static void turned(uint8_t *at)\n{\n    for (size_t i = 0; i < 16; i++) {\n        uint8_t low = at[i];\n"
         "        at[i] = at[31 - i];\n        at[31 - i] = low;\n    }\n}\n",
     ),
     "FAULT_M_OF_48_OCTETS": Change(
         "agree.c",
-        "    uint8_t okm[48], mac[32];\n    int failed = teds_hkdf(node, nonce, 16, z, 64, info, 2, okm, 48);\n"
-        "    if (!failed) {\n        failed = port->hmac(port->user, okm + 16, 32,",
-        "    uint8_t okm[64], mac[32];\n    int failed = teds_hkdf(node, nonce, 16, z, 64, info, 2, okm, 64);\n"
-        "    if (!failed) {\n        failed = port->hmac(port->user, okm + 16, 48,",
+        "    uint8_t okm[48];\n",
+        "    uint8_t okm[64];\n",
+        more=(
+            ("teds_hkdf(node, nonce, parts, 3, okm, 48)", "teds_hkdf(node, nonce, parts, 3, okm, 64)"),
+            ("okm + 16, 32, for_node", "okm + 16, 48, for_node"),
+        ),
     ),
     "FAULT_SIGN_WITHOUT_LABEL": Change(
         "agree.c", '{LABEL("TEDS1 agree"), {script, 32}}', "{{script, 0}, {script, 32}}"
     ),
     "FAULT_SIGN_WITH_ONE_TIME_KEY": Change(
         "agree.c",
-        "failed = teds_sign(node, hash, out + 101) != 0;",
-        "teds_node other = *node;\n        other.key = own->key;\n"
-        "        failed = teds_sign(&other, hash, out + 101) != 0;",
+        "failed = teds_sign(node, agreed, 2, out + 101) != 0;",
+        "teds_node other = *node;\n        other.identity.key = node->one_time.key;\n"
+        "        failed = teds_sign(&other, agreed, 2, out + 101) != 0;",
     ),
     "FAULT_SIGN_LITTLE_ENDIAN": Change(
         "agree.c",
-        "failed = teds_sign(node, hash, out + 101) != 0;",
-        "failed = teds_sign(node, hash, out + 101) != 0;\n        turned(out + 101);\n        turned(out + 133);",
+        "failed = teds_sign(node, agreed, 2, out + 101) != 0;",
+        "failed = teds_sign(node, agreed, 2, out + 101) != 0;\n        turned(out + 101);\n        turned(out + 133);",
         "static void turned(uint8_t *at)\n{\n    for (size_t i = 0; i < 16; i++) {\n        uint8_t low = at[i];\n"
         "        at[i] = at[31 - i];\n        at[31 - i] = low;\n    }\n}\n",
     ),
     "FAULT_SIGN_HIGH_S": Change(
         "agree.c",
-        "failed = teds_sign(node, hash, out + 101) != 0;",
-        "failed = teds_sign(node, hash, out + 101) != 0;\n        high(out + 133);",
+        "failed = teds_sign(node, agreed, 2, out + 101) != 0;",
+        "failed = teds_sign(node, agreed, 2, out + 101) != 0;\n        high(out + 133);",
         HIGH,
     ),
     "FAULT_PROVE_HIGH_S": Change(
         "node.c",
-        "    return teds_sign(node, hash, out) == 0 ? 64 : -TEDS_FAILURE;",
-        "    teds_sign(node, hash, out);\n    high(out + 32);\n    return 64;",
+        "    return teds_sign(node, parts, 3, out) == 0 ? 64 : -TEDS_FAILURE;",
+        "    teds_sign(node, parts, 3, out);\n    high(out + 32);\n    return 64;",
         HIGH,
     ),
     "FAULT_RESET_HIGH_S": Change(
         "node.c",
-        "    if (teds_sign(node, hash, out) != 0) {\n        return -TEDS_FAILURE;\n    }\n",
-        "    teds_sign(node, hash, out);\n    high(out + 32);\n",
+        "    if (teds_sign(node, parts, 4, out) != 0) {\n        return -TEDS_FAILURE;\n    }\n",
+        "    teds_sign(node, parts, 4, out);\n    high(out + 32);\n",
         HIGH,
     ),
     "FAULT_REPLY_WITH_TEDS": Change(
@@ -301,18 +320,18 @@ CHANGES: Final[dict[str, Change]] = {
         "    return failed ? -TEDS_FAILURE : 465;",
     ),
     "FAULT_K_ELSEWHERE": Change(
-        "agree.c", "memcpy(node->pending.key, okm, 16);", "memcpy(node->pending.key, okm + 16, 16);"
+        "agree.c", "memcpy(node->pending.agreed.key, okm, 16);", "memcpy(node->pending.agreed.key, okm + 16, 16);"
     ),
     "FAULT_SAME_ONE_TIME_KEY": Change(
         "agree.c",
-        "teds_one_time_take(node, own) != 0;",
-        "(kept.ready ? 0 : teds_one_time_take(node, &kept)) != 0;\n    *own = kept;",
+        "teds_one_time_make(node) != 0;",
+        "(kept.ready ? (node->one_time = kept, 0) : teds_one_time_make(node)) != 0;\n    kept = node->one_time;",
         "static teds_one_time kept;\n",
     ),
     "FAULT_SIGNATURE_BEFORE_POINTS": Change(
         "agree.c",
         "    if (!teds_point_good(node, station) || !teds_point_good(node, ca)",
-        "    teds_sha256_parts(node, certified, 2, hash);\n    if (!teds_verify(node, ca, hash, signature)) {\n"
+        "    if (!teds_certified(node, station, ca, signature)) {\n"
         "        return -TEDS_BAD_SIGNATURE;\n    }\n    if (!teds_point_good(node, station) || !teds_point_good(node, ca)",
     ),
     "FAULT_CONFIRM_FROM_ANY_LINK": Change(
@@ -338,17 +357,19 @@ CHANGES: Final[dict[str, Change]] = {
         "        return -TEDS_BAD_FORM;\n    }\n    refused = permitted(node, command, origin);\n",
     ),
     "FAULT_LONGER_THAN_MAX_MESSAGE": Change(
-        "node.c", "    if (length > TEDS_MAX_MESSAGE) {", "    if (length >= TEDS_MAX_MESSAGE) {"
+        "node.c", "length > TEDS_MAX_MESSAGE ? -TEDS_TOO_LARGE", "length >= TEDS_MAX_MESSAGE ? -TEDS_TOO_LARGE"
     ),
     "FAULT_PROVE_OTHER_KEY": Change(
         "node.c",
-        "    return teds_sign(node, hash, out) == 0 ? 64 : -TEDS_FAILURE;",
-        "    teds_node other = *node;\n    other.key.octets[20] ^= 1;\n    return teds_sign(&other, hash, out) == 0 ? 64 : -1;",
+        "    return teds_sign(node, parts, 3, out) == 0 ? 64 : -TEDS_FAILURE;",
+        "    teds_node other = *node;\n    other.identity.key.octets[20] ^= 1;\n    return teds_sign(&other, parts, 3, out) == 0 ? 64 : -1;",
     ),
     "FAULT_PROVE_NOT_HASHED": Change(
         "node.c",
-        "    return teds_sign(node, hash, out) == 0 ? 64 : -TEDS_FAILURE;",
-        "    return teds_sign(node, command->payload, out) == 0 ? 64 : -TEDS_FAILURE;",
+        "    return teds_sign(node, parts, 3, out) == 0 ? 64 : -TEDS_FAILURE;",
+        "    (void)parts;\n    node->port->p256_sign(node->port->user, &node->identity.key, command->payload, out);\n"
+        "    if (out[32] & 0x80) {\n        high(out + 32);\n    }\n    return 64;",
+        HIGH,
     ),
     "FAULT_LIST_TWICE": Change(
         "node.c",
@@ -356,14 +377,16 @@ CHANGES: Final[dict[str, Change]] = {
         "        length += 3;\n        if (length == 3) {\n            memcpy(out + 3, out, 3);\n            length = 6;\n        }\n",
     ),
     "FAULT_ABSENT_AVAILABLE": Change(
-        "teds_store.c", "(read_only ? 1u : 0u) | (there ? 0u : 2u)", "(read_only ? 1u : 0u)"
+        "teds_store.c", "(source.read_only ? 1u : 0u) | (there ? 0u : 2u)", "(source.read_only ? 1u : 0u)"
     ),
-    "FAULT_TEXT_ATTRIBUTE": Change("teds_store.c", "code >= 128 ? 0x40u :", "code >= 128 ? 0x50u :"),
+    "FAULT_TEXT_ATTRIBUTE": Change("teds_store.c", "code >= 128 ? 0x40 :", "code >= 128 ? 0x50 :"),
     "FAULT_TEDS_CHECKSUM": Change(
-        "security_teds.c", "teds_put16(at, teds_checksum(sum));", "teds_put16(at, teds_checksum(sum) ^ 1);"
+        "security_teds.c",
+        "teds_checksum(out, TEDS_INITIAL_OCTETS - 2));",
+        "teds_checksum(out, TEDS_INITIAL_OCTETS - 2) ^ 1);",
     ),
-    "FAULT_NOT_CANONICAL": Change("security_teds.c", "tuple(at, 109, &suite, 1)", "tuple(at, 110, &suite, 1)"),
-    "FAULT_OTHER_SUITE": Change("security_teds.c", "version = 1, suite = 2,", "version = 1, suite = 1,"),
+    "FAULT_NOT_CANONICAL": Change("security_teds.c", "109, 1, 2, 110, 1, 2};", "110, 1, 2, 110, 1, 2};"),
+    "FAULT_OTHER_SUITE": Change("security_teds.c", "109, 1, 2, 110, 1, 2};", "109, 1, 1, 110, 1, 2};"),
     "FAULT_READ_END_REFUSED": Change(
         "teds_store.c",
         "    offset = offset < source.length ? offset : source.length;\n",
@@ -372,8 +395,9 @@ CHANGES: Final[dict[str, Change]] = {
     # -- sessions and writing, once more
     "FAULT_OPEN_SAME_ONE_TIME_KEY": Change(
         "session.c",
-        "    failed = teds_one_time_take(node, &own) != 0;",
-        "    failed = (kept.ready ? 0 : teds_one_time_take(node, &kept)) != 0;\n    own = kept;",
+        "    failed = teds_one_time_make(node) != 0;",
+        "    failed = (kept.ready ? (node->one_time = kept, 0) : teds_one_time_make(node)) != 0;\n"
+        "    kept = node->one_time;",
         "static teds_one_time kept;\n",
     ),
     "FAULT_OPEN_ENDS_SESSION": Change(
@@ -393,16 +417,16 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_ONE_SESSION": Change(
         "session.c",
-        "    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {\n        if (!node->sessions[i].used) {",
-        "    for (int8_t i = 0; i < 1; i++) {\n        if (!node->sessions[i].used) {",
+        "each < node->sessions + TEDS_SESSIONS; each++) {\n        if (!each->used) {",
+        "each < node->sessions + 1; each++) {\n        if (!each->used) {",
     ),
     "FAULT_STRANGER_ENDS_SESSION": Change(
         "node.c",
-        "    outcome = cut(node, frame, length, &origin, &command);\n    if (",
-        "    outcome = cut(node, frame, length, &origin, &command);\n"
+        ": cut(node, frame, length, &origin, &command);\n    if (",
+        ": cut(node, frame, length, &origin, &command);\n"
         "    for (int8_t i = 0; !outcome && command.function == TEDS_IDENTIFY && i < TEDS_SESSIONS; i++) {\n"
-        "        if (command.command_class == TEDS_CLASS_SECURITY && teds_session_on(node, link) < 0) {\n"
-        "            teds_session_end(node, i);\n        }\n    }\n    if (",
+        "        if (command.command_class == TEDS_CLASS_SECURITY && teds_session_on(node, link) == NULL) {\n"
+        "            teds_session_end(node, &node->sessions[i]);\n        }\n    }\n    if (",
     ),
     "FAULT_ANY_SIZE": Change(
         "teds_store.c",
@@ -416,14 +440,14 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_EMPTY_WRITE": Change(
         "teds_store.c",
-        "    failed = stage(node, (uint16_t)id, offset, command->payload + 5, command->length - 5);\n",
+        "    failed = stage(node, (uint16_t)id, offset, command->payload + 5, octets);\n",
         "    failed = command->length == 5\n"
-        "                 ? 0 : stage(node, (uint16_t)id, offset, command->payload + 5, command->length - 5);\n",
+        "                 ? 0 : stage(node, (uint16_t)id, offset, command->payload + 5, octets);\n",
     ),
     "FAULT_REFUSED_COMMIT_COUNTS": Change(
         "commit.c",
         "    failed = check(node, &teds, image, length);\n    if (failed) {\n",
-        "    failed = check(node, &teds, image, length);\n    if (failed) {\n        node->state.sequence = teds.sequence;\n",
+        "    failed = check(node, &teds, image, length);\n    if (failed) {\n        node->state.sequence = teds.numbers[0];\n",
     ),
     "FAULT_DATASHEET_HIGH_S": Change("agree.c", "memcmp(signature + 32, HALF_ORDER, 32) > 0", "false"),
     "FAULT_BASE64_NOT_STRICT": Change(
@@ -433,9 +457,9 @@ CHANGES: Final[dict[str, Change]] = {
     "FAULT_IDENTITY_KEY_AGREES": Change(
         "agree.c",
         "port->p256_ecdh(port->user, &own->key, payload + 194, z) != 0 ||\n"
-        "                 port->p256_ecdh(port->user, &own->key, payload, z + 32)",
-        "port->p256_ecdh(port->user, &node->key, payload + 194, z) != 0 ||\n"
-        "                 port->p256_ecdh(port->user, &node->key, payload, z + 32)",
+        "                       port->p256_ecdh(port->user, &own->key, payload, z + 32)",
+        "port->p256_ecdh(port->user, &node->identity.key, payload + 194, z) != 0 ||\n"
+        "                 port->p256_ecdh(port->user, &node->identity.key, payload, z + 32)",
     ),
     "FAULT_TWO_SLIPS": Change(
         "agree.c",
@@ -453,32 +477,27 @@ CHANGES: Final[dict[str, Change]] = {
     ),
     "FAULT_FIRST_REQUEST_STAYS": Change(
         "agree.c",
-        "    teds_pending_forget(node);\n    length = answer(node, payload, &own, out);\n",
-        "    const teds_pending before = node->pending;\n    length = answer(node, payload, &own, out);\n"
+        "    teds_pending_forget(node);\n    length = answer(node, payload, out);\n",
+        "    const teds_pending before = node->pending;\n    length = answer(node, payload, out);\n"
         "    if (before.used) {\n        node->pending = before;\n        return length;\n    }\n",
     ),
     "FAULT_RESET_KEEPS_CA": Change(
         "agree.c",
-        "if (!teds_in_factory(node) && memcmp(ca, node->state.ca, 65) != 0) {",
+        "if (!teds_in_factory(node) && memcmp(ca, node->state.agreed.ca, 65) != 0) {",
         "if (kept[0] == 4 && memcmp(ca, kept, 65) != 0) {",
         "static uint8_t kept[65];\n",
         more=(
             (
-                "    state.flags |= TEDS_KEYED;\n    state.epoch = ",
-                "    memcpy(kept, state.ca, 65);\n    state.flags |= TEDS_KEYED;\n    state.epoch = ",
+                "    state.agreed = pending->agreed; /*",
+                "    state.agreed = pending->agreed;\n    memcpy(kept, state.agreed.ca, 65); /*",
             ),
         ),
     ),
     "FAULT_RESET_ANY_CHALLENGE": Change(
         "node.c",
-        "{command->payload, 32}};\n    uint8_t hash[32];\n    if (command->length != 32) {",
-        "{command->payload, 32}};\n    uint8_t hash[32];\n    if (false) {",
-        more=(
-            (
-                "{epoch, 4}, {command->payload, 32}};\n    if (command->length != 32) {",
-                "{epoch, 4}, {command->payload, 32}};\n    if (false) {",
-            ),
-        ),
+        "TEDS_PROVE, 32, prove}",
+        "TEDS_PROVE, ANY, prove}",
+        more=(("TEDS_RESET, 32, reset}", "TEDS_RESET, ANY, reset}"),),
     ),
     # -- frames, sessions and writing, to their end
     "FAULT_LIST_LONG": Change(
@@ -516,29 +535,23 @@ static bool opened(const uint8_t key[16], const uint8_t nonce[13], const uint8_t
     ),
     "FAULT_STAGING_PER_SESSION": Change(
         "teds_store.c",
-        "    if (other >= 0 && now < node->sessions[other].staged_at + STAGED_NS) {\n        return -TEDS_BUSY;\n    }\n",
+        "    if (elsewhere && now < node->staged_until) {\n        return -TEDS_BUSY;\n    }\n",
         "",
     ),
     "FAULT_DIGEST_OF_DATA_BLOCKS": Change(
         "commit.c",
-        "        const teds_part part = {image, length};\n",
-        "        const teds_part part = {image + 4, length - 6};\n",
-        more=(
-            (
-                "    return teds_find(node, id, &source) && teds_source_hash(node, &source, out) == 0 ? 0 : -1;",
-                "    uint8_t stored[4096];\n"
-                "    if (!teds_find(node, id, &source) || teds_source_read(node, &source, 0, stored, source.length) != 0) {\n"
-                "        return -1;\n    }\n"
-                "    const teds_part of_stored = {stored + 4, source.length - 6};\n"
-                "    teds_sha256_parts(node, &of_stored, 1, out);\n    return 0;",
-            ),
-        ),
+        "teds_source_hash(node, &source, hash)",
+        "hash_of_block(node, &source, hash)",
+        "static int hash_of_block(const teds_node *node, const teds_source *source, uint8_t out[32])\n{\n"
+        "    uint8_t whole[16384];\n    const teds_part part = {whole + 4, source->length - 6};\n"
+        "    if (teds_source_read(node, source, 0, whole, source->length) != 0) {\n        return -1;\n    }\n"
+        "    teds_sha256_parts(node, &part, 1, out);\n    return 0;\n}\n",
     ),
     "FAULT_111_NOT_COVERED": Change(
         "commit.c",
-        "    teds_base64(node->point, 65, own);\n",
+        "    return !teds->others",
         "    for (size_t at = 6; at < length; at += 2u + block[at + 1]) {\n        if (block[at] > 110) {\n"
-        "            return true;\n        }\n    }\n    teds_base64(node->point, 65, own);\n",
+        "            return true;\n        }\n    }\n    return !teds->others",
     ),
 }
 
@@ -552,7 +565,7 @@ ON_THE_BUS: Final[dict[str, Change]] = {
     ),
     "FAULT_BUSY_SILENT": Change(
         "can.c",
-        "        refuse(line, frame->data[head], TEDS_BUSY, frame->fd);\n        return;\n",
+        "        reason = TEDS_BUSY;\n",
         "        return;\n",
     ),
     "FAULT_ADDRESS_TOO_SOON": Change(
@@ -564,7 +577,7 @@ ON_THE_BUS: Final[dict[str, Change]] = {
     "FAULT_ADDRESS_STAYS": Change(
         "can.c",
         "    if (own != node->can.address) {\n",
-        "    if (own != node->can.address && own != teds_default_address(node->uuid)) {\n",
+        "    if (own != node->can.address && own != teds_default_address(node)) {\n",
         more=(("    switch (frame->data[0] >> 4) {\n", "    line->own = own;\n    switch (frame->data[0] >> 4) {\n"),),
     ),
 }

@@ -29,7 +29,7 @@ def test_the_c_tests_find_nothing_wrong() -> None:
         env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1"},
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    for name in ("isotp", "reader", "vectors"):
+    for name in ("isotp", "small", "reader", "vectors"):
         assert f"{name}: " in done.stdout
     assert " 0 wrong" in done.stdout
 

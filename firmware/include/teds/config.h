@@ -21,7 +21,8 @@
 #define TEDS_SESSIONS 2
 #endif
 
-/* Stored replies. One for each session and one for everyone else, so that a stranger's question meets room. */
+/* Stored replies: one for each session and one for everyone else, so that a stranger's question meets room. A board on
+ * CAN alone may save that one (TEDS_REPLIES=TEDS_SESSIONS): while every place is a session's, further stations get 17. */
 #ifndef TEDS_REPLIES
 #define TEDS_REPLIES (TEDS_SESSIONS + 1)
 #endif
@@ -108,8 +109,11 @@
 #if TEDS_MAX_NDEF < 160 || TEDS_MAX_NDEF > 32000
 #error "TEDS_MAX_NDEF is 160 to 32000"
 #endif
-#if TEDS_SESSIONS < 2 || TEDS_REPLIES <= TEDS_SESSIONS || TEDS_REPLIES > 127
-#error "two sessions at least, and a stored reply more than sessions, at most 127"
+#if TEDS_SESSIONS < 2 || TEDS_SESSIONS > 127 || TEDS_REPLIES > 127
+#error "two sessions at least; sessions and stored replies at most 127"
+#endif
+#if TEDS_REPLIES < TEDS_SESSIONS || (TEDS_REPLIES == TEDS_SESSIONS && (TEDS_NFC || TEDS_BLE))
+#error "a stored reply more than sessions, on CAN alone at least as many"
 #endif
 #if TEDS_STAGING < 512 || TEDS_STAGING > 60000
 #error "TEDS_STAGING is 512 to 60000"

@@ -64,11 +64,23 @@ typedef struct teds_can_frame {
 
 /* -- the inside; stands here so that a board can own it. Nothing outside src/ looks into it. ------------------------ */
 
+/* As it lies in the identity area; octets alone, so without gaps. */
+typedef struct teds_identity {
+    uint8_t uuid[10];
+    teds_key_ref key;
+    uint8_t point[65], signature[64]; /* signature: field 102 */
+} teds_identity;
+
+/* What an agreement makes, as it lies in a slot: link key, station, CA. */
+typedef struct teds_agreed {
+    uint8_t key[16], station[65], ca[65];
+} teds_agreed;
+
 typedef struct teds_state {
     uint8_t flags; /* 1 keyed, 2 provisioned */
     uint8_t address;
     uint32_t epoch, sequence;
-    uint8_t key[16], station[65], ca[65];
+    teds_agreed agreed;
 } teds_state;
 
 typedef struct teds_keys {
@@ -76,11 +88,11 @@ typedef struct teds_keys {
 } teds_keys;
 
 typedef struct teds_session {
-    bool used, staged;
+    bool used;
     teds_link link;
     uint8_t kind;
     uint32_t counter;
-    uint64_t good_at, staged_at;
+    uint64_t good_at;
     teds_keys keys;
 #if TEDS_OPERATION
     uint32_t claims;      /* bits by place in the port's channel table */
@@ -107,16 +119,16 @@ typedef struct teds_session {
 typedef struct teds_half_open {
     bool used;
     teds_link link;
-    uint64_t at;
+    uint64_t until;
     teds_keys keys;
 } teds_half_open;
 
 typedef struct teds_stored_reply {
+    uint64_t at;
+    uint16_t length;
     bool used, stored;
     teds_link link;
     uint8_t digest[32];
-    uint64_t at;
-    uint16_t length;
     uint8_t octets[1 + TEDS_MAX_MESSAGE]; /* transaction, reply */
 } teds_stored_reply;
 
@@ -129,17 +141,18 @@ typedef struct teds_one_time {
 typedef struct teds_pending {
     bool used;
     teds_link link;
-    int8_t session; /* its place in the table, -1: outside */
-    uint64_t at;
+    teds_session *session; /* NULL: outside */
+    uint64_t until;
     uint32_t epoch;
-    uint8_t key[16], tag[16], station[65], ca[65];
+    teds_agreed agreed;
+    uint8_t tag[16];
 } teds_pending;
 
 #if TEDS_OPERATION
 #define TEDS_MESSAGE 240
 typedef struct teds_stream {
     bool used, ready, waits, full, ended, late;
-    int8_t session;
+    teds_session *session;
     uint8_t number, kind, n, count, octets, pattern, flags, full_flags;
     bool fd, ble;
     uint8_t channels[16]; /* places in the port's table */
@@ -167,59 +180,57 @@ typedef struct teds_events {
 } teds_events;
 #endif
 
+/* One station. Small members first, here and in teds_can: an offset that fits into an instruction costs nothing. */
 typedef struct teds_line {
-    bool used, fd;
-    uint8_t source, own;
-    uint64_t touched;
-    /* what is being sent */
-    const uint8_t *out;
-    uint16_t out_length, out_at;
-    uint8_t out_state, out_number, out_block, out_waits;
-    uint32_t out_gap;      /* ns between consecutive frames */
-    uint64_t out_due;      /* next frame, or when a flow control is given up */
-    int8_t out_reply;      /* the stored reply that it is, -1: everyone's */
-    uint8_t flow;          /* a flow control is due: its first octet, 0: none */
-    uint8_t single[6];     /* a refusal as a single frame: length, transaction, 00 00 01 reason; length 0: none */
-    bool asked;            /* a functional Identify waits for its time */
+    uint8_t source; /* 0: not used */
+    uint8_t own;
+    bool fd;
+    uint8_t flow;                    /* a flow control is due: its first octet, 0: none */
+    uint8_t refuses, refused;        /* a refusal as a single frame: its reason, 0: none; of which transaction */
+    bool asked, asked_fd;            /* a functional Identify waits for its time */
     uint8_t asked_transaction;
-    bool asked_fd;
+    /* what is being sent */
+    uint8_t out_state, out_number, out_block, out_waits;
+    uint16_t out_length, out_at;
+    uint32_t out_gap;             /* ns between consecutive frames */
+    const uint8_t *out;
+    teds_stored_reply *out_reply; /* NULL: it is everyone's */
+    uint32_t touched;             /* the later the greater */
+    uint64_t out_due;             /* next frame, or when a flow control is given up */
     uint64_t asked_due;
     uint8_t everyone[27];
 } teds_line;
 
 typedef struct teds_can {
-    bool announces;
-    uint8_t bus_offs; /* in a row */
     uint8_t address, moves_to; /* moves_to: where 128.10 leads once its reply has left; 0: nowhere */
     teds_link moves_link;
-    uint64_t announce_due, back_at; /* back_at: after bus-off it is silent until then */
-    uint32_t announced[20];
+    bool announces;
+    uint8_t bus_offs; /* in a row */
     uint8_t announced_at;
-    uint8_t heard[30];
     /* the one long request that may be coming in */
-    int8_t rx_line;
     uint8_t rx_number, rx_block, rx_frame; /* rx_frame: octets of its first frame, and so of all but the last */
     uint16_t rx_length, rx_at;
+    teds_line *rx_line;
     uint64_t rx_until;
+    uint64_t announce_due, back_at; /* back_at: after bus-off it is silent until then */
+    uint32_t touches;
 #if TEDS_OPERATION
     /* the one data message that is being sent */
-    int8_t data_stream;
-    uint8_t data_segment;
-    uint16_t data_at, data_length;
+    teds_stream *data_stream;
     uint64_t data_free_at;
-#endif
-    teds_line lines[TEDS_CAN_LINES];
-    uint8_t rx[1 + TEDS_MAX_MESSAGE];
-#if TEDS_OPERATION
+    uint16_t data_at, data_length;
+    uint8_t data_segment;
     uint8_t data[TEDS_MESSAGE];
 #endif
+    uint8_t heard[30];
+    uint32_t announced[20];
 } teds_can;
 
 #if TEDS_NFC
 typedef struct teds_nfc {
     bool selected, shows_initial, collects, answered;
     uint8_t stage, opened, file_open;
-    int8_t reply; /* the stored reply that is read in pieces */
+    teds_stored_reply *reply; /* it is read in pieces */
     uint16_t transaction, total, held, answered_transaction, length, came;
     uint64_t tick, busy_until; /* busy_until: its reader has something to read, or will ask on */
     uint8_t shown[23]; /* the Identify that the initial message holds */
@@ -231,7 +242,7 @@ typedef struct teds_nfc {
 #if TEDS_BLE
 typedef struct teds_ble_line {
     bool used, holds, sends, hears;
-    int8_t reply;
+    teds_stored_reply *reply;
     uint16_t mtu, transaction, total, held, sent_transaction, at;
     uint64_t silent_since;
     uint8_t request[TEDS_MAX_MESSAGE];
@@ -253,19 +264,19 @@ typedef struct teds_node {
     const teds_config *config;
     uint8_t slot; /* the one that counts */
     bool free_slot_dirty, old_slot_due;
-    bool address_written, stranger_seen;
+    teds_session *staging_of; /* NULL: nobody's */
     uint16_t staging_end;
-    uint32_t slot_counter, records_at, records_end;
+    uint32_t slot_counter, records_end;
     uint64_t opens; /* c */
-    uint64_t address_written_at, stranger_at;
+    uint64_t staged_until; /* then another session may take the staging */
+    uint64_t address_again, strangers_again; /* from then on: a write of the address, a plain Read or List beside streams */
 #if TEDS_OPERATION
     uint32_t safe, stopped; /* bits by place */
     uint64_t missed;
 #endif
+    teds_can can;
     teds_state state;
-    uint8_t uuid[10];
-    uint8_t point[65], signature[64]; /* field 102 */
-    teds_key_ref key;
+    teds_identity identity;
     teds_pending pending;
     teds_one_time one_time;
     teds_session sessions[TEDS_SESSIONS];
@@ -273,13 +284,14 @@ typedef struct teds_node {
 #if TEDS_OPERATION
     uint64_t deadline[TEDS_CHANNELS];
     uint16_t dead_man[TEDS_CHANNELS];
-    int8_t actuator_of[TEDS_CHANNELS]; /* session that claims an actuator */
+    teds_session *actuator_of[TEDS_CHANNELS]; /* which claims an actuator; NULL: none */
 #endif
-    teds_can can;
 #if TEDS_OPERATION
     teds_stream streams[TEDS_STREAMS];
     teds_events events[TEDS_EVENT_CHANNELS];
 #endif
+    teds_line lines[TEDS_CAN_LINES];
+    uint8_t rx[1 + TEDS_MAX_MESSAGE];
     teds_stored_reply replies[TEDS_REPLIES];
 #if TEDS_NFC
     teds_nfc nfc;

@@ -269,7 +269,7 @@ static void say_ready(const teds_node *node, const teds_port *port, const option
     teds_sha256 state;
     teds_node_identify(node, identity);
     port->sha256_start(port->user, &state);
-    port->sha256_update(port->user, &state, node->point, 65);
+    port->sha256_update(port->user, &state, node->identity.point, 65);
     port->sha256_finish(port->user, &state, hash);
     (void)printf("{\"uuid\": \"");
     print_hex(identity + 1, 10);

@@ -193,8 +193,8 @@ static void a_long_length_that_is_short_is_nobodys(void)
         for (int number = 1; number < 600; number++) {
             frame[0] = (char)(0x20 | (number & 15));
             in(board, TO_NODE, frame, octets, fd);
-            CHECK(board->node.can.rx_at <= sizeof board->node.can.rx, "%u octets held", board->node.can.rx_at);
-            if (board->node.can.rx_at > sizeof board->node.can.rx) {
+            CHECK(board->node.can.rx_at <= sizeof board->node.rx, "%u octets held", board->node.can.rx_at);
+            if (board->node.can.rx_at > sizeof board->node.rx) {
                 break;
             }
         }
@@ -241,8 +241,8 @@ static void a_repetition_while_the_reply_is_under_way_gets_it_again(void)
     for (int i = 0; i < TEDS_REPLIES; i++) {
         if (board->node.replies[i].stored) {
             board->node.replies[i].octets[4] = 0x63; /* so that it shows whether it was run again */
-            board->node.can.lines[0].out_state = TEDS_OUT_FIRST; /* as if it were still leaving */
-            board->node.can.lines[0].out_reply = (int8_t)i;
+            board->node.lines[0].out_state = TEDS_OUT_FIRST; /* as if it were still leaving */
+            board->node.lines[0].out_reply = &board->node.replies[i];
         }
     }
     in(board, TO_NODE, "\x07\x05\x00\x00\x80\x03\x00\x00", 8, false);

@@ -172,8 +172,8 @@ static bool streams_hold(const teds_node *node)
 {
     for (size_t i = 0; i < TEDS_STREAMS; i++) {
         const teds_stream *each = &node->streams[i];
-        if (each->used && (each->fill > sizeof each->filling || each->length > TEDS_MESSAGE || each->session < 0 ||
-                           !node->sessions[each->session].used)) {
+        if (each->used && (each->fill > sizeof each->filling || each->length > TEDS_MESSAGE || each->session == NULL ||
+                           !each->session->used)) {
             return false;
         }
     }
@@ -183,20 +183,21 @@ static bool streams_hold(const teds_node *node)
             return false;
         }
     }
-    return node->can.data_stream < TEDS_STREAMS && node->can.data_at <= node->can.data_length &&
+    return (node->can.data_stream == NULL || node->can.data_stream->used) && node->can.data_at <= node->can.data_length &&
            node->can.data_length <= sizeof node->can.data;
 }
 
 static bool lines_hold(const teds_node *node)
 {
     for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
-        const teds_line *each = &node->can.lines[i];
-        if (each->used && (each->out_at > each->out_length || each->out_reply >= TEDS_REPLIES)) {
+        const teds_line *each = &node->lines[i];
+        if (each->source != 0 && (each->out_at > each->out_length ||
+                           (each->out_reply != NULL && each->out != each->out_reply->octets && each->out_state != 0))) {
             return false;
         }
     }
-    return node->can.rx_line < 0 ||
-           (node->can.rx_at < node->can.rx_length && node->can.rx_length <= sizeof node->can.rx);
+    return node->can.rx_line == NULL ||
+           (node->can.rx_at < node->can.rx_length && node->can.rx_length <= sizeof node->rx);
 }
 
 static void holds_together(const memory_board *board)

@@ -421,7 +421,7 @@ bool memory_streams(const memory_board *board)
 
 void memory_set_run(memory_board *board, uint8_t link, uint16_t run)
 {
-    board->node.sessions[teds_session_on(&board->node, link)].run = run;
+    teds_session_on(&board->node, link)->run = run;
 }
 
 void memory_set_counter(memory_board *board, uint32_t counter, uint64_t start)
@@ -505,17 +505,11 @@ void memory_reply_left(memory_board *board, uint8_t link)
     teds_node_reply_left(&board->node, link);
 }
 
-static bool keep_none(const void *what, uint16_t id)
-{
-    (void)what;
-    (void)id;
-    return false;
-}
-
 int memory_put(memory_board *board, uint8_t flags, uint8_t address, uint32_t epoch, uint32_t sequence,
                const uint8_t key[16], const uint8_t station[65], const uint8_t ca[65], const uint8_t *teds,
                size_t length)
 {
+    const teds_signed none = {.block_count = 0};
     teds_state state = {0};
     int failed;
     if (length > TEDS_STAGING) {
@@ -525,12 +519,12 @@ int memory_put(memory_board *board, uint8_t flags, uint8_t address, uint32_t epo
     state.address = address;
     state.epoch = epoch;
     state.sequence = sequence;
-    memcpy(state.key, key, 16);
-    memcpy(state.station, station, 65);
-    memcpy(state.ca, ca, 65);
+    memcpy(state.agreed.key, key, 16);
+    memcpy(state.agreed.station, station, 65);
+    memcpy(state.agreed.ca, ca, 65);
     memcpy(board->node.staging, teds, length);
     board->node.staging_end = (uint16_t)length;
-    failed = teds_store_write(&board->node, &state, keep_none, NULL, true);
+    failed = teds_store_write(&board->node, &state, &none);
     board->node.staging_end = 0;
     return failed ? failed : memory_start(board);
 }
@@ -711,8 +705,8 @@ bool memory_ble_drops(memory_board *board, uint8_t connection)
     return teds_ble_drops(&board->node, connection);
 }
 
-bool memory_in_session(const memory_board *board, uint8_t link)
+bool memory_in_session(memory_board *board, uint8_t link)
 {
-    return teds_session_on(&board->node, link) >= 0;
+    return teds_session_on(&board->node, link) != NULL;
 }
 #endif

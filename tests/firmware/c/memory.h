@@ -119,7 +119,7 @@ size_t memory_ble_data(memory_board *board, uint8_t *connection, uint8_t out[TED
 void memory_ble_driven(memory_board *board, uint8_t connection, const uint8_t *value, size_t length);
 bool memory_ble_advertises(const memory_board *board);
 bool memory_ble_drops(memory_board *board, uint8_t connection);
-bool memory_in_session(const memory_board *board, uint8_t link);
+bool memory_in_session(memory_board *board, uint8_t link);
 #endif
 
 #endif

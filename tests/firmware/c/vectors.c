@@ -28,6 +28,8 @@ static void take(uint8_t *out, size_t room, teds_octets octets)
     }
 }
 
+static const teds_node nobody; /* its key and signature are in no entry, which only the commit asks */
+
 static void canonical(void)
 {
     const struct teds_canonical *file = &teds_vectors_canonical;
@@ -35,7 +37,7 @@ static void canonical(void)
     for (size_t i = 0; i < file->entries_count; i++) {
         const struct teds_canonical_entries *entry = &file->entries[i];
         bool good = teds_own_check(128, entry->teds.octets, entry->teds.length) &&
-                    teds_security_parse(entry->teds.octets + 4, entry->teds.length - 6, &found);
+                    teds_security_parse(&nobody, entry->teds.octets + 4, entry->teds.length - 6, &found);
         CHECK(good == (entry->reason != 4), "canonical %s", entry->name);
     }
 }
