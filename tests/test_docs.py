@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 import pytest
 
+from teds_provision.store.schema import SCHEMA_VERSION
 from tests.cli.test_help import chain
 
 ROOT = Path(__file__).parent.parent
@@ -96,3 +97,8 @@ def test_a_broken_link_and_a_wrong_option_would_be_found(tmp_path: Path) -> None
     assert "measure-what-comes" in anchors(ROOT / "docs" / "ncap.md")
     assert anchor("What `make demo` prints") == "what-make-demo-prints"
     assert page in PAGES
+
+
+def test_the_store_page_and_the_changelog_name_the_schema_of_today() -> None:
+    assert f"## Tables (schema {SCHEMA_VERSION})" in (ROOT / "docs" / "store.md").read_text(encoding="utf-8")
+    assert f"The store now has schema {SCHEMA_VERSION}." in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
