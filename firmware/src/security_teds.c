@@ -23,7 +23,7 @@ bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length)
     return teds[5] == 5 && length >= 13 && teds[8] == code;
 }
 
-static const char SIXTY_FOUR[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+static const char SIXTY_FOUR[64] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 
 static void base64(const uint8_t *octets, size_t length, uint8_t *out)
 {
@@ -40,7 +40,7 @@ static void base64(const uint8_t *octets, size_t length, uint8_t *out)
 
 static int six_bits(uint8_t letter)
 {
-    const char *at = memchr(SIXTY_FOUR, letter, 64);
+    const char *at = memchr(SIXTY_FOUR, letter, sizeof SIXTY_FOUR);
     return at != NULL ? (int)(at - SIXTY_FOUR) : -1;
 }
 

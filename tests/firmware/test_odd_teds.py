@@ -47,7 +47,8 @@ def canonical_in_c(block: bytes) -> bool:
     """The same by ``teds_security_parse``."""
     library = ctypes.CDLL(str(builds.library()))
     library.teds_security_parse.restype = ctypes.c_bool
-    return bool(library.teds_security_parse(block, ctypes.c_size_t(len(block)), ctypes.create_string_buffer(1024)))
+    nobody, found = ctypes.create_string_buffer(65536), ctypes.create_string_buffer(1024)  # whose key is asked later
+    return bool(library.teds_security_parse(nobody, block, ctypes.c_size_t(len(block)), found))
 
 
 def good_block(**changes: object) -> bytes:
