@@ -30,7 +30,7 @@ from teds_provision.protocol.operation.commands import (
 )
 from teds_provision.station.station import Station
 from teds_provision.steps.read import list_blocks, read_block
-from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.conversation import Conversation, SessionLost, is_busy
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import ChannelKind
@@ -236,9 +236,23 @@ def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = No
     """Ask a node, in its session, whether each channel bears the datasheet ``image``, and its sensors for one reading.
 
     ``shown`` are the units in which people see the values of channels, where the profile names one. Nothing stays
-    claimed. Sensors that another session claims are left alone. Raises WrongBoard with the channel that
-    does not bear it, LinkFailure.
+    claimed. Sensors that another session claims are left alone. A session that the node lost meanwhile (who measures
+    it opened another one, its bus was cut) is opened anew, once. Raises WrongBoard with the channel that does not bear
+    it, NodeRefused, LinkFailure.
     """
+    try:
+        return _borne(node, image, shown)
+    except SessionLost as lost:
+        if is_busy(lost.cause):
+            raise lost.cause from lost
+    node.reopen()
+    try:
+        return _borne(node, image, shown)
+    except SessionLost as lost:
+        raise lost.cause from lost
+
+
+def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) -> Borne:
     described = Sheet.of(Image(image.uuid, image.unsigned_blocks()))  # what the Security TEDS says is judged already
     sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
     found = {one.number: _bears(node, one, digest) for one in sheet.channels}

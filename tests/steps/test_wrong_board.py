@@ -189,6 +189,37 @@ def test_reason_6_and_23_of_operate_have_words_of_their_own(
         assert borne.channels == {1: True}
 
 
+def test_a_session_that_the_node_lost_before_the_check_is_opened_anew(
+    station: Station, angle: VirtualNode, tmp_path: Path
+) -> None:
+    """Another one may be opened from this station's address at any time; exit 1, a bug, was the end of that."""
+    given(station, on_reader(angle), order(tmp_path, ANGLE))
+    with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
+        require_session(station, node)
+        image = read_image(node)
+        angle.lost("nfc")
+        assert bears(node, image).channels == {1: True}
+
+
+def test_a_node_that_keeps_no_session_is_told_and_is_no_bug(
+    station: Station, angle: VirtualNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given(station, on_reader(angle), order(tmp_path, ANGLE))
+    with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
+        require_session(station, node)
+        image = read_image(node)
+        opens = node.open
+
+        def lost_at_once(key: bytes) -> None:
+            opens(key)
+            angle.lost("nfc")
+
+        monkeypatch.setattr(node, "open", lost_at_once)
+        angle.lost("nfc")
+        with pytest.raises(NodeRefused, match="reason 2"):
+            bears(node, image)
+
+
 # -- sheets ----------------------------------------------------------------------------------------------------------
 
 
