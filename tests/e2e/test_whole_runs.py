@@ -252,4 +252,4 @@ def test_a_draft_renames_nobody_until_it_is_written(station: Station, desk: Desk
         station.ask("sign", one.uuid)
     station.ask("write", node.uuid, *links)
     assert named() == "index"
-    assert "has the name 'index' already" in station.refuses("write", other.uuid, *links, code=6)["message"]
+    assert "already has the name 'index'" in station.refuses("write", other.uuid, *links, code=6)["message"]

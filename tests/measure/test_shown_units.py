@@ -59,7 +59,7 @@ def test_limits_are_told_in_the_unit_that_was_given(hall: Hall) -> None:
     for unit, words in (("mm", "0 to 110 mm"), ("m", "0 to 0.11 m"), ("cm", "0 to 11 cm")):
         said = hall.ask("set", "g", "1", "5000", "--unit", unit, "--hold", "0.1", code=6)
         assert words in said["error"]["message"]
-        assert f"5000 {unit} is beyond" in said["error"]["message"]
+        assert f"5000 {unit} exceeds the limits" in said["error"]["message"]
 
 
 def test_a_bare_number_of_a_person_is_refused_where_another_unit_is_shown(hall: Hall) -> None:

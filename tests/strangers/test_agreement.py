@@ -76,7 +76,7 @@ WHAT: dict[str, tuple[type[TedsProvisionError], str, int]] = {
     "En is E": (NotAuthentic, POINT, 1),
     "En off the curve": (NotAuthentic, POINT, 1),
     "the same epoch again": (PolicyRefused, "offers key epoch 0", 1),
-    "the epoch little-endian": (NotAuthentic, "offered key epoch 16777216 and says 1", 1),
+    "the epoch little-endian": (NotAuthentic, "offered key epoch 16777216 but reports 1", 1),
     "a reply without its last octet": (Garbled, "164 octets, not 165", 1),
     "the reply to the Request before": (NotAuthentic, TAG, 2),
     "the TEDS changes with every Read": (NotAuthentic, TAG, 2),

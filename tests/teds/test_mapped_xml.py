@@ -44,7 +44,11 @@ def test_the_examples_become_types_with_limits_in_their_units(
         (XML, 'channel = "x"', "no element 'x'"),
         (XML, 'channel = "c"\n[channels]\n', "unknown key 'channels'"),
         (XML, 'channel = "c"\n[channel-keys]\nname = "m"\n', "nothing at 'm'"),
-        (XML, 'channel = "c"\n[channel-keys]\nlow-limit = { at = "n", unit = "N" }\n', "'force' at 'n' is no number"),
+        (
+            XML,
+            'channel = "c"\n[channel-keys]\nlow-limit = { at = "n", unit = "N" }\n',
+            "'force' at 'n' is not a number",
+        ),
         (XML, 'channel = "c"\n[channel-keys]\nnumber = "n"\n', "'force' is no channel number"),
         (XML, 'channel = "c["\n', "is no path"),
         (XML, 'channel = "c"\n[channel-keys]\nname = 3\n', "name is no place"),

@@ -236,11 +236,11 @@ class Provisioning:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
         require_authentic(done.verified)
-        run.state = "done"
         self._roster.show_sheet(uuid, None)
         with suppress(TedsProvisionError):
             self._roster.refresh([uuid])
         self._roster.note(uuid, "verified", verdict=run.verdict, heard=None, looked=time.time(), problem=None)
+        run.state = "done"  # last: who hears it asks for the node next
         self._tell(run)
 
     def _fail(self, run: Run, error: dict[str, str]) -> None:

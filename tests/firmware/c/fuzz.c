@@ -403,7 +403,7 @@ static void measures(memory_board *own, const uint8_t *octets, size_t length, bo
         case 5:
             failing = count > 0 ? copy[0] : 0;
             memory_fails(own, (failing & FLASH) != 0);
-            memory_read_fails(own, failing >> 5);
+            memory_read_fails(own, (long)(failing >> 5));
             break;
         case 6: memory_ble_written(own, 0, copy, count); break;
         case 7: (what & 8 ? memory_ble_driven : memory_ble_written)(own, what >> 4 & 3, copy, count); break;

@@ -29,6 +29,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
         made.close()
 
 
+@pytest.mark.realtime  # a value that comes more than 0.1 s late is in the recording, and in no row of the grid
 def test_two_nodes_are_one_grid_which_pandas_reads(hall: Hall, tmp_path: Path) -> None:
     grid, whole = tmp_path / "run.csv", tmp_path / "run.mcap"
     uuids = [node.uuid for node in hall.nodes.values()]
