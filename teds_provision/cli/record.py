@@ -190,10 +190,11 @@ def convert(app: App, source: Path, target: Path, wide: bool) -> None:
     """
     done = measure_room.recordings.converting.convert(source, target, wide=wide)
     result = done.summary.to_json(done.recording)
+    what = f"ends at {result['until']}" if result["until"] is not None else "holds no values"
     if result["being_written"]:
-        app.warn(f"{source} is still being written: the result ends at {result['until']}.")
+        app.warn(f"{source} is still being written: the result {what}.")
     elif not result["complete"]:
-        app.warn(f"{source} was cut off: the result ends at {result['until']}.")
+        app.warn(f"{source} was cut off: the result {what}.")
     files = [str(path) for path in done.files]
     app.emit(
         {"files": files, **result},

@@ -181,3 +181,14 @@ def fill_with(sink: Sink, facts: list[ChannelFacts], items: list[Any]) -> None:
             sink.write(item)
     sink.close()
     assert sink.stats.error == ""
+
+
+def test_a_recording_that_was_cut_off_before_its_first_value_says_that_it_holds_none(tmp_path: Path) -> None:
+    path, part = tmp_path / "run.csv", tmp_path / "part.csv"
+    fill_with(open_sink(str(path)), [ANGLE], [block(index=0)])
+    head, columns, rows = path.read_bytes().partition(b"\ntime,")
+    names, end, rows = rows.partition(b"\n")
+    part.write_bytes(head + columns + names + end + rows[:5])
+    done = call(tmp_path / "home", "record", "convert", str(part), str(tmp_path / "made.jsonl"))
+    assert done.code == 0
+    assert "was cut off: the result holds no values." in done.err
