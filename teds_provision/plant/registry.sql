@@ -1,4 +1,4 @@
--- registry/1. A post office: it carries signed pages and sealed parcels and decides nothing. `registry sql` prints this, with :registry filled in,
+-- registry/2. A post office: it carries signed pages and sealed parcels and decides nothing. `registry sql` prints this, with :registry filled in,
 -- as one transaction; it may be run again at any time (after a pg_restore it must be). Run it as a superuser in a database of its own: a mere owner gets
 -- warnings, and the last revokes do not take (measured). What members may call belongs to teds_owner, who is no superuser and cannot log in.
 begin;
@@ -14,8 +14,8 @@ grant execute on function pg_catalog.pg_notify(text, text) to teds_owner;
 set local role teds_owner;
 grant usage on schema registry to teds_member, teds_reader;
 create table if not exists registry.meta (one bool primary key default true check (one), version int not null, registry uuid not null);
-insert into registry.meta(version, registry) values (1, :'registry') on conflict do nothing;
-do $$ begin if (select version from registry.meta) <> 1 then raise exception 'this is schema %, not 1', (select version from registry.meta); end if; end $$;
+insert into registry.meta(version, registry) values (2, :'registry') on conflict do nothing;
+do $$ begin if (select version from registry.meta) > 2 then raise exception 'this is schema %, newer than 2', (select version from registry.meta); end if; end $$;
 create table if not exists registry.member (role name primary key, station bytea not null unique check (length(station) = 32), open boolean not null default true,
   n int not null default 0, hash bytea not null default '\x', at timestamptz);
 -- the newest roster that each member knows: nobody can take a version's place, and one that was rolled back is put back by whoever has it
@@ -25,6 +25,13 @@ create table if not exists registry.page (station bytea not null references regi
   jws text not null check (octet_length(jws) between 100 and 1048576), received timestamptz not null default now(), primary key (station, n));
 create table if not exists registry.parcel (id uuid primary key, recipient bytea not null references registry.member(station), sender bytea not null,
   document bytea not null check (octet_length(document) <= 67108864), expires timestamptz not null, received timestamptz not null default now());
+-- since schema 2: pages of stations that are no open member (removed, or their row was lost), handed in by members (`by`). One row for each who hands in,
+-- so that a page with a forged signature (the same H) keeps nobody's page out. `handed` counts them: a member's limit, and what is new at one look.
+create table if not exists registry.found (author bytea not null check (length(author) = 32), n int not null check (n > 0), hash bytea not null,
+  jws text not null check (octet_length(jws) between 100 and 1048576), by bytea not null, received timestamptz not null default now(), primary key (author, by, n, hash));
+create table if not exists registry.handed (author bytea not null, by bytea not null, pages int not null, octets bigint not null, at timestamptz not null,
+  primary key (by, author));
+update registry.meta set version = 2 where version = 1;
 create index if not exists parcel_to on registry.parcel (recipient);
 create index if not exists parcel_from on registry.parcel (sender);
 create or replace function registry.me() returns bytea language sql stable security definer set search_path = pg_catalog, pg_temp
@@ -43,6 +50,24 @@ declare m registry.member; h bytea := sha256(convert_to(left(page, length(page) 
   update registry.member set n = wanted, at = now(), hash = h where role = session_user;
   perform pg_notify('teds', encode(m.station, 'hex') || ' ' || wanted);
   return wanted; end $$;
+create or replace function registry.restore(fingerprint bytea, number int, page text) returns boolean language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
+declare who bytea; h bytea := sha256(convert_to(left(page, length(page) - position('.' in reverse(page))), 'UTF8')); kept bigint; begin
+  if current_setting('transaction_isolation') <> 'read committed' then raise exception 'isolation' using errcode = 'TE005'; end if;
+  select m.station into who from registry.member m where m.role = session_user and m.open for update; -- one at a time: the limit is exact
+  if not found then raise exception 'not a member' using errcode = 'TE001'; end if;
+  if exists (select from registry.member m where m.station = fingerprint and m.open) then
+    raise exception 'its author is an open member and appends its own pages' using errcode = 'TE006'; end if;
+  if exists (select from registry.page p where p.station = fingerprint and p.n = number and p.jws = page)
+    or exists (select from registry.found f where f.author = fingerprint and f.n = number and f.hash = h and f.jws = page)
+    or exists (select from registry.found f where f.author = fingerprint and f.by = who and f.n = number and f.hash = h) then return false; end if;
+  select coalesce(sum(x.octets), 0) into kept from registry.handed x where x.by = who;
+  if kept + greatest(octet_length(page), 1024) > 67108864 then raise exception 'this member has handed in 64 MiB' using errcode = 'TE004'; end if;
+  insert into registry.found(author, n, hash, jws, by) values (fingerprint, number, h, page, who);
+  insert into registry.handed as x (author, by, pages, octets, at) values (fingerprint, who, 1, greatest(octet_length(page), 1024), clock_timestamp())
+    on conflict (by, author) do update set pages = x.pages + 1, octets = x.octets + greatest(octet_length(page), 1024), at = clock_timestamp();
+  if (select x.pages from registry.handed x where x.by = who and x.author = fingerprint) = 1 then
+    perform pg_notify('teds', encode(fingerprint, 'hex') || ' ' || number); end if; -- the first wakes; the others are seen by the look each 60 s
+  return true; end $$;
 create or replace function registry.post_roster(number int, document text) returns void language plpgsql security definer set search_path = pg_catalog, pg_temp as $$
 declare who bytea := registry.me(); begin
   if who is null then raise exception 'not a member' using errcode = 'TE001'; end if;
@@ -65,10 +90,10 @@ create policy mine on registry.parcel for select using ((select registry.me()) i
 create policy gone on registry.parcel for delete using ((select registry.me()) in (recipient, sender));
 revoke all on all tables in schema registry from public, teds_member, teds_reader;
 revoke all on all functions in schema registry from public;
-grant execute on function registry.append(int, bytea, text), registry.post_roster(int, text), registry.send(uuid, bytea, bytea, timestamptz), registry.me() to teds_member;
-grant select on registry.page, registry.member, registry.roster, registry.meta, registry.parcel to teds_member;
+grant execute on function registry.append(int, bytea, text), registry.restore(bytea, int, text), registry.post_roster(int, text), registry.send(uuid, bytea, bytea, timestamptz), registry.me() to teds_member;
+grant select on registry.page, registry.member, registry.roster, registry.meta, registry.parcel, registry.found, registry.handed to teds_member;
 grant delete on registry.parcel to teds_member;
-grant select on registry.page, registry.member, registry.roster, registry.meta to teds_reader;
+grant select on registry.page, registry.member, registry.roster, registry.meta, registry.found, registry.handed to teds_reader;
 reset role;
 -- what every login may do by default and a thief would like
 revoke execute on function pg_catalog.lo_create(oid), pg_catalog.lo_creat(integer), pg_catalog.lo_from_bytea(oid, bytea), pg_catalog.lowrite(integer, bytea), pg_catalog.lo_put(oid, bigint, bytea), pg_catalog.lo_truncate(integer, integer), pg_catalog.lo_truncate64(integer, bigint) from public;

@@ -15,7 +15,7 @@ from uuid import UUID
 from teds_provision.errors import BadData
 from teds_provision.plant.scram import is_verifier
 
-VERSION: Final = 1
+VERSION: Final = 2
 """The newest schema that this program knows; it refuses newer ones."""
 CONNECTIONS: Final = 4
 _FINGERPRINT = re.compile(r"[0-9a-f]{64}")

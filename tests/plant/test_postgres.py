@@ -198,8 +198,8 @@ def test_a_closed_station_is_told_that_it_is_no_member(post: Registry, login: Lo
 def test_a_database_without_schema_and_one_of_a_newer_version_are_told(cluster: Cluster, login: Login) -> None:
     database = Database.new(cluster)
     newer = registry(database.member())
-    database.sql("update registry.meta set version = 2")
-    with pytest.raises(StoreFailure, match="schema 2"):
+    database.sql("update registry.meta set version = 3")
+    with pytest.raises(StoreFailure, match="schema 3"):
         newer.look()
     database.sql("drop schema registry cascade")
     with pytest.raises(StoreFailure, match="does not contain a registry"):
