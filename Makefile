@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults model house man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-coverage firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -163,6 +163,10 @@ test-other:
 # The figures of the house: circles, late imports, modules, helpers used once, shared names, complexity, lines.
 house: $(VENV)/.dev
 	$(BIN)/python scripts/house.py
+
+# How far docstrings and names are from the field's language, beside other codebases: a mirror, not a gate.
+words: $(VENV)/.dev
+	$(BIN)/python scripts/words.py
 
 # The tests of a room and of the rooms that import it: make room ROOM=store
 room: $(VENV)/.dev

@@ -100,6 +100,25 @@ def test_the_ways_through_the_code_are_as_the_page_says() -> None:
     ]
 
 
+def missing_in_the_glossary(text: str) -> list[str]:
+    """Return the files that the page names and that are neither in the package nor beside it."""
+    places = (PACKAGE, ROOT / "docs")
+    return [
+        name
+        for name in re.findall(r"`((?:\.\./)*[a-z_0-9/]+(?:\.py|/))`", text)
+        if not any((p / name).exists() for p in places)
+    ]
+
+
+def test_the_glossary_names_files_that_exist_and_defines_each_word_once() -> None:
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    assert missing_in_the_glossary(text) == []
+    assert missing_in_the_glossary("`steps/verify.py` `steps/verifi.py` `../tests/strangers/`") == ["steps/verifi.py"]
+    for section in text.split("\n## ")[1:]:
+        words = [line.split("|")[1].strip() for line in section.splitlines() if line.startswith("| ")]
+        assert sorted(set(words)) == sorted(words), section.splitlines()[0]
+
+
 def unknown_roles(path: Path, text: str, every: set[str]) -> list[str]:
     """References such as :func:`name` to what neither the file knows nor, with a dot, the package."""
     known = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)} | defined(path)
