@@ -118,7 +118,7 @@ class Bench:
         """Measure so many nodes; they are switched on while the measurement waits for them."""
         uuids = tuple(self.nodes)[:count]
         file = self.folder / f"run-{count}-{time.monotonic_ns()}.csv"
-        kept = KeptMeasurement("", uuids=uuids, rate=RATE, sinks=(str(file),), lasting=False)
+        kept = KeptMeasurement("", uuids=uuids, rate=RATE, sinks=(str(file),), owner="command")
         job = MeasurementJob(self.station, kept, request=MeasurementRequest(timeout=60.0))
         came: list[tuple[int, Block]] = []
         stop, port = threading.Event(), CanPort(self.can)

@@ -178,6 +178,13 @@ class Group(TypedDict):
     measuring: bool
 
 
+class Process(TypedDict):
+    """The process of a command."""
+
+    id: int
+    started: Annotated[int, Meta(description="unix seconds")]
+
+
 class Measurement(TypedDict):
     """A measurement, kept until it is deleted."""
 
@@ -194,6 +201,9 @@ class Measurement(TypedDict):
     actuators: Annotated[bool, Meta(description="whether set points arrive by topics")]
     dead_man: NotRequired[Annotated[int, Meta(description="ms after which an actuator without set points is safe")]]
     created: NotRequired[str]
+    scalar_rate: Annotated[float, Meta(description="messages/s on a topic of one value")]
+    owner: Annotated[str, Meta(description="ncap, page, api:TOKEN, or command: a measure command of this home")]
+    process: Annotated[Process | None, Meta(description="of a command; it ends with its process")]
     state: Literal["starting", "waiting", "running", "failed", "ended"]
     why: str
     nodes: list[Report]

@@ -23,6 +23,7 @@ from teds_provision.errors import BadData, UsageFailure
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings, ble, can
 from teds_provision.store import KeptMeasurement
+from teds_provision.store.records import COMMAND
 
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view
@@ -147,7 +148,7 @@ def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Map
         dead_man=wished["dead_man"],
         scalar_rate=wished["scalar_rate"],
         sinks=tuple(measure_room.running.measurement_job.whole_path(spec) for spec in sinks),
-        lasting=False,
+        owner=COMMAND,
         test_pattern=wished["test_pattern"],
         unsigned=wished["unsigned"],
         require=wished["require"],
@@ -184,8 +185,8 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
 
 def _carried_on(app: App, station: Station, asked: KeptMeasurement) -> KeptMeasurement:
     """What is kept of the group, where nothing else was asked for; else what was asked for."""
-    kept = station.measurements.of_group(asked.group or "")
-    plain = replace(KeptMeasurement("", group=asked.group, lasting=False), created=asked.created)
+    kept = station.measurements.settings_to_continue(asked.group or "")
+    plain = replace(KeptMeasurement("", group=asked.group, owner=COMMAND), created=asked.created)
     if kept is None or asked != plain:
         return asked
     rate = f"{kept.rate:g} Hz" if kept.rate else "the datasheets' rates"

@@ -278,7 +278,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
     for one in found.get("measurements", ()):
         what = f" of {one['match']}" if one.get("match") else ""
         why = f": {one['why']}" if one["why"] else ""
-        console.print(f"measurement {one['id']}{what}: {one['state']}{why}", markup=False)
+        owner = "" if one["owner"] == "ncap" else f" ({one['owner']})"
+        console.print(f"measurement {one['id']}{what}{owner}: {one['state']}{why}", markup=False)
         for node in one["nodes"] if what else ():
             why = f": {node['why']}" if node["why"] else ""
             console.print(f"  {node['uuid']} {node['state']}{why}", markup=False)

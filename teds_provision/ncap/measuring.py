@@ -46,6 +46,7 @@ from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 
 _ADOPTED: Final = "adopted"
+NCAP: Final = "ncap"
 LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; whoever asks waits 5
 ANSWERING: Final = 1.0  # seconds for a node that has another address now
 LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
@@ -194,8 +195,9 @@ class Measuring:
         actuators: bool = True,
         dead_man: int | None = None,
         scalar_rate: float = SCALAR_RATE,
+        owner: str = NCAP,
     ) -> dict[str, Any]:
-        """Measure from now on, after every restart too, until it is deleted.
+        """Measure from now on, after every restart too, until it is deleted; ``owner`` is who asked for it.
 
         Raises UsageFailure (no node, a sink that cannot be named so), NotFound (the group), NodeBusy (one of the nodes
         is measured already).
@@ -224,6 +226,7 @@ class Measuring:
             frozen=frozen,
             dead_man=self._dead_man if dead_man is None else dead_man,
             scalar_rate=scalar_rate,
+            owner=owner,
         )
         # What can never be measured is refused before it is kept: it would be tried for ever, after each restart too.
         nodes = self._station.measurements.nodes_of(kept)
@@ -268,11 +271,18 @@ class Measuring:
             period_of(channel, kept.rate)
 
     def delete(self, measurement_id: str) -> None:
-        """End it, and forget it; raises NotFound."""
+        """End it, and forget it; raises NotFound, PolicyRefused for one that a command of this home runs."""
         with self._guard:
             one = self._running.pop(measurement_id, None)
-        if one is None and self._station.measurements.all() == []:
-            raise NotFound(f"No measurement has the ID {measurement_id!r}.")
+        if one is None:
+            kept = next((other for other in self._station.measurements.all() if other.id == measurement_id), None)
+            if kept is None:
+                raise NotFound(f"No measurement has the ID {measurement_id!r}.")
+            if not kept.lasting:
+                raise PolicyRefused(
+                    f"Measurement {measurement_id} belongs to the command measure (process {kept.pid}).",
+                    hint="End it there with Ctrl-C.",
+                )
         if one is not None:
             one.stop.set()
             self._end(one)
@@ -283,10 +293,20 @@ class Measuring:
         self._live.event("measurement", state="deleted", id=measurement_id)
 
     def all(self) -> list[dict[str, Any]]:
-        """Every one."""
+        """Return every one: those that run here, then those that commands of this home run."""
         with self._guard:
             every = list(self._running.values())
-        return [self._json(one) for one in every]
+        return [*(self._json(one) for one in every), *(self._json(one) for one in self._of_commands())]
+
+    def _of_commands(self) -> list[Running]:
+        """Return those of commands that live, to be shown; the nodes of one whose group is gone are not known."""
+        found = []
+        for kept in self._station.measurements.of_commands():
+            with suppress(NotFound):
+                uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
+                why = f"measured by the command measure (process {kept.pid})"
+                found.append(Running(kept, uuids, state="running", why=why))
+        return found
 
     def of(self, uuid: str) -> str | None:
         """The measurement that has a node."""
@@ -427,11 +447,14 @@ class Measuring:
             "actuators": self._sinks.moves(kept),
             "dead_man": kept.dead_man,
             "created": kept.created,
+            "scalar_rate": kept.scalar_rate,
+            "owner": kept.owner,
+            "process": None if kept.pid is None else {"id": kept.pid, "started": kept.started},
             "state": one.state,
             "why": one.why,
             "nodes": [
                 one.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""})
-                for uuid in dict.fromkeys((*one.uuids, *left))
+                for uuid in (dict.fromkeys((*one.uuids, *left)) if kept.lasting else ())
             ],
             "files": [str(file) for sink in (one.job.sinks if one.job is not None else ()) for file in sink.files],
         }

@@ -1,25 +1,27 @@
 """What this station measures (operation.md section 7), how it detects nodes, and the names under which it publishes.
 
-A measurement is kept from before its first session until it is deleted (``lasting``), or until it ends in order. So
-after ``kill -9``, power loss or a restart it is still there, and is carried on: by ``measure GROUP`` (the same
-command, without options) or by ``ncap run``. A topic's name may be changed as long as nobody measures its node.
+Each kept measurement has an owner. One of ``ncap``, the page or a token of the API is kept until it is deleted, and
+``ncap run`` carries it on after ``kill -9``, power loss or a restart. One of a ``measure`` command is kept while that
+command lives, which a lock shows: the next reader removes the row of a dead one. Only ``measure GROUP`` without options
+takes over its settings, as a measurement of its own. A topic's name may be changed while its node is not measured.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import secrets
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from teds_provision.errors import Frozen, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import Frozen, NotFound, PolicyRefused, StoreFailure, UsageFailure
 from teds_provision.station.groups import Groups
 from teds_provision.store import Store
-from teds_provision.store.lock import Mark, MarkTaken
-from teds_provision.store.records import DetectionMode, KeptMeasurement
+from teds_provision.store.lock import Mark, MarkTaken, OwnerLock
+from teds_provision.store.records import COMMAND, DetectionMode, KeptMeasurement
 
 FOLDER = "measuring"  # of the home: who measures what now
 
@@ -34,12 +36,24 @@ class Measurements:
         self._store, self._groups, self._home = store, groups, home
 
     def all(self) -> list[KeptMeasurement]:
-        """Every one that is kept, oldest first."""
-        return self._store.measurements()
+        """Return every one that is kept, oldest first; removes those of dead commands."""
+        kept = self._store.measurements()
+        dead = {one.id for one in kept if self._is_of_dead_command(one)}
+        with suppress(StoreFailure):  # a full disk hides no list; the next reader tries again
+            for measurement_id in dead:
+                self._store.remove_measurement(measurement_id)
+        return [one for one in kept if one.id not in dead]
 
     def due(self) -> list[KeptMeasurement]:
-        """Those to carry on now: kept, not past their end."""
-        return [one for one in self.all() if one.ends is None or one.ends > time.time()]
+        """Return those that ``ncap`` measures now: its own, the page's and the API's that are not past their end."""
+        return [one for one in self.all() if one.lasting and not _is_past(one)]
+
+    def of_commands(self) -> list[KeptMeasurement]:
+        """Return those of commands that live."""
+        return [one for one in self.all() if not one.lasting]
+
+    def _is_of_dead_command(self, measurement: KeptMeasurement) -> bool:
+        return not measurement.lasting and not OwnerLock(self._home, measurement.id).is_taken
 
     def get(self, measurement_id: str) -> KeptMeasurement:
         """One of them; raises NotFound."""
@@ -51,9 +65,14 @@ class Measurements:
             )
         return found
 
-    def of_group(self, group: str) -> KeptMeasurement | None:
-        """The one of a group that was cut off, or lasts: what `measure GROUP` carries on; None where there is none."""
-        return next((one for one in reversed(self.due()) if one.group == group), None)
+    def settings_to_continue(self, group: str) -> KeptMeasurement | None:
+        """Return what `measure GROUP` continues: the settings of one that was cut off, or that lasts, as a command's.
+
+        None if there is none. The row itself stays its owner's; that of a dead command goes with the next :meth:`all`.
+        """
+        kept = [one for one in self._store.measurements() if one.group == group and not _is_past(one)]
+        found = next((one for one in reversed(kept) if one.lasting or self._is_of_dead_command(one)), None)
+        return None if found is None else replace(found, id="", owner=COMMAND, pid=None, started=None)
 
     def nodes_of(self, measurement: KeptMeasurement) -> tuple[bytes, ...]:
         """UUIDs of its nodes, 10 octets each; raises NotFound where its group is gone."""
@@ -67,13 +86,20 @@ class Measurements:
         self._store.put_measurement(kept)
         return kept
 
-    def begin(self, measurement: KeptMeasurement) -> KeptMeasurement:
-        """Keep one that begins now; what was cut off before of the same group is not carried on any more."""
-        with self._store.transaction():
-            for one in self.all():
-                if one.group == measurement.group and not one.lasting and one.id != measurement.id:
-                    self.forget(one.id)
-            return self.keep(measurement)
+    @contextmanager
+    def owned_by_command(self, measurement: KeptMeasurement) -> Iterator[KeptMeasurement]:
+        """Keep a measurement of this process while the block runs, with its process ID and start.
+
+        Its lock is taken before the row exists and released after the row is gone, so a row without a taken lock is
+        always that of a dead command. Raises NotFound (its group).
+        """
+        owned = replace(measurement, id=secrets.token_hex(8), owner=COMMAND, pid=os.getpid(), started=_process_start())
+        with OwnerLock(self._home, owned.id):
+            self.all()  # whatever a dead command left goes now
+            try:
+                yield self.keep(owned)
+            finally:  # only a process that dies leaves it to the next reader
+                self.forget(owned.id)
 
     def forget(self, measurement_id: str) -> bool:
         """Measure it no more after the next start; False where it is not there. Ends nothing that runs."""
@@ -171,3 +197,17 @@ class Measurements:
                     hint="Choose another name.",
                 )
         self._store.put_topic_name(uuid, channel, name)
+
+
+def _is_past(measurement: KeptMeasurement) -> bool:
+    return measurement.ends is not None and measurement.ends <= time.time()
+
+
+def _process_start() -> int:
+    """Return when this process started (unix seconds); now, if the system does not report it."""
+    try:
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        booted = next(row for row in Path("/proc/stat").read_text().splitlines() if row.startswith("btime "))
+        return int(booted.split()[1]) + ticks // os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, LookupError, StopIteration):
+        return int(time.time())

@@ -28,6 +28,7 @@ from teds_provision.store.records import utc_now
 
 FILE_NAME = "store.lock"
 TURNS_NAME = "store.turns"
+OWNERS_NAME = "store.owners"
 _TURN_SECONDS = 60.0
 _FIRST_POLL_SECONDS = 0.001
 _LAST_QUIET_POLL_SECONDS = 0.004
@@ -225,24 +226,24 @@ def _holder(descriptor: int) -> str:
         return "another process"
 
 
-class NodeTurn(_HeldFile):
-    """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
+class _LockedOctet(_HeldFile):
+    """One octet of a file, at a place that ``key`` names (two keys may share one).
 
-    One octet of a file is locked, at a place that the UUID names (two nodes may share one: then they take turns, no
-    more). Waits up to a minute; raises NodeBusy after that, StoreFailure where the file cannot be made.
+    A lock of the open file, not of the process, so threads exclude each other too; a child that executes another
+    program does not inherit it.
     """
 
-    def __init__(self, home: Path, uuid: bytes, *, notice: Callable[[str], object] | None = None) -> None:
-        super().__init__(_beside(home, TURNS_NAME))
-        self._uuid, self._notice = uuid, notice
+    def __init__(self, path: Path, key: bytes) -> None:
+        super().__init__(path)
+        self._key = key
 
     @property
     def is_taken(self) -> bool:
-        """Whether somebody works on the node now; nothing is taken, and nobody waits."""
+        """True if the octet is locked now; takes nothing and waits for nothing."""
         try:
             descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
         except OSError:
-            return False  # nobody has ever worked on a node of this store
+            return False  # no octet of this file was ever locked
         try:
             said = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, self._lock_struct())
         except OSError:
@@ -252,22 +253,34 @@ class NodeTurn(_HeldFile):
         return bool(struct.unpack_from("h", said)[0] != fcntl.F_UNLCK)
 
     def _lock_struct(self) -> bytes:
-        place = int.from_bytes(hashlib.sha256(self._uuid).digest()[:6], "big")
+        place = int.from_bytes(hashlib.sha256(self._key).digest()[:6], "big")
         return struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)  # struct flock
 
+    def _try_to_lock(self, descriptor: int) -> bool:
+        """Lock the octet; False if another open file has it locked."""
+        try:
+            fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, self._lock_struct())
+        except (BlockingIOError, PermissionError):
+            return False
+        except OSError as error:
+            raise as_store_failure(error, self._path) from error
+        return True
+
+
+class NodeTurn(_LockedOctet):
+    """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
+
+    Two nodes may share an octet: then they take turns, no more. Waits up to a minute; raises NodeBusy after that,
+    StoreFailure where the file cannot be made.
+    """
+
+    def __init__(self, home: Path, uuid: bytes, *, notice: Callable[[str], object] | None = None) -> None:
+        super().__init__(_beside(home, TURNS_NAME), uuid)
+        self._uuid, self._notice = uuid, notice
+
     def _acquire(self, descriptor: int) -> None:
-        asked = self._lock_struct()
         until, told = time.monotonic() + _TURN_SECONDS, False
-        while True:
-            try:
-                # a lock of this open file, not of the process: threads take turns too
-                fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, asked)
-            except (BlockingIOError, PermissionError):
-                pass
-            except OSError as error:
-                raise as_store_failure(error, self._path) from error
-            else:
-                return
+        while not self._try_to_lock(descriptor):
             if time.monotonic() >= until:
                 raise NodeBusy(
                     f"Another command of this station is using node {self._uuid.hex()}.",
@@ -277,3 +290,18 @@ class NodeTurn(_HeldFile):
                 self._notice(f"Waiting: another command is using node {self._uuid.hex()}.")
                 told = True
             time.sleep(_POLL_SECONDS)
+
+
+class OwnerLock(_LockedOctet):
+    """``with OwnerLock(home, measurement_id):`` the command that owns a measurement lives.
+
+    The kernel releases it when the command ends, also by kill -9, whichever process gets its process ID afterwards.
+    Raises StoreLocked if another command owns a measurement of this ID.
+    """
+
+    def __init__(self, home: Path, measurement_id: str) -> None:
+        super().__init__(_beside(home, OWNERS_NAME), measurement_id.encode())
+
+    def _acquire(self, descriptor: int) -> None:
+        if not self._try_to_lock(descriptor):
+            raise StoreLocked("Another command owns this measurement.", hint="Wait for it to finish, or stop it.")

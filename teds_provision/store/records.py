@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from teds_provision.teds.image import Image
 
@@ -247,14 +247,19 @@ class Group:
     created: str = field(default_factory=utc_now)
 
 
+COMMAND: Final = "command"
+"""Owner of a measurement that a ``measure`` command runs."""
+
+
 @dataclass(frozen=True)
 class KeptMeasurement:
     """What the station measures after every start (operation.md section 7): a group, or nodes by UUID.
 
     ``channels`` empty: every sensor. ``rate`` in Hz, None for what the datasheets say; ``kind`` None: as each channel
     is. ``sinks`` are the strings that name files and topics; ``actuators`` says whether set points may come by them,
-    with a ``dead_man`` in ms. ``scalar_rate`` in Hz is that of topics of one value. One that is ``lasting`` is kept
-    until it is deleted, any other until it ends in order. ``ends`` is when (unix seconds), None for never.
+    with a ``dead_man`` in ms. ``scalar_rate`` in Hz is that of topics of one value.
+    ``owner`` is ``ncap``, ``page``, ``api:TOKEN`` or :data:`COMMAND`; of a command ``pid`` is the process ID and
+    ``started`` the start of that process (unix seconds). ``ends`` is when (unix seconds), None for never.
     ``test_pattern`` and ``unsigned`` as the options of ``measure``; ``require`` is the text of its ``--require`` file,
     "" for none.
     ``match`` is the expression of which nodes are taken in as they come (measure/matching.py), None for none;
@@ -272,7 +277,7 @@ class KeptMeasurement:
     dead_man: int = 1000
     scalar_rate: float = 10.0
     sinks: tuple[str, ...] = ()
-    lasting: bool = True
+    owner: str = "ncap"
     ends: float | None = None
     created: str = field(default_factory=utc_now)
     test_pattern: bool = False
@@ -280,6 +285,13 @@ class KeptMeasurement:
     require: str = ""
     match: str | None = None
     frozen: bool = False
+    pid: int | None = None
+    started: int | None = None
+
+    @property
+    def lasting(self) -> bool:
+        """True if it is kept until it is deleted; a command's ends with the command."""
+        return self.owner != COMMAND
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 12
+SCHEMA_VERSION: Final = 13
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
@@ -249,6 +249,29 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         """CREATE TABLE frames(
         uuid BLOB NOT NULL CHECK(length(uuid) = 10), channel INTEGER NOT NULL CHECK(channel BETWEEN 0 AND 255),
         frame TEXT NOT NULL CHECK(frame <> ''), PRIMARY KEY(uuid, channel)) STRICT, WITHOUT ROWID""",
+    ),
+    # the owner of each measurement, from which follows whether it lasts; an earlier one that did not was a command's
+    13: (
+        "ALTER TABLE measurements RENAME TO measurements_before",
+        """CREATE TABLE measurements(
+        id TEXT PRIMARY KEY CHECK(id <> ''), group_name TEXT REFERENCES groups(name) ON DELETE CASCADE,
+        uuids TEXT NOT NULL, channels TEXT NOT NULL, rate REAL CHECK(rate > 0),
+        kind TEXT CHECK(kind IN ('periodic', 'event', 'free')), trigger INTEGER NOT NULL CHECK(trigger IN (0, 1)),
+        actuators INTEGER NOT NULL CHECK(actuators IN (0, 1)),
+        dead_man INTEGER NOT NULL CHECK(dead_man BETWEEN 20 AND 10000),
+        scalar_rate REAL NOT NULL CHECK(scalar_rate BETWEEN 0 AND 1000), sinks TEXT NOT NULL,
+        owner TEXT NOT NULL CHECK(owner IN ('ncap', 'command', 'page') OR owner GLOB 'api:?*'),
+        ends REAL, created TEXT NOT NULL,
+        test_pattern INTEGER NOT NULL DEFAULT 0 CHECK(test_pattern IN (0, 1)),
+        unsigned INTEGER NOT NULL DEFAULT 0 CHECK(unsigned IN (0, 1)), require TEXT NOT NULL DEFAULT '',
+        match TEXT CHECK(match <> ''), frozen INTEGER NOT NULL DEFAULT 0 CHECK(frozen IN (0, 1)),
+        pid INTEGER, started INTEGER,
+        CHECK(owner = 'command' OR (pid IS NULL AND started IS NULL)),
+        CHECK((group_name IS NOT NULL) + (uuids <> '[]') + (match IS NOT NULL) = 1)) STRICT, WITHOUT ROWID""",
+        """INSERT INTO measurements SELECT id, group_name, uuids, channels, rate, kind, trigger, actuators, dead_man,
+        scalar_rate, sinks, CASE lasting WHEN 1 THEN 'ncap' ELSE 'command' END, ends, created, test_pattern, unsigned,
+        require, match, frozen, NULL, NULL FROM measurements_before""",
+        "DROP TABLE measurements_before",
     ),
 }
 

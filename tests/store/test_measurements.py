@@ -51,8 +51,8 @@ def test_a_measurement_names_a_group_or_nodes(store: Store, wrong: KeptMeasureme
 def test_a_measurement_comes_back_as_it_was_kept(store: Store) -> None:
     wanted = KeptMeasurement(
         "m3", uuids=(ONE,), channels=(1, 4), kind=None, trigger=True, actuators=True, dead_man=200,
-        scalar_rate=0.5, sinks=("/r/run.csv", "ros1"), lasting=False, ends=1.5e9, test_pattern=True,
-        unsigned=True, require="[angle]\n",
+        scalar_rate=0.5, sinks=("/r/run.csv", "ros1"), owner="command", pid=4711, started=1_700_000_000,
+        ends=1.5e9, test_pattern=True, unsigned=True, require="[angle]\n",
     )  # fmt: skip
     store.put_measurement(wanted)
     assert store.measurement("m3") == wanted

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreFailure
+from teds_provision.station.groups import Groups
+from teds_provision.station.measurements import Measurements
 from teds_provision.store import Store
 from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
 from tests.bench import make_station
@@ -49,6 +51,36 @@ def tables(path: Path) -> dict[str, list[tuple[object, ...]]]:
         found = {name: connection.execute(f"PRAGMA table_info({name})").fetchall() for (name,) in names}
         rest = connection.execute("SELECT name, sql FROM sqlite_schema WHERE type <> 'table' ORDER BY name").fetchall()
         return {**found, "": rest}
+
+
+def test_a_measurement_of_an_earlier_schema_gets_an_owner(tmp_path: Path) -> None:
+    """What lasted was begun by the service; what ended with its command is that of a command which has ended."""
+    home = tmp_path / "home"
+    home.mkdir(mode=0o700)
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection:
+        for statement in statements(0, 12):
+            connection.execute(statement)
+        connection.execute("INSERT INTO meta VALUES('id', 'ab')")
+        connection.execute("INSERT INTO groups VALUES('arm', '2026-01-01T00:00:00Z')")
+        for name, lasting in (("kept", 1), ("cut", 0)):
+            columns = (
+                "id, group_name, uuids, channels, trigger, actuators, dead_man, scalar_rate, sinks, lasting, created"
+            )
+            values = (name, "arm", "[]", "[2]", 1, 0, 500, 5.0, '["ros2"]', lasting, "2026-01-01T00:00:00Z")
+            marks = ", ".join("?" * len(values))
+            connection.execute(f"INSERT INTO measurements({columns}) VALUES({marks})", values)
+        connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
+        connection.execute("PRAGMA user_version=12")
+        connection.commit()
+    with closing(Store.open(home)) as store:
+        kept = {one.id: one for one in store.measurements()}
+        measurements = Measurements(store, Groups(store, home, None), home)  # type: ignore[arg-type]
+        continued = measurements.settings_to_continue("arm")
+        assert [one.id for one in measurements.all()] == ["kept"], "the next reader removes that of a dead command"
+    assert {name: one.owner for name, one in kept.items()} == {"kept": "ncap", "cut": "command"}
+    assert (kept["kept"].channels, kept["kept"].sinks, kept["kept"].lasting) == ((2,), ("ros2",), True)
+    assert continued is not None
+    assert (continued.owner, continued.id, continued.channels) == ("command", "", (2,))
 
 
 @pytest.mark.parametrize("version", range(OLDEST_SCHEMA, SCHEMA_VERSION))

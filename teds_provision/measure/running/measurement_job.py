@@ -2,15 +2,16 @@
 
 The way of `measure` and of `ncap run` alike:
 
-* ``station.measurements.keep(KeptMeasurement(...))`` says what is measured; ``due()`` what is to be carried on after a
-  start, ``of_group(NAME)`` what `measure NAME` carries on; ``forget(ID)`` deletes.
+* ``station.measurements.keep(KeptMeasurement(...))`` keeps what ``ncap`` measures; ``due()`` is what it carries on
+  after a start, ``settings_to_continue(NAME)`` what `measure NAME` continues; ``forget(ID)`` deletes.
 * ``Buses(ports)`` hears the buses of the process, once for all measurements.
 * ``MeasurementJob(station, kept)`` makes its sinks; ``run(buses, stop)`` measures on this thread until ``stop`` is set,
   or ``start(buses)`` and ``stop()`` on a thread of its own, again and again after an error. While it runs, its nodes
   and its group are held: ``station.measurements.is_running(uuid)``, PolicyRefused (6) for whoever wants them too.
 * ``job.measurement.session(uuid)`` is the session of a node that is measured, for one more command in between.
 
-What is kept is deleted when a measurement that is not ``lasting`` ends in order; after ``kill -9`` it is still there.
+A measurement of a command is kept while it runs. The row of one that was killed belongs to no process, and the next
+reader removes it; `measure NAME` without options continues with its settings.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,9 +96,10 @@ class MeasurementJob:
         """
         uuids = self.station.measurements.nodes_of(self.kept)
         name = self.kept.group or ", ".join(uuid.hex()[:8] for uuid in uuids[:3])
-        with self.station.measurements.running(uuids, group=self.kept.group, what=f"measure {name}"):
+        with ExitStack() as stack:
+            stack.enter_context(self.station.measurements.running(uuids, group=self.kept.group, what=f"measure {name}"))
             if self.kept.group is not None:
-                self.kept = self.station.measurements.begin(self.kept)
+                self._keep_while_it_runs(stack)
             if duration is None and self.kept.ends is not None:
                 duration = max(0.1, self.kept.ends - time.time())
             self.measurement = measurement = Measurement(
@@ -113,11 +116,17 @@ class MeasurementJob:
             self._commands = measurement.command
             try:
                 self.ended = measurement.run(stop, duration)
-            finally:  # however it ends in this process: only a process that dies leaves it to be carried on
+            finally:
                 self.measurement = None
-                if not self.kept.lasting:
-                    self.station.measurements.forget(self.kept.id)
         return self.ended
+
+    def _keep_while_it_runs(self, stack: ExitStack) -> None:
+        """Keep a command's measurement of a group until ``stack`` closes; one that lasts is kept for longer."""
+        kept, measurements = self.kept, self.station.measurements
+        if not kept.lasting:
+            self.kept = stack.enter_context(measurements.owned_by_command(kept))
+        elif not kept.id:
+            self.kept = measurements.keep(kept)
 
     def start(self, buses: Buses, watcher: Watcher | None = None) -> None:
         """Measure on a thread of its own until :meth:`stop`, or to its end; begun again after what ends it."""

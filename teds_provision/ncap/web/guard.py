@@ -66,6 +66,11 @@ class Caller:
         """Who stands in the audit log; None: the user who runs the daemon."""
         return {"socket": None, "browser": "page"}.get(self.kind, by_token(self.name))
 
+    @property
+    def owner(self) -> str:
+        """Return the owner of a measurement that the caller begins; on the socket, which its user has, it is ncap."""
+        return {"socket": "ncap", "browser": "page"}.get(self.kind, f"api:{self.name}")
+
 
 @dataclass(eq=False)
 class Refusal(Exception):

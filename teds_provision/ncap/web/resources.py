@@ -345,7 +345,8 @@ class Resources:
         body = await body_of(request, bodies.NewMeasurement)
         said = {name: value for name, value in vars(body).items() if value is not None}  # else as the daemon has it
         said["uuids"] = await self._nodes_of(body.uuids)
-        return JSONResponse(await changing(lambda: measuring.add(**said)), 201)
+        caller: Caller = request.scope[CALLER]
+        return JSONResponse(await changing(lambda: measuring.add(**said, owner=caller.owner)), 201)
 
     async def measurement(self, request: Request) -> Response:
         """DELETE /measurements/ID."""

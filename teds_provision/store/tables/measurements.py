@@ -85,7 +85,7 @@ class MeasurementTables:
             one.dead_man,
             float(one.scalar_rate),
             json.dumps(list(one.sinks)),
-            int(one.lasting),
+            one.owner,
             one.ends,
             one.created,
             int(one.test_pattern),
@@ -93,6 +93,8 @@ class MeasurementTables:
             one.require,
             one.match,
             int(one.frozen),
+            one.pid,
+            one.started,
         )
         self._database.execute(f"INSERT OR REPLACE INTO measurements VALUES({places(values)})", values)
 
@@ -148,7 +150,6 @@ def _measurement(*row: Any) -> KeptMeasurement:
         trigger=bool(one.trigger),
         actuators=bool(one.actuators),
         sinks=tuple(json.loads(row[10])),
-        lasting=bool(one.lasting),
         test_pattern=bool(one.test_pattern),
         unsigned=bool(one.unsigned),
         frozen=bool(one.frozen),

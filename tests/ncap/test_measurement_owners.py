@@ -1,0 +1,133 @@
+"""A measurement belongs to whoever began it: `ncap run` beside `measure GROUP`, with ends and cuts of both."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.client import ApiError
+from teds_provision.store import KeptMeasurement, Store
+from tests.e2e.desk import Running
+from tests.measure.hall import Hall, killed
+from tests.ncap.service import Service
+from tests.pace import until
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    made = Hall(tmp_path_factory.mktemp("owners"), {"g": "gripper"})
+    try:
+        made.nodes["g"].start()
+        made.station.ask("group", "create", "arm", made.nodes["g"].uuid)
+        yield made
+    finally:
+        made.close()
+
+
+@pytest.fixture(autouse=True)
+def tidy(hall: Hall) -> Iterator[None]:
+    """Each test ends all that it began, and leaves no measurement in the store."""
+    yield
+    hall.desk.clear(but=[node.process for node in hall.nodes.values()])
+    with closing(Store.open(hall.station.home)) as store:
+        for kept in store.measurements():
+            store.remove_measurement(kept.id)
+
+
+def rows(hall: Hall) -> list[KeptMeasurement]:
+    """The rows as they are stored: this reader removes none."""
+    with closing(Store.open(hall.station.home)) as store:
+        return store.measurements()
+
+
+def began(hall: Hall, *words: object) -> Running:
+    """`measure arm`, once its first value came."""
+    command = hall.begin("arm", "--rate", 20, *words)
+    command.wait_for('"event":"data"')
+    return command
+
+
+def ncap(hall: Hall) -> Service:
+    return Service(hall.desk, hall.station).start()
+
+
+def listed(service: Service) -> list[dict[str, Any]]:
+    with service.client() as asked:
+        return [dict(one) for one in asked.measurements()]
+
+
+def test_ncap_shows_the_measurement_of_a_command_and_never_takes_it_over(hall: Hall) -> None:
+    command = began(hall, "--to", hall.folder / "own.csv")
+    [row] = rows(hall)
+    assert (row.owner, row.pid) == ("command", command.process.pid)
+    assert row.started
+    service = ncap(hall)
+    [shown] = listed(service)
+    assert (shown["owner"], shown["state"], shown["group"]) == ("command", "running", "arm")
+    assert shown["process"] == {"id": command.process.pid, "started": row.started}
+    assert hall.station.ask("ncap", "status")["measurements"][0]["owner"] == "command"
+    with service.client() as asked, pytest.raises(ApiError, match="belongs to the command measure"):
+        asked.request("DELETE", f"/measurements/{shown['id']}")
+    command.signal(signal.SIGINT)
+    assert command.end().code == 0
+    assert listed(service) == []
+    assert rows(hall) == []
+    assert not any(json.loads(line).get("event") == "measurement" for line in service.process.out.splitlines())
+    service.kill()
+    assert listed(ncap(hall)) == [], "and a restart finds nothing to carry on"
+
+
+@pytest.mark.parametrize("reader", ["status", "start", "measure"])
+def test_the_next_reader_removes_the_row_of_a_killed_command(hall: Hall, reader: str) -> None:
+    service = ncap(hall) if reader == "status" else None
+    killed(began(hall))
+    assert len(rows(hall)) == 1
+    if service is not None:
+        assert listed(service) == []
+    elif reader == "start":
+        assert listed(ncap(hall)) == []
+    else:
+        command = began(hall)  # other options: it is no continuation
+        assert [row.pid for row in rows(hall)] == [command.process.pid]
+        command.signal(signal.SIGINT)
+        assert command.end().code == 0
+    assert rows(hall) == []
+
+
+def test_a_process_that_got_the_process_id_of_a_killed_command_does_not_own_its_row(hall: Hall) -> None:
+    with closing(Store.open(hall.station.home)) as store:
+        store.put_measurement(KeptMeasurement("dead", "arm", owner="command", pid=os.getpid(), started=1))
+    assert listed(ncap(hall)) == []
+    assert rows(hall) == []
+
+
+def test_what_the_socket_the_page_and_a_token_begin_is_carried_on_by_ncap(hall: Hall) -> None:
+    service = ncap(hall)
+    token = service.token("plotter")
+    with service.client() as asked:
+        mine = asked.request("POST", "/measurements", {"match": "name:none"})
+    with service.client(token) as asked:
+        theirs = asked.request("POST", "/measurements", {"match": "name:nothing", "scalar_rate": 3})
+    assert (mine["owner"], mine["process"]) == ("ncap", None)
+    assert (theirs["owner"], theirs["scalar_rate"]) == ("api:plotter", 3)
+    service.kill()
+    assert {one["owner"] for one in listed(ncap(hall))} == {"ncap", "api:plotter"}
+
+
+def test_ncap_waits_for_the_group_that_a_command_measures_and_gets_it_afterwards(hall: Hall, tmp_path: Path) -> None:
+    service = ncap(hall)
+    command = began(hall, "--to", tmp_path / "own.csv")
+    with service.client() as asked:
+        asked.request("POST", "/measurements", {"group": "arm", "rate": 20})
+    killed(command)
+    until(lambda: [one["state"] for one in listed(service)] == ["running"], "its own measurement begins")
+    assert [row.owner for row in rows(hall)] == ["ncap"]
