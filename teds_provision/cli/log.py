@@ -66,10 +66,11 @@ def log(
         raise UsageFailure("--today and --since cannot be combined.", hint="Use one of them.")
     station = app.station()
     audit_log = station.audit_log
-    choice = store.Choice(station.nodes.resolve(uuid) if uuid else None, act, failed)
     wanted = "today" if today else since
-    moment_of = moment(wanted) if wanted is not None else None
-    after = audit_log.before(choice, since=moment_of, last=last)
+    choice = store.Choice(
+        station.nodes.resolve(uuid) if uuid else None, act, failed, since=moment(wanted) if wanted is not None else None
+    )
+    after = audit_log.before(choice, last=last)
     verdict = audit_log.check(after)
     if follow:
         _follow(app, station, choice, verdict, after)
@@ -78,8 +79,7 @@ def log(
     if app.json:
         _tell_json(entries, verdict, after)
     else:
-        narrowed = choice != store.Choice() or moment_of is not None
-        _tell_lines(app, entries, verdict, after, narrowed=narrowed)
+        _tell_lines(app, entries, verdict, after, narrowed=choice != store.Choice())
 
 
 class _Counted:

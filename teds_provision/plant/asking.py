@@ -385,15 +385,24 @@ def sign_by_office(station: Station, links: LinkSettings, order: SignBy, reporte
 
 
 def _earlier(station: Station, wanted: Wanted) -> SignRequestRow | None:
-    """The newest request that was made for exactly this: epoch, name, blocks, and a sequence that still holds."""
+    """Return the newest request for exactly this epoch, name and content if it still holds, else None.
+
+    The newest is that of the highest sequence: a clock that was set back does not bring an older one to the front.
+    """
+    found: tuple[int, bool, SignRequestRow] | None = None
     for row in station.plant.line.sign_requests(wanted.job, wanted.image.uuid, "out"):
         if row.peer != wanted.office:
             continue
         request = open_request(row.request, lambda kid: station.point)
         same = (request.epoch, request.name, request.calibration) == (wanted.epoch, wanted.name, wanted.calibration)
         if same and request.image.unsigned_blocks() == wanted.image.unsigned_blocks():
-            return row if row.answer is not None or request.sequence == wanted.sequence else None
-    return None
+            place = (request.sequence, row.answer is not None)
+            if found is None or place > found[:2]:
+                found = (*place, row)
+    if found is None:
+        return None
+    sequence, answered, newest = found
+    return newest if answered or sequence == wanted.sequence else None
 
 
 def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, wanted: Wanted) -> SignRequest:

@@ -70,6 +70,8 @@ class Choice:
     """Stands in act, outcome, details, actor or UUID, in either case."""
     before: int | None = None
     """Only entries with a smaller number."""
+    since: str | None = None
+    """Only entries of this moment or later (UTC, as entries have it), wherever they are in the chain."""
 
 
 FAILED = (
@@ -129,31 +131,36 @@ class AuditLog:
         return self._database.stream(_entry, statement, after)
 
     def latest(self) -> str | None:
-        """Return the latest moment that an entry names, None for an empty log."""
-        row = self._database.one("SELECT max(at) FROM audit")
-        return str(row[0]) if row is not None and row[0] is not None else None
+        """Return the time of the newest entry of the chain, None for an empty log.
+
+        A clock that once was ahead and has been corrected since leaves later times in the middle of the chain.
+        """
+        row = self._database.one("SELECT at FROM audit ORDER BY seq DESC LIMIT 1")
+        return str(row[0]) if row is not None else None
 
     def newest(self) -> tuple[int, str]:
         """Return number and hash (64 digits) of the newest entry; (0, the root) for an empty log."""
         row = self._database.one("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
         return (int(row[0]), bytes(row[1]).hex()) if row is not None else (0, self._root.hex())
 
-    def before(self, choice: Choice, *, since: str | None = None, last: int | None = None) -> int:
-        """Return the number of the entry before the first that is meant: seen ``since``, among the ``last`` of them.
+    def before(self, choice: Choice, *, last: int | None = None) -> int:
+        """Return the number of the entry before the first one to show: of the ``last`` chosen, or made ``since``.
 
-        Looks from the end, so that it costs what is shown and not what the log holds.
+        With ``last`` the search starts at the end. A time says nothing about the position, as clocks are set back, so
+        ``since`` without ``last`` reads entries from the beginning (0.1 s for a million).
         """
-        terms = _terms(choice)
-        after = 0
-        if since is not None:
-            row = self._database.one("SELECT seq FROM audit WHERE at < ? ORDER BY seq DESC LIMIT 1", (since,))
-            after = int(row[0]) if row is not None else 0
         if last is not None:
-            statement = f"SELECT seq FROM audit WHERE seq > ?{terms} ORDER BY seq DESC LIMIT ?"
-            rows = self._database.execute(statement, (after, last))
-            end = self._database.one("SELECT coalesce(max(seq), 0) FROM audit")
-            after = int(rows[-1][0]) - 1 if rows else int(end[0] if end is not None else 0)
-        return after
+            statement = f"SELECT seq FROM audit WHERE seq > 0{_terms(choice)} ORDER BY seq DESC LIMIT ?"
+            rows = self._database.execute(statement, (last,))
+            first = rows[-1] if rows else None
+        elif choice.since is not None:
+            first = self._database.one("SELECT seq FROM audit WHERE at >= ? ORDER BY seq LIMIT 1", (choice.since,))
+        else:
+            return 0
+        if first is not None:
+            return int(first[0]) - 1
+        end = self._database.one("SELECT coalesce(max(seq), 0) FROM audit")
+        return int(end[0]) if end is not None else 0
 
     def check(self, after: int = 0) -> AuditVerdict:
         """Recompute the chain from entry ``after`` on (0: the whole of it); raises StoreFailure for an unreadable file.
@@ -252,6 +259,8 @@ def _terms(choice: Choice) -> str:
         part = _like(choice.text)
         columns = ("act", "outcome", "detail", "who", "lower(hex(uuid))")
         terms += " AND (" + " OR ".join(f"{column} LIKE {part} ESCAPE '!'" for column in columns) + ")"
+    if choice.since is not None:
+        terms += " AND at >= '" + choice.since.replace("'", "''").replace("\0", "") + "'"
     if choice.before is not None:
         terms += f" AND seq < {int(choice.before)}"
     if choice.failed:

@@ -133,6 +133,21 @@ def test_entries_are_found_by_time_act_outcome_and_node(home: Path) -> None:
     assert call(home, "log", "--today", "--since", "2h").code == 2
 
 
+def test_an_entry_of_an_earlier_clock_hides_no_other_entry(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Store.open(home) as store:
+        for day in ("2026-05-04", "2026-05-05", "2026-05-04", "2026-05-05"):
+            monkeypatch.setattr("teds_provision.store.audit.utc_now", lambda day=day: f"{day}T12:00:00Z")
+            store.audit.append("verify", bytes.fromhex(ONE), f"of {day}")
+    since = ("--since", "2026-05-05T00:00:00+00:00", "--act", "verify")
+    shown = call(home, "--json", "log", *since)
+    assert [entry["seq"] for entry in shown.json["entries"]] == [3, 5], "filtered by time, in the order of the chain"
+    assert (shown.json["intact"], shown.json["totals"]["entries"]) == (True, 2)
+    assert [entry["seq"] for entry in call(home, "--json", "log", *since, "--last", 1).json["entries"]] == [5]
+    assert len(call(home, "log", *since).out.splitlines()) == 2
+    tamper(home, "UPDATE audit SET detail = '{\"a\":1}' WHERE seq = 4")
+    assert call(home, "log", *since).code == 7, "the chain is checked from the first entry shown on"
+
+
 def errors(kind: type[TedsProvisionError] = TedsProvisionError) -> set[str]:
     """The code of every error of the tree, those that rooms add to it too."""
     return {kind.code}.union(*map(errors, kind.__subclasses__()))

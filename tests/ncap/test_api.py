@@ -17,6 +17,7 @@ import pytest
 
 from teds_provision.client import ApiError, Client
 from teds_provision.ncap.nodes.sheets import curves
+from teds_provision.store import Store
 from teds_provision.teds.calibration import read_calibrations
 from teds_provision.teds.profile import load_profile
 from tests.e2e.desk import ANGLE
@@ -142,6 +143,22 @@ def test_a_datasheet_of_another_type_makes_no_board_another_one_unless_it_is_sai
     assert asked.request("PUT", f"{path}?dry_run=1", {**body, "retype": True})["changes"]
     [noted] = asked.request("GET", f"/log?act=api&failed=1&uuid={hand}&limit=1")["entries"]
     assert (noted["outcome"], noted["facts"]["method"]) == ("wrong-board", "PUT")
+
+
+def test_an_entry_of_an_earlier_clock_hides_no_other_entry(
+    service: Service, asked: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Store.open(service.station.home) as store:
+        for day in ("2099-05-04", "2099-05-05", "2099-05-04", "2099-05-05"):
+            monkeypatch.setattr("teds_provision.store.audit.utc_now", lambda day=day: f"{day}T12:00:00Z")
+            store.audit.append("verify", None, f"of {day}")
+    path = "/log?act=verify&since=2099-05-05T00:00:00Z"
+    newest = asked.request("GET", f"{path}&limit=1")
+    both = asked.request("GET", path)
+    assert [entry["outcome"] for entry in both["entries"]] == ["of 2099-05-05"] * 2
+    assert (newest["entries"], both["intact"]) == (both["entries"][1:], True)
+    [older] = asked.request("GET", f"{path}&before={newest['entries'][0]['seq']}")["entries"]
+    assert older == both["entries"][0]
 
 
 def test_a_refused_change_stands_in_the_log_with_who_asked_for_what_and_why(

@@ -144,6 +144,17 @@ def test_an_office_that_is_away_costs_nothing_but_time(desk: Desk) -> None:
     assert security.decode(done.image.blocks[SECURITY]).sequence == 1
 
 
+def test_the_newest_request_is_that_of_the_highest_sequence_whatever_the_clock_was(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    first = desk.request(run, one)
+    (row,) = desk.line.plant.line.sign_requests(first.job, first.uuid, "out")
+    sealed = seal_request(replace(first, sequence=first.sequence + 1), desk.line.credentials().key)
+    later = replace(row, hash=open_request(sealed, lambda kid: desk.line.point).hash, request=sealed)
+    with desk.line.durable("test"):
+        desk.line.plant.line.put_sign_request(replace(later, at="2000-01-01T00:00:00Z"))
+    assert desk.request(run, one).hash != first.hash, "the later request does not fit the board, so a new one is made"
+
+
 def test_the_same_request_gets_the_same_answer_octet_for_octet(desk: Desk) -> None:
     request = desk.request(desk.run(), board(1))
     first = answer(desk.office, request.octets)

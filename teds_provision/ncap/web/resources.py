@@ -144,15 +144,15 @@ class Resources:
         if text is not None and len(text) > LONGEST_TEXT:
             raise UsageFailure(f"text may have at most {LONGEST_TEXT} characters.")
         failed = words.get("failed", "0") not in ("0", "", "false")
-        choice = Choice(act=words.get("act") or None, failed=failed, text=text or None, before=before)
         since = _moment("since", words["since"]) if words.get("since") else None
-        return _shown(request, await reading(self._log, choice, limit, words.get("uuid"), since))
+        choice = Choice(act=words.get("act") or None, failed=failed, text=text or None, before=before, since=since)
+        return _shown(request, await reading(self._log, choice, limit, words.get("uuid")))
 
-    def _log(self, choice: Choice, limit: int, uuid: str | None, since: str | None) -> dict[str, Any]:
+    def _log(self, choice: Choice, limit: int, uuid: str | None) -> dict[str, Any]:
         log = self._daemon.station.audit_log
         if uuid:
             choice = replace(choice, uuid=bytes.fromhex(self._daemon.resolve(uuid)))
-        after = log.before(choice, since=since, last=limit)
+        after = log.before(choice, last=limit)
         verdict = log.check(after)
         entries = [
             {

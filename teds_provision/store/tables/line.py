@@ -160,11 +160,11 @@ class LineTables:
         )
 
     def sign_requests(self, job: str, uuid: bytes, direction: Literal["out", "in"]) -> list[SignRequestRow]:
-        """Return the requests for one board of a job, newest first."""
+        """Return the requests for one board of a job."""
         return self._database.read(
             SignRequestRow,
             f"SELECT {_REQUEST} FROM sign_requests WHERE job = ? AND uuid = ? AND direction = ?"
-            " ORDER BY at DESC, coalesce(sequence, 0) DESC",
+            " ORDER BY coalesce(sequence, 0), hash",
             (job, uuid, direction),
         )
 
