@@ -17,9 +17,9 @@ from teds_provision import plant, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import local_time, moment, print_json_list, print_table, shown
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.station.label import label_of, write_label
-from teds_provision.steps.inventory import STATES, inventory, search
+from teds_provision.steps.inventory import PAGE, STATES, inventory, search
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,11 +72,16 @@ def nodes(
         return
     day = (datetime.now(UTC) + timedelta(days=due)).strftime("%Y-%m-%d") if due is not None else None
     seen = moment(since) if since is not None else None
-    found = search(station, text, state=state, profile=profile, group=group, due=day, since=seen)
+    try:
+        found = search(station, text, state=state, profile=profile, group=group, due=day, since=seen)
+    except NotFound:
+        found = _named_in_plant(station, text) if not any((state, profile, group, due, since)) else []
+        if not found:
+            raise
     if fits is not None:
         show_fits(app, station, fits, found)
         return
-    described = _with_conflicts(station, inventory(station, found))
+    described = _with_plant(station, inventory(station, found))
     if app.json or form == "json":
         print_json_list("nodes", described)
     elif form == "csv":
@@ -95,14 +100,34 @@ def nodes(
         _table(described)
 
 
-def _with_conflicts(station: Station, described: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Each node with what the stations of the plant do not agree on; the nodes as they are where none was joined."""
-    if station.plant.joined is None:
-        return iter(described)
+def _named_in_plant(station: Station, text: str | None) -> list[bytes]:
+    """Return the known node that only another station of the plant calls ``text``; empty if there is none."""
+    if text is None or station.plant.joined is None:
+        return []
+    uuid = plant.status.resolve(station, text)
+    if not station.nodes.is_known(uuid):
+        raise NotFound(f"This station has not met node {uuid.hex()}.", hint=f"See: nodes --plant {uuid.hex()}")
+    return [uuid]
+
+
+def _with_plant(station: Station, described: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Add to each node its conflicts in the plant, and the plant's name if this station gave it none.
+
+    Leave the nodes unchanged if the station joined no registry.
+    """
+    roster = station.plant.roster
+    if roster is None:
+        yield from described
+        return
     found: dict[str, list[dict[str, str]]] = {}
     for uuid, name, why in station.plant.tables.conflicts():
         found.setdefault(uuid.hex(), []).append({"name": name, "why": why})
-    return ({**node, "conflicts": found.get(node["uuid"], [])} for node in described)
+    rest = iter(described)
+    while page := list(islice(rest, PAGE)):
+        names = plant.status.names(station, roster, [bytes.fromhex(node["uuid"]) for node in page if not node["name"]])
+        for node in page:
+            named = node["name"] or names.get(bytes.fromhex(node["uuid"]))
+            yield {**node, "name": named, "conflicts": found.get(node["uuid"], [])}
 
 
 def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) -> None:

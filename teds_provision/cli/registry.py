@@ -206,10 +206,13 @@ def request(app: App, output: Path) -> None:
         octets = plant.membership.request(station)
     _write_once(output, octets + b"\n")
     login = plant.schema.role_of(station.fingerprint)
+    held = station.plant.roster
+    member = held is not None and held.member(station.fingerprint) is not None
+    step = f"sql --member {quote(output.name)} | psql" if member else f"add {quote(output.name)} --role base"
     app.emit(
         {"request": str(output), "fingerprint": station.fingerprint, "role": login},
         f"Request of {station.name}: {output}\n{station.fingerprint}\n"
-        f"There: teds-provision registry add {quote(output.name)} --role base",
+        f"{'At a keeper' if member else 'There'}: teds-provision registry {step}",
     )
 
 
@@ -779,6 +782,14 @@ def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str]
     held = plant.folding.require_roster(station)
     if member is not None:
         asked = document.open_request(read_file(member))
+        left = held.removed_one(asked.fingerprint)
+        if left is not None:
+            raise PolicyRefused(
+                f"{left.name} was removed from {held.name} ({left.why}); its login stays closed.",
+                hint="A removed key cannot return: create a new station (init), and add that one.",
+            )
+        if held.member(asked.fingerprint) is None:
+            app.warn(f"{asked.name} is not in the roster yet. To add it: registry add {quote(str(member))} --role ROLE")
         text = plant.schema.member_sql(asked.fingerprint, asked.login)
     elif closed is not None:
         text = plant.schema.close_sql(_of_roster(held, closed))

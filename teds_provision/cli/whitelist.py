@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision import steps
+from teds_provision import plant, steps
 from teds_provision.cli.build import write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
@@ -76,7 +76,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 def _meant(station: Station, uuid: str) -> bytes:
     """The UUID, or the one that stands for an EUI-64 of which no node is known by its first digits."""
     try:
-        return station.nodes.resolve(uuid)
+        return plant.status.resolve(station, uuid)
     except NotFound:
         by_rule = steps.whitelist.uuid_of_eui64(uuid)
         if by_rule == uuid:
@@ -96,7 +96,7 @@ def _meant(station: Station, uuid: str) -> bytes:
 def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Remove a node from the whitelist and forget its pinned key, so that a replaced board can be pinned again."""
     station = app.station()
-    octets = station.nodes.resolve(uuid)
+    octets = plant.status.resolve(station, uuid)
     entry = station.pins.entry(octets)
     told = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
     pinned = entry.fingerprint if entry is not None else None

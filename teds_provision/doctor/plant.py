@@ -7,6 +7,7 @@ from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 
 from teds_provision.doctor.checks import Finding, System, check
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Roster, open_roster
 from teds_provision.store import Store
 from teds_provision.store.database import has_store
@@ -23,7 +24,14 @@ def registry(system: System) -> Iterator[Finding]:
         return
     with Store.open(system.home) as store:
         record, row, facts = store.plant(), store.held_roster(), store.facts()
-        if record is None or record.left is not None or row is None or facts is None or facts.ca is None:
+        if (
+            record is None
+            or record.left is not None
+            or row is None
+            or facts is None
+            or facts.ca is None
+            or facts.point is None
+        ):
             return
         now, roster = datetime.now(UTC), open_roster(row.octets, facts.ca)
         yield _roster(roster, now)
@@ -37,7 +45,7 @@ def registry(system: System) -> Iterator[Finding]:
         for one in alarms:
             yield Finding("registry", "warning", f"Alarm {one.code}: {one.why}.", "teds-provision registry status")
         conflicts = len({uuid for uuid, _, _ in store.conflicts()})
-        said = f"{store.unsent()} events unsent, {conflicts} conflicts."
+        said = f"{store.unsent(fingerprint(facts.point))} events unsent, {conflicts} conflicts."
         fix = "teds-provision registry status" if conflicts else ""
         yield Finding("registry", "warning" if conflicts else "ok", said, fix)
 

@@ -12,6 +12,7 @@ from teds_provision.plant import scram
 from teds_provision.plant.folding import now, recount, require_roster
 from teds_provision.plant.post import Post
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
 from teds_provision.protocol.plant.roster import Roster, open_roster
 from teds_provision.station.station import Station
@@ -145,22 +146,35 @@ def accept(station: Station, of: str, hash: str | None, post: Post | None) -> tu
 
 
 def branch(station: Station, of: str, hash: str | None, post: Post | None) -> tuple[int, str]:
-    """The branch that :func:`accept` takes: number and H of its first page. Raises NotFound, PolicyRefused."""
+    """Return the branch that :func:`accept` takes: number and H of its first page.
+
+    An earlier choice can be changed: name the other branch by its ``hash``. Raises NotFound, PolicyRefused.
+    """
     roster = require_roster(station)
     tables = station.plant.tables
     chain: Chain = tables.chain(of)
-    n = chain.counted[0] + 1
     names = tables.page_names(chain.chain)
-    branches = sorted({hash for number, hash, _ in names if number == n})
-    wanted = [one for one in branches if hash is not None and one.startswith(hash.lower())]
+    partings = [chain.counted[0] + 1]  # the one that is undecided
+    if chain.accepted is not None:  # and the one that was decided, which a person may decide differently
+        partings.append(counting(names, last=None, accepted=None).two or 0)
+    by_number = {n: sorted({hash for number, hash, _ in names if number == n}) for n in partings}
+    n = next((n for n in partings if len(by_number[n]) > 1 and _among(by_number[n], hash)), 0)
+    n = n or next((n for n in partings if len(by_number[n]) > 1), 0)
+    if not n:
+        raise NotFound(f"{roster.name_of(of)} has only one history here.", hint="See: teds-provision registry status")
+    branches = by_number[n]
+    wanted = _among(branches, hash)
     if hash is None and post is not None and not post.everybody:
         shown = {carried.n: carried for carried in post.pages(of, n - 1)}
         wanted = [one for one in branches if n in shown and hash_of(shown[n].octets) == one]
-    if len(branches) < 2:
-        raise NotFound(f"{roster.name_of(of)} has only one history here.", hint="See: teds-provision registry status")
     if len(wanted) != 1:
         listed = ", ".join(one[:16] for one in branches)
         raise PolicyRefused(
             f"Page {n} of {roster.name_of(of)} exists here twice: {listed}.", hint="Choose one: --page HASH"
         )
     return n, wanted[0]
+
+
+def _among(branches: Sequence[str], digits: str | None) -> list[str]:
+    """Return the branches whose hash begins with ``digits``."""
+    return [] if digits is None else [hash for hash in branches if hash.startswith(digits.lower())]

@@ -424,7 +424,10 @@ def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
     state, words = error.sqlstate, _words(error)
     match state:
         case "TE001":
-            return NotMember("The registry does not accept this station's login.", hint="See: registry status")
+            return NotMember(
+                "The database does not list this station's login as open: it was closed, or its row was lost.",
+                hint="At a keeper, with FILE from registry request --output FILE: registry sql --member FILE | psql",
+            )
         case "TE002":
             return Fork(f"The registry rejected a page: {words}", hint="See: registry status")
         case "TE003":

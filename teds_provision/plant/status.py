@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final
@@ -76,7 +76,7 @@ def status(station: Station, record: PlantRecord, roster: Roster) -> PlantStatus
         record,
         roster,
         tuple(_standing(station, one, chains.get(one.fingerprint), at) for one in roster.by_key.values()),
-        station.plant.tables.unsent(),
+        station.plant.tables.unsent(station.fingerprint),
         len({uuid for uuid, _, _ in station.plant.tables.conflicts()}),
         tuple(station.plant.tables.alarms()),
         heads_digest(station),
@@ -136,18 +136,21 @@ def log(
 
 
 def resolve(station: Station, text: str) -> bytes:
-    """The UUID that ``text`` means: in the own store first, else among the nodes that stations of the plant name.
+    """Return the UUID that ``text`` means, looking in the own store first, then at what the plant's stations report.
 
-    Raises NotFound, UsageFailure where several fit.
+    Raises NotFound, or UsageFailure if several nodes fit.
     """
     try:
         return station.nodes.resolve(text)
     except NotFound:
+        roster = station.plant.roster
+        if roster is None:
+            raise
         name = text.strip()
         digits = name.lower().removeprefix("0x")
         found = [
             node["uuid"]
-            for node in nodes(station, require_roster(station), name)
+            for node in nodes(station, roster, name)
             if (len(digits) >= SHORTEST and node["uuid"].startswith(digits)) or node["name"] == name
         ]
         if not found:
@@ -157,6 +160,15 @@ def resolve(station: Station, text: str) -> bytes:
             f"{text!r} matches {len(found)} nodes: {', '.join(found[:5])}.", hint="Give more digits of the UUID."
         )
     return bytes.fromhex(found[0])
+
+
+def names(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[bytes, str]:
+    """Return the names that the plant's stations gave to these nodes; nodes without one are left out."""
+    found: dict[bytes, str] = {}
+    for start in range(0, len(uuids), AT_ONCE):
+        page = views(station, roster, uuids[start : start + AT_ONCE])
+        found.update((uuid, seen.name) for uuid, seen in page.items() if seen.name)
+    return found
 
 
 def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator[dict[str, Any]]:

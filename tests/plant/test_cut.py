@@ -92,7 +92,7 @@ def carried_on(folder: Path) -> list[object]:
         roster = station.plant.roster
         assert roster is not None
         assert station.plant.tables.alarms() == []
-        assert station.plant.tables.unsent() == 0
+        assert station.plant.tables.unsent(station.fingerprint) == 0
         assert station.plant.tables.to_judge(1) == []
         said = views(station, roster, NODES)
         seen.append((heads_digest(station)[1], {uuid: sorted(view.pins.values()) for uuid, view in said.items()}))

@@ -31,7 +31,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
 
 def test_who_joined_no_registry_tells_nothing(station: Station) -> None:
     station.plant.tell("named", UUID, name="grip")
-    assert station.plant.tables.unsent() == 0
+    assert station.plant.tables.unsent(station.fingerprint) == 0
 
 
 def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
@@ -44,7 +44,7 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
 
     with pytest.raises(KeyError):
         fails()
-    assert station.plant.tables.unsent() == 0
+    assert station.plant.tables.unsent(station.fingerprint) == 0
     with station.transaction():
         station.plant.tell("named", UUID, name="grip")
     ((_, name, text),) = station.plant.tables.outbox(10)
@@ -56,7 +56,7 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
 def test_who_left_tells_nothing_any_more(station: Station) -> None:
     station.plant.tables.put_plant(PlantRecord(REGISTRY, left="2026-01-31T12:00:00Z"))
     station.plant.tell("named", UUID, name="grip")
-    assert station.plant.tables.unsent() == 0
+    assert station.plant.tables.unsent(station.fingerprint) == 0
 
 
 def test_a_registry_costs_no_further_commit(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,4 +83,4 @@ def test_a_registry_costs_no_further_commit(station: Station, monkeypatch: pytes
     alone = commits()
     station.plant.tables.put_plant(PlantRecord(REGISTRY))
     assert commits() == alone > 0
-    assert station.plant.tables.unsent() >= 3, "pinned, agreed, pinned"
+    assert station.plant.tables.unsent(station.fingerprint) >= 3, "pinned, agreed, pinned"

@@ -352,7 +352,64 @@ def test_a_person_accepts_one_of_two_histories_and_sees_it_first(desk: Desk, tmp
     said = [one for one in told["events"] if one["act"] == "pinned"]  # type: ignore[attr-defined]
     assert sorted(one["counts"] for one in said) == [False, True], "of two first pages one counts"
     (node,) = desk.ask("north", "nodes", "--plant")["nodes"]  # type: ignore[misc]
-    assert len(node["says"]["pinned_by"]) == 1
+    (pinned,) = node["says"]["pinned_by"].values()
+    offered = desk.run("north", "registry", "accept", "west", "--page", "0" * 16, "--yes").err
+    hashes = {word for word in offered.replace(",", " ").replace(".", " ").split() if len(word) == 16}
+    (other_branch,) = hashes - {branch}
+    assert desk.ask("north", "registry", "accept", "west", "--page", other_branch, "--yes")["done"] == 1
+    (node,) = desk.ask("north", "nodes", "--plant")["nodes"]  # type: ignore[misc]
+    assert set(node["says"]["pinned_by"].values()) == {KEY, "cd" * 32} - {pinned}, "a person changed the choice"
+
+
+def test_a_removed_station_gets_no_login_and_a_member_is_not_asked_to_join_again(desk: Desk) -> None:
+    joined(desk)
+    west, north = desk.folder / "west.request", desk.folder / "north.request"
+    opened = desk.ask("north", "registry", "sql", "--member", west)
+    assert "login connection limit" in str(opened["sql"])
+    desk.ask("north", "registry", "remove", "west", "--stolen", "--last", 0, "--yes")
+    refused = desk.run("north", "registry", "sql", "--member", west)
+    assert (refused.code, refused.out) == (6, "")
+    assert "west was removed from plant Augsburg (stolen)" in refused.err
+    shown = desk.run("north", "registry", "request", "--output", north)
+    assert "registry sql --member north.request | psql" in shown.out
+    assert "registry add" not in shown.out
+
+
+def test_what_waits_in_pages_counts_as_unsent(desk: Desk) -> None:
+    joined(desk)
+    desk.ask("north", "whitelist", "add", "00" * 10, "--fingerprint", KEY)
+    desk.sync("north")
+    assert desk.ask("north", "registry", "status")["unsent"] == 0
+    desk.ask("north", "whitelist", "add", UUID, "--fingerprint", KEY)
+    (pages,) = desk.stick.glob("*/1.jws")
+    pages.parent.rename(desk.folder / "away")
+    pages.parent.write_text("no folder: the page is made, and cannot leave")
+    assert desk.run("north", "registry", "sync").code not in (0, 2)
+    with Store.open(desk.folder / "north") as store:
+        assert store.outbox(1) == []
+    assert desk.ask("north", "registry", "status")["unsent"] == 1
+    checks = json.loads(desk.run("north", "--json", "doctor").out)["checks"]
+    assert any(one["why"].startswith("1 events unsent") for one in checks if one["name"] == "registry")
+    pages.parent.unlink()
+    (desk.folder / "away").rename(pages.parent)
+    desk.ask("north", "registry", "sync")
+    assert desk.ask("north", "registry", "status")["unsent"] == 0
+
+
+def test_a_node_that_only_the_plant_knows_is_revoked_and_whitelisted_by_its_first_digits(desk: Desk) -> None:
+    joined(desk)
+    desk.ask("west", "whitelist", "add", UUID, "--fingerprint", KEY, "--name", "finger 1")
+    desk.sync("west", "south")
+    assert desk.run("south", "nodes", UUID[:4]).code == 3
+    planned = desk.ask("south", "revoke", UUID[:4], "--why", "stolen", "--dry-run")
+    assert planned["uuid"] == UUID
+    assert desk.ask("south", "whitelist", "remove", UUID[:4], "--dry-run")["removed"] is False
+    assert desk.ask("south", "whitelist", "add", UUID[:4], "--dry-run")["added"] == 1
+    desk.ask("south", "whitelist", "add", UUID[:4])
+    for word in (UUID[:4], "finger 1"):
+        (node,) = desk.ask("south", "nodes", word)["nodes"]  # type: ignore[misc]
+        assert (node["uuid"], node["name"]) == (UUID, "finger 1"), "the name that west gave it"
+    assert desk.run("south", "revoke", "ffff", "--why", "stolen").code == 3
 
 
 def test_a_node_on_which_stations_do_not_agree_says_so_itself(desk: Desk) -> None:

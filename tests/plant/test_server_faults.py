@@ -61,7 +61,7 @@ def survived(office: Office, cluster: Cluster, *steps: int) -> int:
         assert office.database.sql("select count(distinct jws) from registry.roster") == [["1"]], step
         for each in (office.north, south):
             assert each.plant.tables.alarms() == [], step
-            assert each.plant.tables.unsent() == 0, step
+            assert each.plant.tables.unsent(each.fingerprint) == 0, step
         assert plant_room.parcels.waiting_out(office.north) == 0, step
         plant_room.folding.put_roster(office.north, plant_room.owner.signed(
             office.north, plant_room.owner.unshared(office.north, ("all", ""))))  # fmt: skip

@@ -138,7 +138,7 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     pin(west, bytes([1] * 10))
     with pytest.raises(Fork, match="copy of this home"):
         plants.sync(west)
-    assert west.plant.tables.unsent() >= 1
+    assert west.plant.tables.unsent(west.fingerprint) >= 1
     assert resume(west, plant.files.FilesPost(plants.stick)) == 1
     plants.sync(west)
     plants.sync(plants.north)
@@ -309,7 +309,7 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
     plants.sync(plants.north)
     said = [one.event["uuid"] for one in plant.status.log(plants.north)]
     assert sorted(said) == [uuid.hex() for uuid in nodes]
-    assert plants.north.plant.tables.unsent() == 0
+    assert plants.north.plant.tables.unsent(plants.north.fingerprint) == 0
     assert alarms(plants.north) == []
     for station in homes:
         station.close()

@@ -5,6 +5,7 @@ Stations are named by fingerprint here and by a small number (``chain``) in the 
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -189,9 +190,18 @@ class PlantTables:
         """Return the oldest events that wait for a page: number, id, JSON."""
         return self._database.execute("SELECT seq, id, event FROM outbox ORDER BY seq LIMIT ?", (most,))
 
-    def unsent(self) -> int:
-        """Return how many events wait for a page."""
-        return int(self._database.execute("SELECT count(*) FROM outbox")[0][0])
+    def unsent(self, station: str) -> int:
+        """Return how many events of this station (a fingerprint) the registry has not acknowledged.
+
+        They wait for a page, or are in a page newer than the last acknowledged one. A station that is connected to no
+        registry gets no acknowledgement, so only the events without a page count.
+        """
+        waiting = int(self._database.execute("SELECT count(*) FROM outbox")[0][0])
+        record, chain = self.plant(), self.chains().get(station)
+        if record is None or record.url is None or chain is None:
+            return waiting
+        pages = self.each_page(chain.chain, record.acknowledged)
+        return waiting + sum(len(json.loads(page.content).get("events", ())) for page in pages)
 
     def drop_events(self, ids: Iterable[str]) -> None:
         """Take events that stand in a page out of the outbox."""
