@@ -37,6 +37,7 @@ from teds_provision.steps.build import (
     BuildOrder,
     Confirm,
     Prepared,
+    compose,
     for_several,
     merged,
     named_for,
@@ -143,7 +144,9 @@ class Boards:
             named_for(station, self.node, self.prepared)
         self.progress = _progress(station, request, order)
         self.expected = 0  # how many boards of a bus are worked on, once they were found
-        self.stop = IdleStop(links.timeout if self.progress is not None and not request.watch else None)
+        taps = self.progress is not None and not request.watch and not request.everyone
+        self.stop = IdleStop(links.timeout if taps else None)  # what is on a bus is found once: no board is waited for
+        self._all_done = False
         self._turn = threading.Lock()
         self._rows: dict[bytes, SheetRow] = {}
         self._boards: list[BoardResult] = []
@@ -152,7 +155,7 @@ class Boards:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a person should know of the order, or of the rows of the sheet, before the first board comes."""
-        rows = self.progress.sheet.warnings if self.progress is not None else ()
+        rows = (*self.progress.sheet.warnings, *self.progress.again) if self.progress is not None else ()
         return (*self.prepared.warnings, *rows)
 
     def unlock(self) -> None:
@@ -278,7 +281,9 @@ class Boards:
         """What it came to: the whole sheet over all runs, or the nodes of this run."""
         if self.progress is not None:
             if self.stop.ran_out:
-                self.progress.ran_out(self._links.timeout)
+                self.progress.ran_out(f"was tapped within {self._links.timeout:.0f} s")
+            elif self._request.everyone and self._all_done:
+                self.progress.ran_out("answered on the bus")
             return self.progress.totals()
         results = [board.result for board in self._boards]
         steps = [{step.name: step.seconds for step in board.done.steps} for board in self._boards if board.done]
@@ -288,9 +293,11 @@ class Boards:
         return BatchTotals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), self.worst)
 
     def _as_they_come(self, questions: Questions) -> Iterator[BoardResult]:
-        for arrival in watch_nodes(
-            self._links, lambda node: self._provision(node, questions), self._reporter, self.stop
-        ):
+        def work(node: Conversation) -> Provisioned:
+            with self.stop.working():
+                return self._provision(node, questions)
+
+        for arrival in watch_nodes(self._links, work, self._reporter, self.stop):
             row = self._rows.pop(arrival.uuid, None)
             number = row.number if row is not None else None
             board = BoardResult(arrival.uuid, arrival.seconds, arrival.result, arrival.error, number, arrival.place)
@@ -304,7 +311,8 @@ class Boards:
         try:
             everyone, contacts = self._on_the_bus(port)
             yield from self._side_by_side(port, contacts, questions)
-            if not self.stop.is_set():
+            if not self.stop.is_asked:
+                self._all_done = True
                 refuse_twins(everyone)  # the others are done, and what is not done is not passed over
         finally:
             port.close()
@@ -324,7 +332,10 @@ class Boards:
         return everyone, contacts
 
     def _side_by_side(self, port: Port, contacts: list[Contact], questions: Questions) -> Iterator[BoardResult]:
-        """Each of these nodes in a thread, as many at a time as the bus and the token bear, until ``stop`` is set."""
+        """Provision each of these nodes in a thread, as many at a time as the bus and the token bear.
+
+        Once a person asks to stop, no further node is begun; those that are begun are finished and yielded.
+        """
         token = self._station.identity.keystore.startswith("pkcs11:")
         workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.max_parallel, len(contacts)))
         pool = ThreadPoolExecutor(workers, thread_name_prefix="node")
@@ -332,9 +343,11 @@ class Boards:
         running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
         try:
             for done in as_completed(running):
-                yield done.result()
-                if self.stop.is_set():
-                    break
+                if not done.cancelled():
+                    yield done.result()
+                if self.stop.is_asked:
+                    for waiting in running:
+                        waiting.cancel()
         except BaseException:  # Ctrl-C: a mute node would be waited for, a minute long
             port.close()
             raise
@@ -358,6 +371,8 @@ class Boards:
         listed = self._station.pins.entry(uuid) is not None
         if self.progress is not None and any(row.uuid in (uuid, None) for row in self.progress.open):
             return True
+        if self.progress is not None and self.progress.has_passed(uuid):
+            return False
         if self.line is not None and self.line.is_listed(uuid):
             listed = True
         if self.line is not None and self.line.only_verify:
@@ -479,7 +494,20 @@ def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) ->
         raise UsageFailure(
             "On a bus, rows cannot follow the order of taps.", hint="Give each row its uuid or fingerprint."
         )
-    return Progress(station.home, sheet)
+    return Progress(station.home, sheet, lambda row, uuid: _has_it_already(station, row, uuid))
+
+
+def _has_it_already(station: Station, row: SheetRow, uuid: bytes) -> bool:
+    """True if the datasheet that this station knows of a board is what its row of the sheet gives."""
+    image = station.nodes.datasheet(uuid)
+    if image is None:
+        return False
+    try:
+        prepared = named_for(station, uuid, row.prepared)
+        made = [compose(station, uuid, prepared, image, edition=edition).blocks for edition in (2007, 2024)]
+    except TedsProvisionError:
+        return False
+    return image.unsigned_blocks() in map(dict, made)
 
 
 def _require_consistent(request: ProvisionRequest, links: LinkSettings) -> None:

@@ -17,10 +17,11 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -37,7 +38,7 @@ from teds_provision.errors import (
 from teds_provision.files import SHARED, open_lock, private_folder, read_limited, write_whole
 from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
-from teds_provision.steps.build import BuildOrder, Prepared, prepare
+from teds_provision.steps.build import BuildOrder, Prepared, content_digests, prepare
 from teds_provision.steps.provision import Provisioned
 from teds_provision.steps.verify import require_authentic
 from teds_provision.store import utc_now
@@ -144,6 +145,12 @@ class SheetRow:
     fingerprint: str | None
     prepared: Prepared
     digest: str
+
+    @cached_property
+    def content(self) -> dict[str, str]:
+        """Digests of what the row names: a row stays done only while profile, calibration and name are unchanged."""
+        profile, calibration = content_digests(self.prepared)
+        return {"profile": profile, "calibration": calibration, "name": self.prepared.order.name or ""}
 
     @property
     def by_order(self) -> bool:
@@ -336,10 +343,14 @@ _MAX_OCTETS: Final = 64 << 20
 class Attempted:
     """What became of one row: the board that took it, its last result, and whether the first try passed.
 
-    ``digest`` is of the row's cells: another content is another board, and begins anew.
+    ``digest`` is of the row's cells: other cells are another board, and begin from nothing. ``content`` has the digests
+    of what the cells name (:attr:`SheetRow.content`), None in a file of an older version; ``again`` is why the row is
+    done once more, "" if it is not.
     """
 
     digest: str
+    content: dict[str, str] | None = None
+    again: str = ""
     uuid: str | None = None
     result: str = ""
     tries: int = 0
@@ -353,8 +364,11 @@ class Attempted:
 class Progress:
     """The rows of one sheet with what became of them; durable after each board."""
 
-    def __init__(self, home: Path, sheet: BatchSheet) -> None:
-        self.sheet = sheet
+    def __init__(
+        self, home: Path, sheet: BatchSheet, has_it: Callable[[SheetRow, bytes], bool] = lambda _row, _uuid: True
+    ) -> None:
+        """Read what earlier runs kept; ``has_it`` decides on rows of an older version: True keeps them done."""
+        self.sheet, self._has_it = sheet, has_it
         name = hashlib.sha256(str(sheet.path.resolve()).encode()).hexdigest()[:32]
         self._path = home / FOLDER / f"{name}.json"
         self._there = kept = self._read_progress()
@@ -371,14 +385,43 @@ class Progress:
         rows = told.get("rows") if isinstance(told, dict) else None
         return rows if isinstance(rows, dict) else {}
 
-    @staticmethod
-    def _attempted(row: SheetRow, kept: Any) -> Attempted:
-        if not isinstance(kept, dict) or kept.get("digest") != row.digest:
-            return Attempted(row.digest)
+    def _attempted(self, row: SheetRow, kept: Any) -> Attempted:
         try:
-            return Attempted(**kept)
-        except TypeError:  # of another version of this tool
-            return Attempted(row.digest)
+            found = Attempted(**kept)
+        except TypeError:  # no row yet, or of another version of this tool
+            return Attempted(row.digest, row.content)
+        if found.digest != row.digest:
+            again = "its row in the sheet has changed" if found.result == "passed" else ""
+            return Attempted(row.digest, row.content, again)
+        if found.result == "passed":
+            again = self._why_again(row, found)
+            if again:
+                return Attempted(row.digest, row.content, again, uuid=found.uuid)
+        return replace(found, content=row.content)
+
+    def _why_again(self, row: SheetRow, found: Attempted) -> str:
+        """Return why a row that has passed is done once more, "" if it stays done."""
+        if found.content is None:  # finished by an older version, which kept no digests
+            same = found.uuid is not None and self._has_it(row, bytes.fromhex(found.uuid))
+            return "" if same else "its board has another datasheet than the sheet gives"
+        changed = [what for what, digest in row.content.items() if found.content.get(what) != digest]
+        return f"its {' and '.join(changed)} changed" if changed else ""
+
+    @property
+    def again(self) -> tuple[str, ...]:
+        """Which rows are done once more, and why, in sentences."""
+        found: dict[str, list[int]] = {}
+        for row in self.open:
+            if self.rows[row.number].again:
+                found.setdefault(self.rows[row.number].again, []).append(row.number)
+        return tuple(
+            f"{'Rows' if len(rows) > 1 else 'Row'} {_numbers(rows)}: provisioned again, because {why}."
+            for why, rows in found.items()
+        )
+
+    def has_passed(self, uuid: bytes) -> bool:
+        """True if the row of this board is done."""
+        return any(row.uuid == uuid.hex() and row.result == "passed" for row in self.rows.values())
 
     def save(self, *changed: SheetRow) -> None:
         """Put these rows (all, where none is named) onto the disk, beside what another run of this sheet put there.
@@ -490,16 +533,19 @@ class Progress:
         attempted.message = board.failure.message if board.failure is not None else ""
         if board.done is not None:
             attempted.message = attempted.message or " ".join(board.done.warnings)
+        if attempted.again:
+            attempted.message = f"Provisioned again, because {attempted.again}. {attempted.message}".rstrip()
+        if board.done is not None:
             attempted.steps = {step.name: step.seconds for step in board.done.steps}
         self._tried = self._tried | {row.number}
         self.worst = worse(self.worst, board.failure)
         self.save(row)
 
-    def ran_out(self, seconds: float) -> None:
-        """Note that no board came in time for the rows that nobody tried, if there are any."""
+    def ran_out(self, how: str) -> None:
+        """Note that no board came for the rows that were not tried, if there are any; ``how``: was tapped, answered."""
         if self.untried:
             missed = ", ".join(str(row.number) for row in self.untried[:10])
-            self.worst = worse(self.worst, NoNode(f"No board was tapped within {seconds:.0f} s for row {missed}."))
+            self.worst = worse(self.worst, NoNode(f"No board {how} for row {missed}."))
 
     def totals(self) -> BatchTotals:
         """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""

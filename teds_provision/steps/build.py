@@ -254,6 +254,18 @@ def digest_of(profile: Profile) -> str:
     return profile.composed[place].hex()
 
 
+def content_digests(prepared: Prepared) -> tuple[str, str]:
+    """Return SHA-256 (hex) of the profile with all that it extends, and of the fitted calibrations; "" for none."""
+    profile, calibrations = prepared.profile, prepared.calibrations
+    if profile is None:
+        return "", ""
+    if calibrations is None:
+        return digest_of(profile), ""
+    blocks = _built_of(profile, _NOBODY, calibrations, None, 2007).blocks
+    fitted = [[*block, octets.hex()] for block, octets in sorted(blocks.items()) if block[1] == AccessCode.CALIBRATION]
+    return digest_of(profile), hashlib.sha256(json.dumps(fitted).encode()).hexdigest()
+
+
 def _digest(profile: Profile) -> bytes:
     blocks = _built_of(profile, _NOBODY, {}, None, 2007).blocks
     said = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]

@@ -304,6 +304,7 @@ class IdleStop(threading.Event):
     def __init__(self, seconds: float | None) -> None:
         super().__init__()
         self._seconds, self._asked = seconds, False
+        self._busy, self._counting = 0, threading.Lock()
         self.renew()
 
     def ask(self) -> None:
@@ -314,13 +315,30 @@ class IdleStop(threading.Event):
         """Something happened: wait the whole time again."""
         self._until = None if self._seconds is None else time.monotonic() + self._seconds
 
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        """Suspend the time-out while a board is worked on: it limits the wait for the next board, not the work."""
+        with self._counting:
+            self._busy += 1
+        try:
+            yield
+        finally:
+            self.renew()  # before the count goes down: no instant at which the old time is over
+            with self._counting:
+                self._busy -= 1
+
+    @property
+    def is_asked(self) -> bool:
+        """True if a person or a signal asked to stop; a time-out does not count."""
+        return self._asked or super().is_set()
+
     @property
     def ran_out(self) -> bool:
         """Whether the time is over, and not somebody said stop."""
         return self._is_over() and not self._asked and not super().is_set()
 
     def _is_over(self) -> bool:
-        return self._until is not None and time.monotonic() >= self._until
+        return not self._busy and self._until is not None and time.monotonic() >= self._until
 
     def is_set(self) -> bool:
         """Whether somebody said stop, or the time is over."""

@@ -304,6 +304,40 @@ def test_of_many_on_a_bus_each_line_names_its_node_and_one_without_the_calibrati
     assert (again.code, "1 failed" in again.out) == (6, True), "it is not finished the second time either"
 
 
+@pytest.mark.needs("a slow chip")
+def test_every_board_of_a_sheet_counts_whatever_the_time_out_and_a_corrected_calibration_is_written(
+    desk: Desk, station: Station, tmp_path: Path
+) -> None:
+    """The idle timer ran during discovery: six boards were finished, and the report knew one of them, exit 5."""
+    nodes = [desk.node(f"node{number}").start("--crypto-delay", "150", nfc=False, can=True) for number in range(3)]
+    curve = tmp_path / "curve.csv"
+    curve.write_text(f"# date: 2026-11-01\n{CALIBRATION.format(middle=180)}")
+    rows = [{"uuid": node.uuid, "profile": ANGLE, "calibration": "curve.csv"} for node in nodes]
+    file, report = sheet(tmp_path / "boards.csv", *rows), tmp_path / "report.csv"
+    words = ["--json", "provision", "--all", "--batch", file, "--report", report, "--timeout", "1"]
+    words += desk.links.over("can")
+    outcome = station.run(*words)
+    *lines, last = lines_of(outcome)
+    assert (outcome.code, last["totals"]["passed"], len(lines)) == (0, 3, 3), outcome
+
+    curve.write_text(f"# date: 2026-11-01\n{CALIBRATION.format(middle=181)}")
+    outcome = station.run(*words)
+    *lines, last = lines_of(outcome)
+    assert [results(line)["write"] for line in lines] == ["done"] * 3, outcome
+    assert (outcome.code, last["totals"]["passed"]) == (0, 3)
+    assert report.read_text().count("because its calibration changed") == 3
+    assert "Rows 1, 2, 3: provisioned again" in outcome.err
+
+    nodes[2].stop()
+    sheet(tmp_path / "boards.csv", *[row | {"name": f"arm {at}"} for at, row in enumerate(rows) if at])
+    outcome = station.run(*words)
+    last = lines_of(outcome)[-1]
+    assert (outcome.code, last["totals"]["passed"], last["totals"]["skipped"]) == (5, 1, 1), outcome
+    assert "No board answered on the bus for row 2" in last["error"]["message"]
+    outcome = station.run(*words[1:])
+    assert outcome.err.count("not in the sheet") == 1, "the first board; a finished one is in the sheet"
+
+
 # -- global options and a look at a plan -------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from teds_provision.steps.batch_sheet import (
     BoardResult,
     Declined,
     Progress,
+    SheetRow,
     read_sheet,
     write_report,
 )
@@ -130,6 +132,66 @@ def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tm
     assert row.number == 2
 
 
+CERTIFICATE = "# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,{high}\n"
+
+
+def finished(station: Station, folder: Path, text: str) -> Progress:
+    """A sheet of one row that has passed, kept on the disk."""
+    progress = Progress(station.home, read(station, folder, text))
+    progress.take(progress.sheet.rows[0], board_of(1))
+    progress.rows[1].result = "passed"
+    progress.save()
+    return progress
+
+
+def test_a_row_is_done_again_after_its_calibration_profile_or_name_changed(station: Station, tmp_path: Path) -> None:
+    """The digest of the cells stayed the same: a corrected file of the same name was reported as passed."""
+    (station.home / "profiles").mkdir()
+    base, own, file = station.home / "profiles/base.toml", station.home / "profiles/own.toml", tmp_path / "cal.csv"
+    base.write_text('name = "base"\nextends = "load-cell"\n')
+    own.write_text('name = "own"\nextends = "base"\n')
+    file.write_text(CERTIFICATE.format(high=500))
+    text = "name,calibration,profile\na,cal.csv,own\n"
+    finished(station, tmp_path, text)
+    assert Progress(station.home, read(station, tmp_path, text)).open == []
+
+    file.write_text(CERTIFICATE.format(high=490))
+    again = Progress(station.home, read(station, tmp_path, text))
+    assert [(row.number, again.board_of(row)) for row in again.open] == [(1, board_of(1).hex())]
+    assert again.again == ("Row 1: provisioned again, because its calibration changed.",)
+    file.write_text(CERTIFICATE.format(high=500))
+    assert Progress(station.home, read(station, tmp_path, text)).open == [], "it is as it was"
+
+    base.write_text('name = "base"\nextends = "load-cell"\n[channel.1]\nuncertainty = 0.4\n')
+    assert Progress(station.home, read(station, tmp_path, text)).again == (
+        "Row 1: provisioned again, because its profile changed.",
+    )
+    base.write_text('name = "base"\nextends = "load-cell"\n')
+    renamed = Progress(station.home, read(station, tmp_path, text.replace("a,", "b,", 1)))
+    assert renamed.again == ("Row 1: provisioned again, because its row in the sheet has changed.",)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_row_finished_by_an_older_version_is_done_again_if_its_board_differs(
+    station: Station, tmp_path: Path, same: bool
+) -> None:
+    progress = finished(station, tmp_path, "name\na\n")
+    (kept,) = (station.home / "batches").glob("*.json")
+    told = json.loads(kept.read_text())
+    for member in ("content", "again"):
+        del told["rows"]["1"][member]
+    kept.write_text(json.dumps(told))
+    asked: list[bytes] = []
+
+    def has_it(row: SheetRow, uuid: bytes) -> bool:
+        asked.append(uuid)
+        return same
+
+    again = Progress(station.home, progress.sheet, has_it)
+    assert (asked, len(again.open)) == ([board_of(1)], 0 if same else 1)
+    assert ("another datasheet" in "".join(again.again)) is not same
+
+
 def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Path) -> None:
     """Row 1 was bound to the first board that came; whoever has the name in fact got the name of row 2."""
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
@@ -158,7 +220,7 @@ def test_a_no_is_no_try_of_a_board(station: Station, tmp_path: Path) -> None:
 def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path) -> None:
     """It said "0 passed, 0 failed, 2 skipped", and not why."""
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
-    progress.ran_out(30)
+    progress.ran_out("was tapped within 30 s")
     error = progress.totals().error
     assert isinstance(error, NoNode)
     assert error.message == "0 passed, 0 failed, 2 skipped. No board was tapped within 30 s for row 1, 2."
