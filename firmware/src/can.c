@@ -10,12 +10,19 @@
 #define FIRST_STATION 0xF1u
 #define LAST_STATION 0xF7u
 #define CR_NS TEDS_SECOND
+#define REQUEST_NS (5u * TEDS_SECOND)
+#define MILLISECOND UINT64_C(1000000)
+/* A reply whose flow control is as late as this gives way to another station's request; a station's comes in 1 to 5 ms. */
+#define PATIENT_NS (100 * MILLISECOND)
 #define MOST_OF_12_BITS 4095u
 #define LONGEST_SILENCE UINT64_C(30) /* s */
 #define EVERYONE_NS 50000000u
 #define START_NS 500000000u
 #define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
 #define A_MINUTE (60u * TEDS_SECOND >> UNIT_BITS)
+#define MOVES_AT_ONCE 3u
+#define QUIET_NS (600u * TEDS_SECOND) /* without a conflict: moves are immediate again */
+#define LONGEST_STAY UINT64_C(60)     /* s */
 
 static uint32_t crc_of(const teds_node *node)
 {
@@ -32,48 +39,99 @@ static bool is_sending(const teds_line *line)
     return line->out_state != TEDS_OUT_IDLE;
 }
 
+/* An answer to everyone counts for nothing here: any stranger can keep one waiting. */
 bool teds_can_sending(const teds_node *node)
 {
     for (const teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
-        if (is_sending(line)) {
+        if (is_sending(line) && line->out_reply != NULL) {
             return true;
         }
     }
     return false;
 }
 
-/* A random wait of up to `most` ns; 0 where the chip has no randomness now. */
+/* A random wait of up to `most` ns. While the chip has no randomness it follows from the UUID: nodes that start together
+ * must not speak together. */
 static uint32_t spread(const teds_node *node, uint32_t most)
 {
     uint8_t octets[2];
     if (node->port->random(node->port->user, octets, sizeof octets) != 0) {
-        return 0;
+        const uint32_t crc = crc_of(node);
+        teds_put16(octets, (uint16_t)(crc ^ crc >> 16));
     }
     return (most >> 16) * teds_get16(octets);
 }
 
 /* -- lines ------------------------------------------------------------------------------------------------------------ */
 
-static teds_line *line_of(teds_node *node, uint8_t source)
+/* A message has left, or was given up. */
+static void left(teds_node *node, teds_line *line)
 {
+    line->out_state = TEDS_OUT_IDLE;
+    if (line->out_reply == NULL) {
+        return;
+    }
+    line->out_reply->at = teds_now(node);
+    line->out_reply = NULL;
+    teds_node_reply_left(node, line->source);
+}
+
+/* An answer to everyone that nobody takes up gives way to whatever else is asked. */
+static bool gives_way(const teds_line *line)
+{
+    return line->out_reply == NULL && line->out_state == TEDS_OUT_WAITS;
+}
+
+/* How readily a line is left to another station. A session's own never is, so that what strangers ask takes no place that
+ * a pair with a session needs; nor is that of the long request that is coming in. */
+enum { AT_REST, OF_EVERYONE, OF_A_REPLY, NOT_TO_BE_HAD };
+
+static unsigned holds_on(teds_node *node, const teds_line *line, uint64_t now)
+{
+    if (line->source == 0) {
+        return AT_REST;
+    }
+    if (node->can.rx_line == line || teds_session_on(node, line->source) != NULL) {
+        return NOT_TO_BE_HAD;
+    }
+    if (!is_sending(line)) {
+        return line->asked ? OF_EVERYONE : AT_REST;
+    }
+    if (gives_way(line)) {
+        return OF_EVERYONE;
+    }
+    return line->out_state == TEDS_OUT_WAITS && line->out_due + PATIENT_NS <= now + TEDS_N_BS ? OF_A_REPLY
+                                                                                              : NOT_TO_BE_HAD;
+}
+
+/* A station's line; the most readily left one, and of these the one not used for longest. `most`: what may be taken.
+ * NULL: none is to be had, or the node has moved by giving a reply up. */
+static teds_line *line_of(teds_node *node, uint8_t source, unsigned most, uint64_t now)
+{
+    const uint8_t own = node->can.address;
+    unsigned best = NOT_TO_BE_HAD;
     teds_line *found = NULL;
     node->can.touches++;
     for (teds_line *each = node->lines; each < node->lines + TEDS_CAN_LINES; each++) {
+        unsigned held;
         if (each->source == source) {
             each->touched = node->can.touches;
             return each;
         }
-        if (is_sending(each) || node->can.rx_line == each) {
-            continue;
-        }
-        if (found == NULL || each->touched < found->touched) { /* 0: not used */
+        held = holds_on(node, each, now);
+        if (held <= most && (held < best || (held == best && each->touched < found->touched))) { /* 0: not used */
             found = each;
+            best = held;
         }
+    }
+    if (found != NULL && best == OF_A_REPLY) {
+        left(node, found);
+        found = own == node->can.address ? found : NULL;
     }
     if (found != NULL) {
         memset(found, 0, sizeof *found);
         found->source = source;
-        found->own = node->can.address;
+        found->own = own;
         found->touched = node->can.touches;
     }
     return found;
@@ -116,21 +174,11 @@ void teds_can_move(teds_node *node, uint8_t address)
 {
     if (address != node->can.address) {
         node->can.address = address;
+        node->can.gives_up = false; /* the address that was claimed is left */
+        node->can.turned_away = 0;
         lose_all(node);
     }
     node->can.moves_to = 0;
-}
-
-/* A message has left, or was given up. */
-static void left(teds_node *node, teds_line *line)
-{
-    line->out_state = TEDS_OUT_IDLE;
-    if (line->out_reply == NULL) {
-        return;
-    }
-    line->out_reply->at = teds_now(node);
-    line->out_reply = NULL;
-    teds_node_reply_left(node, line->source);
 }
 
 /* -- requests ----------------------------------------------------------------------------------------------------------- */
@@ -143,6 +191,37 @@ static void refuse(teds_line *line, uint8_t transaction, uint8_t reason, bool fd
     if (TEDS_CAN_FD && !is_sending(line)) {
         line->fd = fd;
     }
+}
+
+/* When a request that begins now has to be whole: 5 s, and what our own STmin takes. */
+static uint64_t ends_at(size_t length, size_t octets_of_frame, uint64_t now)
+{
+    return now + REQUEST_NS + (uint64_t)(length / (octets_of_frame - 1)) * teds_isotp_gap(TEDS_CAN_STMIN);
+}
+
+/* Who else is in the way of a long request of this line; 0: it is taken. A pair with a session goes before a stranger, and
+ * whoever holds the place begins no other request in it while another pair waits. */
+static uint8_t in_the_way(teds_node *node, const teds_line *line, uint64_t now)
+{
+    teds_can *can = &node->can;
+    teds_line *holder = can->rx_line;
+    if (holder == NULL || now >= can->rx_until) {
+        return 0;
+    }
+    if (holder == line) {
+        if (can->rx_wanted) {
+            can->rx_line = NULL;
+            return TEDS_BUSY;
+        }
+        return 0;
+    }
+    if (teds_session_on(node, line->source) != NULL && teds_session_on(node, holder->source) == NULL) {
+        holder->flow = 0;
+        refuse(holder, node->rx[0], TEDS_BUSY, can->rx_frame > 8);
+        return 0;
+    }
+    can->rx_wanted = true;
+    return TEDS_BUSY;
 }
 
 static void request(teds_node *node, teds_line *line, const uint8_t *body, size_t length, bool fd, uint64_t tick)
@@ -180,13 +259,16 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
         if (length <= MOST_OF_12_BITS) {
             return;
         }
-    } else if (length < frame->length - 1u) {
-        return; /* would fit one frame: not to be answered (ISO 15765-2) */
+    } else if (length < (frame->length > 8 ? frame->length - 1u : 8u)) {
+        return; /* would fit one frame: not to be answered (FF_DLmin of ISO 15765-2) */
+    }
+    if (gives_way(line)) {
+        line->out_state = TEDS_OUT_IDLE; /* which leaves the line free to answer in the form of this frame */
     }
     if (length > sizeof node->rx) { /* always so of a length in 32 bits; what is taken is longer than its first frame */
         reason = TEDS_TOO_LARGE;
-    } else if (can->rx_line != NULL && can->rx_line != line && now < can->rx_until) {
-        reason = TEDS_BUSY;
+    } else {
+        reason = in_the_way(node, line, now);
     }
     if (reason != 0) {
         refuse(line, frame->data[head], reason, frame->fd);
@@ -198,7 +280,9 @@ static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *
     can->rx_number = 1;
     can->rx_frame = frame->length;
     can->rx_block = TEDS_CAN_BLOCK;
+    can->rx_wanted = false;
     can->rx_until = now + CR_NS;
+    can->rx_ends = ends_at(length, frame->length, now);
     memcpy(node->rx, frame->data + 2, can->rx_at);
     line->flow = 0x30;
     if (TEDS_CAN_FD && !is_sending(line)) {
@@ -229,7 +313,7 @@ static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_f
     memcpy(node->rx + can->rx_at, frame->data + 1, octets);
     can->rx_at = (uint16_t)(can->rx_at + octets);
     can->rx_number = (uint8_t)((number + 1) & 15);
-    can->rx_until = now + CR_NS;
+    can->rx_until = now + CR_NS < can->rx_ends ? now + CR_NS : can->rx_ends;
     if (can->rx_at == can->rx_length) {
         line->flow = 0;
         request(node, line, node->rx, can->rx_length, frame->fd, now);
@@ -240,17 +324,30 @@ static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_f
     }
 }
 
+/* A station for which there is no line: what it asks gets 17, which needs none. */
+static void turn_away(teds_node *node, const teds_can_frame *frame, uint8_t source)
+{
+    const uint8_t *body = frame->data + 2;
+    size_t octets;
+    if (frame->data[0] >> 4 == 1 ? frame->length >= 8 : teds_isotp_single(frame->data, frame->length, &body, &octets)) {
+        node->can.turned_away = source;
+        node->can.turned_away_transaction = body[0];
+        node->can.turned_away_fd = TEDS_CAN_FD && frame->fd;
+    }
+}
+
 static void physical(teds_node *node, const teds_can_frame *frame, uint64_t tick)
 {
     const uint8_t own = (uint8_t)(frame->identifier >> 8), source = (uint8_t)frame->identifier;
     const uint8_t *body;
     size_t octets;
     teds_line *line;
-    if (own != node->can.address) {
+    if (own != node->can.address || frame->length < 2) {
         return;
     }
-    line = line_of(node, source);
-    if (line == NULL || frame->length < 2) {
+    line = line_of(node, source, OF_A_REPLY, tick);
+    if (line == NULL) {
+        turn_away(node, frame, source);
         return;
     }
     switch (frame->data[0] >> 4) {
@@ -281,7 +378,7 @@ static void functional(teds_node *node, const teds_can_frame *frame, uint64_t no
         memcmp(body + 1, identify, 6) != 0) {
         return; /* nothing else that is asked of everyone is answered */
     }
-    line = line_of(node, (uint8_t)frame->identifier);
+    line = line_of(node, (uint8_t)frame->identifier, OF_EVERYONE, now);
     if (line != NULL) { /* a newer one of the same station takes its place */
         line->asked = true;
         line->asked_transaction = body[0];
@@ -290,22 +387,33 @@ static void functional(teds_node *node, const teds_can_frame *frame, uint64_t no
     }
 }
 
-/* An answer to everyone that nobody takes up gives way to the next. */
+/* It gives way to the next. */
 static bool may_answer_everyone(const teds_line *line)
 {
-    return !is_sending(line) || (line->out_reply == NULL && line->out_state == TEDS_OUT_WAITS);
+    return !is_sending(line) || gives_way(line);
 }
 
-/* It leaves the stored reply alone. */
+/* It leaves the stored reply alone. The octets are those of every line: the transaction leaves with the first frame, now,
+ * and what is under way ends when the rest changes (teds_can_identity_changed). */
 static void answer_everyone(teds_node *node, teds_line *line)
 {
+    uint8_t *octets = node->can.everyone;
     line->asked = false;
-    line->everyone[0] = line->asked_transaction;
-    line->everyone[1] = 1;
-    teds_put16(line->everyone + 2, 23);
-    teds_node_identify(node, line->everyone + 4);
+    octets[0] = line->asked_transaction;
+    octets[1] = 1;
+    teds_put16(octets + 2, 23);
+    teds_node_identify(node, octets + 4);
     line->out_reply = NULL;
-    teds_isotp_begin(line, line->everyone, sizeof line->everyone, TEDS_CAN_FD && line->asked_fd);
+    teds_isotp_begin(line, octets, sizeof node->can.everyone, TEDS_CAN_FD && line->asked_fd);
+}
+
+void teds_can_identity_changed(teds_node *node)
+{
+    for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
+        if (line->out_reply == NULL) {
+            line->out_state = TEDS_OUT_IDLE;
+        }
+    }
 }
 
 /* -- Announce and Claim ------------------------------------------------------------------------------------------------------ */
@@ -332,11 +440,33 @@ static uint8_t next_free(const teds_node *node)
     return address;
 }
 
+/* With an actuator claimed a node keeps its address and goes on announcing. */
+static bool stays(const teds_node *node)
+{
+#if TEDS_OPERATION
+    return teds_actuator_claimed(node);
+#else
+    (void)node;
+    return false;
+#endif
+}
+
+/* Leave this address to the node that claims it. */
+static void give_up_address(teds_node *node, uint64_t now)
+{
+    node->can.gives_up = false;
+    if (!stays(node)) {
+        node->can.moves = (uint8_t)(node->can.moves < UINT8_MAX ? node->can.moves + 1 : UINT8_MAX);
+        teds_can_move(node, next_free(node));
+    }
+    announce_soon(node, now, EVERYONE_NS);
+}
+
 static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now)
 {
+    teds_can *can = &node->can;
     uint8_t address = (uint8_t)frame->identifier;
     uint32_t crc, own;
-    bool stays = false;
     if (address != node->can.address || frame->length != 8 || frame->data[0] != 1 || frame->data[1] > 2) {
         return;
     }
@@ -345,12 +475,18 @@ static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now
     if (crc == own) {
         return; /* a conflict for a person, or our own frame given back */
     }
-    announce_soon(node, now, EVERYONE_NS);
-#if TEDS_OPERATION
-    stays = teds_actuator_claimed(node);
-#endif
-    if (crc < own && !stays) {
-        teds_can_move(node, next_free(node));
+    if (can->conflict_at != 0 && now - can->conflict_at >= QUIET_NS) {
+        can->moves = 0;
+    }
+    can->conflict_at = now;
+    if (crc > own || stays(node)) {
+        announce_soon(node, now, EVERYONE_NS);
+    } else if (can->moves < MOVES_AT_ONCE) {
+        give_up_address(node, now);
+    } else if (!can->gives_up) { /* an Announce proves nothing, and each move ends the sessions here */
+        const unsigned doublings = can->moves - MOVES_AT_ONCE;
+        can->gives_up = true;
+        can->move_at = now + (doublings < 6 ? UINT64_C(1) << doublings : LONGEST_STAY) * TEDS_SECOND;
     }
 }
 
@@ -424,17 +560,16 @@ static void flow_control(teds_line *line, teds_can_frame *frame)
     line->flow = 0;
 }
 
-static void refusal(teds_line *line, teds_can_frame *frame)
+static void refusal(teds_can_frame *frame, uint8_t transaction, uint8_t reason, bool fd)
 {
-    frame->fd = TEDS_CAN_FD && line->fd;
+    frame->fd = TEDS_CAN_FD && fd;
     frame->data[0] = 5;
-    frame->data[1] = line->refused;
+    frame->data[1] = transaction;
     frame->data[2] = 0;
     frame->data[3] = 0;
     frame->data[4] = 1;
-    frame->data[5] = line->refuses;
+    frame->data[5] = reason;
     teds_can_pad(frame, 6);
-    line->refuses = 0;
 }
 
 /* What a line has to say now, flow controls first: somebody waits for them. */
@@ -446,7 +581,8 @@ static bool line_next(teds_node *node, teds_line *line, teds_can_frame *frame, u
         return true;
     }
     if (line->refuses != 0) {
-        refusal(line, frame);
+        refusal(frame, line->refused, line->refuses, line->fd);
+        line->refuses = 0;
         return true;
     }
     if (line->asked && now >= line->asked_due && may_answer_everyone(line)) {
@@ -471,6 +607,12 @@ bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
             return true;
         }
     }
+    if (node->can.turned_away != 0) {
+        frame->identifier = PHYSICAL | (uint32_t)node->can.turned_away << 8 | node->can.address;
+        refusal(frame, node->can.turned_away_transaction, TEDS_BUSY, node->can.turned_away_fd);
+        node->can.turned_away = 0;
+        return true;
+    }
     if (node->can.announces && now >= node->can.announce_due) {
         node->can.announces = false;
         if (may_announce(node, now)) {
@@ -488,7 +630,17 @@ bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
 uint64_t teds_can_poll(teds_node *node, uint64_t now)
 {
     teds_can *can = &node->can;
-    uint64_t due = can->announces ? can->announce_due : TEDS_NEVER;
+    uint64_t due;
+    if (can->gives_up && now >= can->move_at) {
+        give_up_address(node, now);
+    }
+    due = can->turned_away != 0 ? now : TEDS_NEVER;
+    if (can->announces) {
+        teds_sooner(&due, can->announce_due);
+    }
+    if (can->gives_up) {
+        teds_sooner(&due, can->move_at);
+    }
     if (can->rx_line != NULL) {
         if (now >= can->rx_until) {
             can->rx_line = NULL;

@@ -230,6 +230,8 @@ uint8_t teds_state_octet(const teds_node *node);
 enum { TEDS_OUT_IDLE, TEDS_OUT_FIRST, TEDS_OUT_WAITS, TEDS_OUT_RUNS };
 void teds_isotp_begin(teds_line *line, const uint8_t *octets, size_t length, bool fd);
 bool teds_isotp_next(teds_line *line, teds_can_frame *frame, uint64_t now);
+#define TEDS_N_BS TEDS_SECOND /* a flow control is waited for so long */
+uint32_t teds_isotp_gap(uint8_t stmin);
 void teds_isotp_flow(teds_line *line, const uint8_t *data, size_t length, uint64_t now);
 bool teds_isotp_single(const uint8_t *data, size_t length, const uint8_t **body, size_t *octets);
 void teds_can_pad(teds_can_frame *frame, size_t used);
@@ -237,6 +239,8 @@ void teds_can_pad(teds_can_frame *frame, size_t used);
 /* -- can.c --------------------------------------------------------------------------------------------------------- */
 void teds_can_move(teds_node *node, uint8_t address);
 bool teds_can_sending(const teds_node *node);
+/* What Identify says is another thing from now on: answers to everyone that are under way end. */
+void teds_can_identity_changed(teds_node *node);
 uint64_t teds_can_poll(teds_node *node, uint64_t now);
 uint8_t teds_default_address(const teds_node *node);
 

@@ -6,7 +6,6 @@
 #include "inside.h"
 
 #define PADDING 0xCC
-#define WAIT_NS TEDS_SECOND /* N_Bs */
 #define MOST_WAITS 10u
 
 /* Classic frames have 8 octets; FD ones the next length that FD knows. */
@@ -55,7 +54,7 @@ static void first(teds_line *line, teds_can_frame *frame, uint64_t now)
     line->out_at = (uint16_t)(room - 2);
     line->out_number = 1;
     line->out_state = TEDS_OUT_WAITS;
-    line->out_due = now + WAIT_NS;
+    line->out_due = now + TEDS_N_BS;
 }
 
 static void consecutive(teds_line *line, teds_can_frame *frame, uint64_t now)
@@ -73,7 +72,7 @@ static void consecutive(teds_line *line, teds_can_frame *frame, uint64_t now)
         line->out_state = TEDS_OUT_IDLE;
     } else if (line->out_block != 0 && --line->out_block == 0) {
         line->out_state = TEDS_OUT_WAITS;
-        line->out_due = now + WAIT_NS;
+        line->out_due = now + TEDS_N_BS;
     }
 }
 
@@ -92,7 +91,7 @@ bool teds_isotp_next(teds_line *line, teds_can_frame *frame, uint64_t now)
 }
 
 /* STmin: 0 to 7F ms, F1 to F9 hundreds of microseconds; reserved ones count as 127 ms. */
-static uint32_t gap_of(uint8_t stmin)
+uint32_t teds_isotp_gap(uint8_t stmin)
 {
     if (stmin >= 0xF1 && stmin <= 0xF9) {
         return (stmin - 0xF0u) * 100000u;
@@ -109,13 +108,13 @@ void teds_isotp_flow(teds_line *line, const uint8_t *data, size_t length, uint64
     case 0:
         line->out_state = TEDS_OUT_RUNS;
         line->out_block = data[1];
-        line->out_gap = gap_of(data[2]);
+        line->out_gap = teds_isotp_gap(data[2]);
         line->out_due = now;
         line->out_waits = 0;
         break;
     case 1:
         line->out_waits++;
-        line->out_due = now + WAIT_NS;
+        line->out_due = now + TEDS_N_BS;
         if (line->out_waits > MOST_WAITS) {
             line->out_due = 0; /* given up at the next look */
         }
@@ -127,12 +126,11 @@ void teds_isotp_flow(teds_line *line, const uint8_t *data, size_t length, uint64
 
 bool teds_isotp_single(const uint8_t *data, size_t length, const uint8_t **body, size_t *octets)
 {
-    size_t start;
-    if (length < 2 || data[0] >> 4 != 0) {
+    const size_t start = length > 8 ? 2 : 1; /* the length has its escape in frames of more than 8 octets, and only there */
+    if (length < 2 || data[0] >> 4 != 0 || (start == 2 && data[0] != 0)) {
         return false;
     }
-    start = data[0] != 0 ? 1 : 2;
-    *octets = data[0] != 0 ? data[0] : data[1];
+    *octets = data[start - 1];
     *body = data + start;
-    return *octets != 0 && start + *octets <= length;
+    return *octets >= (start == 2 ? 8u : 1u) && start + *octets <= length;
 }

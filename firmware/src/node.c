@@ -150,7 +150,8 @@ static int permitted(teds_node *node, const teds_command *command, const teds_or
     const uint8_t function = command->function;
     int refused;
     if (command->command_class == TEDS_CLASS_SECURITY &&
-        (command->channel != 0 || function == 0 || function == TEDS_NO_FUNCTION || function > TEDS_DRIVE)) {
+        (command->channel != 0 || function == 0 || function == TEDS_NO_FUNCTION || function > TEDS_DRIVE ||
+         (function == TEDS_SET_CAN_ADDRESS && node->config->no_can))) {
         return -TEDS_UNKNOWN_COMMAND;
     }
     refused = origin->session != NULL ? inner(command) : plain(node, command, origin);
@@ -181,7 +182,7 @@ void teds_node_identify(const teds_node *node, uint8_t out[23])
     teds_put32(out + 12, state->epoch);
     teds_put32(out + 16, state->sequence);
     teds_put16(out + 20, TEDS_MAX_MESSAGE);
-    out[22] = node->can.address;
+    out[22] = node->config->no_can ? 0 : node->can.address;
 }
 
 static int identify(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
@@ -433,6 +434,7 @@ teds_stored_reply *teds_reply_place(teds_node *node, teds_link link)
     for (teds_line *line = node->lines; line < node->lines + TEDS_CAN_LINES; line++) {
         if (line->out_reply == found) {
             line->out_state = TEDS_OUT_IDLE;
+            line->out_reply = NULL; /* it is another link's from now on */
         }
     }
 #if TEDS_NFC
@@ -485,10 +487,13 @@ teds_stored_reply *teds_answer(teds_node *node, teds_link link, const teds_arriv
 
 /* -- the life of a node -------------------------------------------------------------------------------------------------- */
 
-int teds_node_init(teds_node *node, const teds_config *config, const teds_port *port)
+int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *config, const teds_port *port)
 {
     uint8_t counter[8];
     int failed;
+    if (built != teds_built()) {
+        return TEDS_E_BUILD; /* this node may be larger than the board's */
+    }
     memset(node, 0, sizeof *node);
     node->config = config;
     node->port = port;
@@ -569,6 +574,9 @@ uint64_t teds_node_poll(teds_node *node, uint64_t now)
         teds_sooner(&next, node->nfc.busy_until);
     }
 #endif
+    if (node->old_slot_due) {
+        teds_sooner(&next, node->old_slot_by);
+    }
     teds_sooner(&next, teds_sessions_poll(node, now)); /* last: what ran above may have opened one */
     return next;
 }

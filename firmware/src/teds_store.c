@@ -17,6 +17,7 @@
 #define UNIT_MOST 32u
 #define PIECE 64u
 #define STAGED_NS (60u * TEDS_SECOND)
+#define OLD_SLOT_NS (15u * TEDS_SECOND) /* no station repeats a command after that */
 static const uint8_t IDENTITY_MAGIC[8] = {'T', 'I', 'D', 'N', 1, 0, 0, 0};
 static const uint8_t SLOT_MAGIC[5] = {'T', 'S', 'L', 'T', 1};
 
@@ -123,29 +124,59 @@ static int make_identity(teds_node *node)
     return close_area(&into, IDENTITY_OCTETS) != 0 ? TEDS_E_FLASH : 0;
 }
 
-static int load_identity(teds_node *node)
+static int read_identity(teds_node *node, bool *good)
 {
     const teds_port *port = node->port;
     uint8_t magic[sizeof IDENTITY_MAGIC];
+    if (read_area(port, TEDS_IDENTITY, 0, magic, sizeof magic) != 0 ||
+        read_area(port, TEDS_IDENTITY, sizeof magic, &node->identity, sizeof node->identity) != 0 ||
+        crc_good(port, TEDS_IDENTITY, IDENTITY_OCTETS, good) != 0) {
+        return TEDS_E_FLASH;
+    }
+    *good = *good && memcmp(magic, IDENTITY_MAGIC, sizeof magic) == 0;
+    return 0;
+}
+
+/* A torn identity is no one's while both slots are blank: the first start writes a slot before the node shows its key. */
+static int forget_torn_identity(const teds_port *port)
+{
+    for (int area = TEDS_SLOT_A; area <= TEDS_SLOT_B; area++) {
+        uint32_t crc;
+        bool blank;
+        if (look_over(port, area, port->slot_octets, &blank, &crc) != 0) {
+            return TEDS_E_FLASH;
+        }
+        if (!blank) {
+            return TEDS_E_IDENTITY;
+        }
+    }
+    return port->erase(port->user, TEDS_IDENTITY) != 0 ? TEDS_E_FLASH : 0;
+}
+
+static int load_identity(teds_node *node)
+{
+    const teds_port *port = node->port;
     uint32_t crc;
     bool blank, good;
     int failed;
     if (look_over(port, TEDS_IDENTITY, port->identity_octets, &blank, &crc) != 0) {
         return TEDS_E_FLASH;
     }
-    failed = blank ? make_identity(node) : 0;
-    if (failed) {
-        return failed;
+    if (!blank) {
+        failed = read_identity(node, &good);
+        if (failed || good) {
+            return failed;
+        }
+        failed = forget_torn_identity(port);
+        if (failed) {
+            return failed;
+        }
     }
-    if (read_area(port, TEDS_IDENTITY, 0, magic, sizeof magic) != 0 ||
-        read_area(port, TEDS_IDENTITY, sizeof magic, &node->identity, sizeof node->identity) != 0 ||
-        crc_good(port, TEDS_IDENTITY, IDENTITY_OCTETS, &good) != 0) {
-        return TEDS_E_FLASH;
+    failed = make_identity(node);
+    if (!failed) {
+        failed = read_identity(node, &good);
     }
-    if (good && memcmp(magic, IDENTITY_MAGIC, sizeof magic) == 0) {
-        return 0;
-    }
-    return blank ? TEDS_E_FLASH : TEDS_E_IDENTITY; /* blank: it does not read back as it was written just now */
+    return failed || good ? failed : TEDS_E_FLASH; /* it does not read back as it was written just now */
 }
 
 /* -- slots ---------------------------------------------------------------------------------------------------------- */
@@ -204,14 +235,21 @@ int teds_store_load(teds_node *node)
         }
         if (look_over(port, TEDS_SLOT_A + i, port->slot_octets, &blank, &crc) != 0 ||
             (!blank && port->erase(port->user, TEDS_SLOT_A + i) != 0)) {
-            return TEDS_E_FLASH;
+            if (!good[0] && !good[1]) {
+                return TEDS_E_FLASH;
+            }
+            node->free_slot_dirty = node->spare_slot_fails = true; /* the other one is whole: enough to measure */
         }
     }
     if (good[0] || good[1]) {
         return take_slot(node, good[0] ? TEDS_SLOT_A : TEDS_SLOT_B, head[good[0] ? 0 : 1]);
     }
-    node->slot = TEDS_SLOT_B; /* nothing is stored: A is written first */
+    node->slot = TEDS_SLOT_B; /* nothing is stored: A is written now, so that it shows that the identity counts */
     node->state.address = teds_default_address(node);
+    if (teds_store_write(node, &node->state, NULL) != 0) {
+        return TEDS_E_FLASH;
+    }
+    node->free_slot_dirty = node->old_slot_due = false; /* B is blank */
     return 0;
 }
 
@@ -223,7 +261,8 @@ static int free_slot(const teds_node *node)
 int teds_make_blank(teds_node *node)
 {
     if (node->free_slot_dirty) {
-        if (node->port->erase(node->port->user, free_slot(node)) != 0) {
+        node->spare_slot_fails = node->port->erase(node->port->user, free_slot(node)) != 0;
+        if (node->spare_slot_fails) {
             return -TEDS_FAILURE;
         }
         node->free_slot_dirty = false;
@@ -237,15 +276,13 @@ void teds_store_poll(teds_node *node, uint64_t now)
     bool waits = teds_can_sending(node);
 #if TEDS_NFC
     waits = waits || now < node->nfc.busy_until;
-#else
-    (void)now;
 #endif
 #if TEDS_BLE
     for (const teds_stored_reply *each = node->replies; each < node->replies + TEDS_REPLIES; each++) {
         waits = waits || teds_ble_sends(node, each);
     }
 #endif
-    if (node->old_slot_due && !waits) {
+    if (node->old_slot_due && (!waits || now >= node->old_slot_by)) {
         node->old_slot_due = false; /* where it fails, the next Write or start erases it */
         (void)teds_make_blank(node);
     }
@@ -360,6 +397,8 @@ int teds_store_write(teds_node *node, const teds_state *state, const teds_signed
     node->slot_counter++;
     node->records_end = HEAD_OCTETS + (uint32_t)octets;
     node->old_slot_due = true;
+    node->old_slot_by = teds_now(node) + OLD_SLOT_NS;
+    teds_can_identity_changed(node);
     return 0;
 }
 

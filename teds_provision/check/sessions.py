@@ -396,8 +396,10 @@ def _moved(probe: Probe, home: int, target: int) -> StationSession:
 
 @rule("address-checks", "Command frames", Stage.SESSION)
 def address_checks(probe: Probe) -> str:
-    """Set CAN address takes one octet, 1 to 239; anything else gets 4 and changes nothing."""
+    """Set CAN address takes one octet, 1 to 239; anything else gets 4 and changes nothing. Without CAN it gets 1."""
     before = probe.identity()
+    if not before.can_address:
+        return probe.sealed_refused(_set_address(1), Reason.UNKNOWN_COMMAND, "address 1, of a node without CAN")
     for payload in (b"", b"\0", bytes([240]), b"\x01\x02"):
         seen = probe.sealed_refused(security_command(Function.SET_CAN_ADDRESS, payload), Reason.BAD_FORM, payload.hex())
     holds(probe.identity() == before, "A refused Set CAN address changed Identify.")

@@ -224,7 +224,9 @@ def run(
     lines, pulse = ActuatorLines(app), node_room.pulse.Pulse()
     make = _boards(app, lines, source, battery)
     nodes = [
-        node_room.virtual.VirtualNode(folder, delays=delays, exclusive=True, board=make, pulse=pulse)
+        node_room.virtual.VirtualNode(
+            folder, delays=delays, exclusive=True, board=make, pulse=pulse, has_can=bool(links["can"])
+        )
         for folder in folders
     ]
     stop = talk.meeting.IdleStop(None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -233,5 +234,9 @@ def _flash_from_json(data: dict[str, Any]) -> Flash:
 
 
 def _replace(path: Path, document: dict[str, Any]) -> None:
+    octets = json.dumps(document).encode()
     with whole_file(path, replace=True) as file:
-        file.write(json.dumps(document).encode())
+        file.write(octets)
+        file.seek(0)
+        if file.read() != octets:  # what is not there does not take the place of the old state
+            raise OSError(errno.EIO, "the flash does not read back as it was written", str(path))

@@ -135,6 +135,7 @@ class VirtualNode:
 
     ``exclusive`` takes the node for this process; see FlashFile. ``board`` makes the hardware from the flash file,
     None: a node that does not measure. With a ``pulse`` it runs in real time: samples, leases, dead-men, data frames.
+    ``has_can`` is False for a board that no bus reaches.
     """
 
     def __init__(
@@ -146,6 +147,7 @@ class VirtualNode:
         exclusive: bool = False,
         board: Callable[[FlashFile], Board | None] = lambda file: None,
         pulse: Pulse | None = None,
+        has_can: bool = True,
     ) -> None:
         self._delays = delays or Delays()
         self.flash_file = FlashFile(folder, delay=self._delays.flash, exclusive=exclusive)
@@ -165,6 +167,7 @@ class VirtualNode:
             verify=self._verify,
             hardware=self.board,
             quick_points=self._delays.crypto <= _QUICK,
+            has_can=has_can,
         )
         if self.board is not None:
             self.board.clock.due, self.board.clock.guard = self._simulated, self._core.interrupt

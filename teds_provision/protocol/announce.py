@@ -22,6 +22,11 @@ LAST_ADDRESS: Final = 239
 START_SPREAD: Final = 0.5
 """An Announce after start or bus-off waits a random time of up to so many seconds."""
 CLAIM_SPREAD: Final = 0.05
+MOVES_AT_ONCE: Final = 3
+"""Moves after a start that wait for nothing; each further one waits 1, 2, 4 … :data:`LONGEST_STAY` seconds."""
+LONGEST_STAY: Final = 60.0
+QUIET: Final = 600.0
+"""After so many seconds without a conflict moves are immediate again."""
 A_MINUTE: Final = 60.0
 MOST_A_MINUTE: Final = 20
 _LAYOUT: Final = struct.Struct(">BBI2s")
@@ -84,6 +89,9 @@ class AddressClaim:
     """Another node with the same CRC has announced itself from the same address: a matter for a person."""
     _heard: set[int] = field(default_factory=set)
     _due: float | None = None
+    _move_due: float | None = None
+    _moves: int = 0
+    _conflict_at: float | None = None
     _sent: deque[float] = field(default_factory=deque)
 
     def start(self, now: float) -> None:
@@ -95,9 +103,10 @@ class AddressClaim:
         self._heard.add(source)
 
     def take(self, announce: Announce, own: int, now: float, *, pinned: bool = False) -> int:
-        """An Announce came in; return the address that the node has from now on, ``own`` where it stays.
+        """An Announce came in; return the address that the node has from now on, ``own`` if it stays.
 
-        ``pinned``: an actuator of the node is claimed, so it stays and goes on announcing.
+        ``pinned``: an actuator of the node is claimed, so it stays and goes on announcing. An Announce proves nothing,
+        and a move ends the sessions: after a few, the next waits until :meth:`move_due`.
         """
         self._heard.add(announce.address)
         if announce.address != own:
@@ -105,10 +114,35 @@ class AddressClaim:
         if announce.crc == self.crc:
             self.conflict = True
             return own
-        self._due = now + self.uniform(0, CLAIM_SPREAD)
+        if self._conflict_at is not None and now - self._conflict_at >= QUIET:
+            self._moves = 0
+        self._conflict_at = now
         if announce.crc > self.crc or pinned:
+            self._due = now + self.uniform(0, CLAIM_SPREAD)
             return own
+        if self._moves < MOVES_AT_ONCE:
+            return self.move(own, now)
+        if self._move_due is None:
+            self._move_due = now + min(LONGEST_STAY, 2.0 ** min(self._moves - MOVES_AT_ONCE, 10))
+        return own
+
+    @property
+    def move_due(self) -> float | None:
+        """Monotonic time at which the node leaves its address to the one that claims it, None for no such time."""
+        return self._move_due
+
+    def move(self, own: int, now: float, *, pinned: bool = False) -> int:
+        """Return the address that the node moves to, and announce there; ``own`` if it stays."""
+        self._move_due = None
+        self._due = now + self.uniform(0, CLAIM_SPREAD)
+        if pinned:
+            return own
+        self._moves += 1
         return self._next(own)
+
+    def relocated(self) -> None:
+        """Give up a move that waits: the node has left the contested address by command."""
+        self._move_due = None
 
     def due(self, now: float) -> float | None:
         """Monotonic time at which the next Announce is to leave, None for none.

@@ -290,8 +290,11 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
 
     Its reply still leaves from the old address; the node is met at the new one from then on. A board that moves at once
     loses that reply: where none comes over the bus, who is at the new address is asked before wiring is spoken of.
-    Raises NodeRefused (3: neither tapped nor in a session; 17: written less than 10 s ago), OtherKey, LinkFailure.
+    Raises NodeRefused (3: neither tapped nor in a session; 17: written less than 10 s ago), OtherKey, LinkFailure,
+    UsageFailure for a node without CAN.
     """
+    if not node.identity.can_address:
+        raise UsageFailure("This node has no CAN, so it has no CAN address.", hint="Nothing needs to be set.")
     if node.identity.can_address == address:
         return False
     open_session(station, node)

@@ -36,6 +36,14 @@ class Memory:
     def fail(self, fails: bool) -> None:
         self.desk.node.fails(fails)
 
+    @property
+    def garbles(self) -> bool:
+        return False
+
+    @garbles.setter
+    def garbles(self, garbles: bool) -> None:
+        self.desk.node.garble(5 if garbles else 0)
+
 
 @dataclass
 class CDesk(Desk):

@@ -33,6 +33,7 @@ def _library(path: Path) -> Any:
     library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
     library.memory_steps.restype = library.memory_chip_calls.restype = library.memory_reads.restype = ctypes.c_long
     library.memory_poll.restype = ctypes.c_uint64
+    library.memory_written.restype, library.memory_spare_slot_fails.restype = ctypes.c_long, ctypes.c_bool
     library.memory_dead.restype = library.memory_misused.restype = library.memory_nfc_written.restype = ctypes.c_bool
     library.memory_ble_advertises.restype = library.memory_ble_drops.restype = ctypes.c_bool
     library.memory_in_session.restype = library.memory_acts.restype = library.memory_streams.restype = ctypes.c_bool
@@ -173,6 +174,20 @@ class MemoryNode:
     def read_fails(self, read: int) -> None:
         """Have this read of its flash fail, it alone, counted from now; 0: none."""
         self._library.memory_read_fails(self._board, ctypes.c_long(read))
+
+    def garble(self, unit: int) -> None:
+        """Have its flash take this unit, counted from now, and read back something else; 0: none."""
+        self._library.memory_garble(self._board, ctypes.c_long(unit))
+
+    @property
+    def written(self) -> int:
+        """Units written since :meth:`garble`."""
+        return int(self._library.memory_written(self._board))
+
+    @property
+    def spare_slot_fails(self) -> bool:
+        """Whether its spare slot could not be erased."""
+        return bool(self._library.memory_spare_slot_fails(self._board))
 
     @property
     def reads(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -78,7 +79,7 @@ def _counters(twins: Twins) -> list[int]:
 BOUNDS = {
     "TEDS_MAX_MESSAGE": (512, 4094),
     "TEDS_STAGING": (512, 60000),
-    "TEDS_CAN_LINES": (1, 7),
+    "TEDS_CAN_LINES": (3, 7),
     "TEDS_CAN_BLOCK": (0, 255),
     "TEDS_CAN_STMIN": (0, 0xF9),
     "TEDS_CHANNELS": (1, 32),
@@ -97,6 +98,56 @@ def _compiles(*words: str, what: list[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["gcc", *warnings, *words, *where, *what], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.parametrize("sessions", [2, 3, 4, 5, 6, 20])
+def test_there_is_a_line_for_each_session_and_one_more_whatever_their_number(sessions: int) -> None:
+    builds.need("make", "gcc")
+    assert _compiles(f"-DTEDS_SESSIONS={sessions}", what=[str(builds.FIRMWARE / "src/can.c")]).returncode == 0
+
+
+_BOARD = """
+#include "teds/node.h"
+#include <stdio.h>
+#include <string.h>
+
+static struct { teds_node node; unsigned char behind[1 << 16]; } ram;
+
+int main(void)
+{
+    teds_config config = {0};
+    teds_port port = {0};
+    int failed;
+    memset(&ram, 0xA5, sizeof ram);
+    failed = teds_node_init(&ram.node, &config, &port);
+    for (size_t i = 0; i < sizeof ram; i++) {
+        if (((unsigned char *)&ram)[i] != 0xA5) {
+            return 1;
+        }
+    }
+    printf("%d", failed);
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize(
+    "library", ["-DTEDS_NFC=1", "-DTEDS_BLE=1", "-DTEDS_STAGING=8192", "-DTEDS_OPERATION=0", "-DTEDS_SHA256_OCTETS=256"]
+)
+def test_a_board_that_was_compiled_with_other_options_is_told_before_anything_is_written(
+    library: str, tmp_path: Path
+) -> None:
+    """The library's node may be larger than the board's: the octets behind it are not its own."""
+    builds.need("make", "gcc")
+    (tmp_path / "board.c").write_text(_BOARD)
+    words = ["gcc", "-std=c99", f"-I{builds.FIRMWARE}/include", f"-I{builds.FIRMWARE}/src", "-O0", "-c"]
+    sources = [str(path) for path in sorted((builds.FIRMWARE / "src").glob("*.c"))]
+    subprocess.run([*words, library, *sources], cwd=tmp_path, check=True)
+    subprocess.run([*words, "board.c"], cwd=tmp_path, check=True)
+    objects = [str(path) for path in tmp_path.glob("*.o")]
+    subprocess.run(["gcc", *objects, "-o", "board"], cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "board"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "-6")
+
+
 @pytest.mark.parametrize("end", [0, 1], ids=["least", "most"])
 def test_it_compiles_at_the_ends_of_every_size(end: int) -> None:
     builds.need("make", "gcc")
@@ -112,7 +163,7 @@ def test_it_compiles_at_the_ends_of_every_size(end: int) -> None:
         *(f"{name}={bounds[0] - 1}" for name, bounds in BOUNDS.items()),
         *(f"{name}={bounds[1] + 1}" for name, bounds in BOUNDS.items()),
         *("TEDS_CAN_STMIN=0x80", "TEDS_SESSIONS=1", "TEDS_REPLIES=1", "TEDS_REPLIES=2 TEDS_NFC=1", "TEDS_REPLIES=128"),
-        *("TEDS_EVENT_CHANNELS=0", "TEDS_EVENT_CHANNELS=9"),
+        *("TEDS_EVENT_CHANNELS=0", "TEDS_EVENT_CHANNELS=9", "TEDS_SESSIONS=4 TEDS_CAN_LINES=4"),
     ],
 )
 def test_a_size_beyond_its_bounds_does_not_compile(word: str) -> None:

@@ -45,7 +45,7 @@ def test_its_tag_keeps_every_rule_of_the_profile(desk: Desk, station: Station, n
     checked = station.ask("node", "check", "--factory", "--yes", *desk.links.over("nfc"))
     assert [rule for rule in checked["checks"] if rule["result"] == "failed"] == []
     skipped = {rule["rule"] for rule in checked["checks"] if rule["result"] == "skipped"}
-    assert skipped == OF_A_BUS | {"nfc-wtx", "operate-lease"}
+    assert skipped == OF_A_BUS | {"nfc-wtx", "operate-lease", "address-moves", "address-back"}
 
 
 def test_a_node_that_was_tapped_is_written_over_the_bus(desk: Desk, station: Station, node: CNode) -> None:

@@ -8,14 +8,15 @@ import pytest
 
 from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
+from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
 from teds_provision.teds.image import SECURITY
 from tests.firmware.desk import CDesk
 from tests.protocol.desk import CREDENTIALS, META, NAME, NODE, UUID
 
 pytestmark = pytest.mark.system
 
-TORN_IDENTITY = -4
+FLASH, TORN_IDENTITY = -2, -4
+IDENTITY = 256
 Act = Callable[[CDesk], Reply]
 
 
@@ -135,23 +136,100 @@ def test_there_is_the_old_state_or_the_new_one(what: str, torn: bool, unit: int,
 
 
 @pytest.mark.parametrize("torn", [False, True], ids=["clean", "torn"])
-def test_at_the_very_first_start_there_is_one_identity_or_none(torn: bool) -> None:
-    """A torn identity is told, never replaced by a second key; a blank one is made."""
-    desk = CDesk()
+@pytest.mark.parametrize("unit", [4, 32])
+def test_the_very_first_start_may_be_cut_anywhere(unit: int, torn: bool) -> None:
+    """No identity was shown yet: the next start begins again, cut as often as the power likes."""
+    desk = CDesk(unit=unit)
     blank = bytes([0xFF]) * len(desk.node.image)
-    seen = []
-    for step in range(1, 60):
+    for step in range(1, 200):
         desk.node.image = blank
         desk.node.start_cut(step, torn=torn)
         cut = desk.node.dead
-        again = desk.node.start()
-        seen.append(again)
-        assert again in (0, TORN_IDENTITY)
-        assert again == TORN_IDENTITY or desk.node.identity().uuid == UUID
+        desk.node.start_cut(step // 2 + 1, torn=torn)
+        assert desk.node.start() == 0, f"step {step}"
+        assert desk.node.identity().uuid == UUID
+        assert not desk.node.misused
+        identity = desk.node.image[:IDENTITY]
+        assert desk.node.start() == 0
+        assert desk.node.image[:IDENTITY] == identity
         if not cut:
             break
-    assert seen[-1] == 0
-    assert TORN_IDENTITY in seen
+    else:
+        pytest.fail("it never came to its end")
+    desk.node.close()
+
+
+@pytest.mark.parametrize("octet", [0, 20, 60, 191])
+def test_an_identity_that_was_shown_is_never_replaced(octet: int) -> None:
+    """A factory node's too: what it has shown may be pinned somewhere."""
+    desk = CDesk()
+    assert desk.node.start() == 0
+    desk.node.image = _with(desk.node.image, octet, desk.node.image[octet] ^ 1)
+    assert desk.node.start() == TORN_IDENTITY
+    desk.node.close()
+
+
+def _with(image: bytes, at: int, octet: int) -> bytes:
+    return image[:at] + bytes([octet]) + image[at + 1 :]
+
+
+def test_a_spare_slot_that_cannot_be_erased_stops_no_good_node() -> None:
+    """It answers, and refuses each change of its state with 11; when erasing works again, all works."""
+    desk = CDesk()
+    provisioned(desk)
+    desk.node.poll()
+    before = desk.shown()
+    spare = next(at for at in (IDENTITY, (IDENTITY + len(desk.node.image)) // 2) if desk.node.image[at] == 0xFF)
+    desk.node.image = _with(desk.node.image, spare + 100, 0)
+    desk.node.fails(True)
+    for _ in range(2):
+        assert desk.node.start() == 0
+        assert desk.node.spare_slot_fails
+        assert desk.shown() == before
+    desk.open()
+    assert desk.stage((1, 12), NAME).reason == Reason.FLASH_FAILURE
+    assert desk.sealed(security_command(Function.RESET, bytes(32))).reason == Reason.FLASH_FAILURE
+    desk.now += 11
+    assert desk.sealed(security_command(Function.SET_CAN_ADDRESS, b"\x21")).reason == Reason.FLASH_FAILURE
+    assert desk.shown() == before
+    desk.node.fails(False)
+    assert desk.stage((1, 12), NAME).ok
+    assert not desk.node.spare_slot_fails
+    assert desk.sealed(security_command(Function.RESET, bytes(32))).ok
+    desk.node.close()
+
+
+def test_without_a_whole_slot_a_spare_that_cannot_be_erased_stops_the_node() -> None:
+    desk = CDesk()
+    size = len(desk.node.image)
+    desk.node.image = b"".join((desk.node.image[:IDENTITY], b"\0" * (size - IDENTITY)))
+    desk.node.fails(True)
+    assert desk.node.start() == FLASH
+    desk.node.close()
+
+
+@pytest.mark.parametrize("act", ["a first key", "another datasheet", "a reset", "an address"])
+def test_what_flash_took_and_reads_back_as_something_else_does_not_count(act: str) -> None:
+    """It accepts each unit, and one bit of one of them is another: 11, and the old state, after a restart, too."""
+    desk = CDesk()
+    BEFORE[act](desk)
+    desk.node.poll()
+    desk.restart()
+    image, key, old = desk.node.image, desk.key, desk.shown()
+    desk.node.garble(0)
+    assert ACTS[act](desk).ok
+    units = desk.node.written
+    assert units > 20
+    for unit in {1, 2, units // 3, units // 2, units - 1, units}:
+        desk.node.image, desk.key = image, key
+        desk.restart()
+        desk.now += 60
+        desk.node.garble(unit)
+        assert ACTS[act](desk).reason == Reason.FLASH_FAILURE, f"unit {unit}"
+        assert desk.shown() == old
+        desk.node.garble(0)
+        desk.restart()
+        assert desk.shown() == old, f"unit {unit}: after a restart"
     desk.node.close()
 
 

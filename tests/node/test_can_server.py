@@ -267,15 +267,15 @@ def test_an_equal_crc_is_told_to_a_person(hub: Hub, node: EchoNode) -> None:
         stranger.bus.close()
 
 
-def test_24_nodes_on_one_address_in_two_processes_sort_themselves_out(hub: Hub) -> None:
-    nodes = [EchoNode(0x21, uuid=bytes([number]) * 10) for number in range(24)]
+def test_6_nodes_on_one_address_in_two_processes_sort_themselves_out(hub: Hub) -> None:
+    nodes = [EchoNode(0x21, uuid=bytes([number]) * 10) for number in range(6)]
     servers = [CanServer(hub.spec), CanServer(hub.spec)]
     for number, node in enumerate(nodes):
         servers[number % 2].add(node)
     try:
         for server in servers:
             server.start()
-        assert wait_for(lambda: len({node.address for node in nodes}) == 24)
+        assert wait_for(lambda: len({node.address for node in nodes}) == 6)
     finally:
         for server in servers:
             server.stop()
@@ -394,6 +394,41 @@ def test_comes_back_from_a_lost_bus_silent_and_announces_again(node: EchoNode) -
     finally:
         server.stop()
         again.close()
+
+
+def test_a_question_to_everyone_in_a_station_s_own_name_costs_its_reply_nothing(
+    hub: Hub, station: Stranger, server: CanServer
+) -> None:
+    """A stranger asks everyone from this address while the reply waits for its flow control, and before it leaves."""
+    request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)
+    pair = Pair(0xF1, 0x21, station.bus.send)
+    held: list[Frame] = []
+    messages: list[bytes] = []
+    pair.send(request)
+    until = time.monotonic() + PATIENCE
+    while time.monotonic() < until and not messages:
+        frame = station.bus.receive(0.05)
+        if frame is None or frame.identifier != 0x18DAF121:
+            continue
+        if frame.data[0] >> 4 == 1 and not held:
+            held.append(frame)
+            station.everyone("0742000080070000")
+            time.sleep(0.1)  # its answer is due after 50 ms
+        pair.take(frame)
+        messages += [] if (message := pair.received()) is None else [message]
+    assert messages == [b"\x05" + bytes(30)]
+
+
+def test_forged_announces_move_it_three_times_at_once_and_then_later(
+    station: Stranger, hub: Hub, node: EchoNode, server: CanServer
+) -> None:
+    for moves in range(1, 4):
+        station.bus.send(Frame(0x1CFF0000 | node.address, Announce(node.address, 0, 0).encode()))
+        assert wait_for(lambda at=0x21 + moves: node.address == at)  # type: ignore[misc]
+    asked = time.monotonic()
+    station.bus.send(Frame(0x1CFF0024, Announce(0x24, 0, 0).encode()))
+    assert wait_for(lambda: node.address == 0x25)
+    assert time.monotonic() - asked >= 1.0
 
 
 def test_a_repetition_that_meets_the_reply_costs_neither(station: Stranger, server: CanServer) -> None:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from dataclasses import replace
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import pytest
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked
+from teds_provision.files import whole_file
+from teds_provision.node import flash_file
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import Delays, VirtualNode
 from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.protocol.flash import FlashFailure
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import StationSession
@@ -19,6 +28,82 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 
 from ..protocol.desk import CREDENTIALS, UUID, Desk
+
+
+@dataclass
+class BadDisk:
+    """A file that takes what is written and has something else: cut short, or with one octet changed."""
+
+    file: BinaryIO
+    what: str
+
+    def write(self, octets: bytes) -> int:
+        self.file.write(octets[:-3] if self.what == "cut" else octets[:99] + b"?" + octets[100:])
+        return len(octets)
+
+    def seek(self, at: int) -> int:
+        return self.file.seek(at)
+
+    def read(self) -> bytes:
+        return self.file.read()
+
+
+@pytest.mark.parametrize("what", ["cut", "garbled"])
+def test_what_the_disk_took_and_reads_back_as_something_else_takes_no_place_of_the_old_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    flash = FlashFile.create(tmp_path / "node")
+    before, octets = flash.load(), flash.path.read_bytes()
+
+    @contextmanager
+    def bad_disk(path: Path, *, replace: bool) -> Iterator[BinaryIO]:
+        with whole_file(path, replace=replace) as file:
+            yield cast(BinaryIO, BadDisk(file, what))
+
+    monkeypatch.setattr(flash_file, "whole_file", bad_disk)
+    with pytest.raises(FlashFailure):
+        flash.commit(replace(before, epoch=9))
+    assert (flash.load(), flash.path.read_bytes()) == (before, octets)
+    monkeypatch.undo()
+    flash.commit(replace(before, epoch=9))
+    assert FlashFile(tmp_path / "node").load().epoch == 9
+
+
+def test_the_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    """The process is killed at each call that changes the folder: the old state or the new one, never a part."""
+    flash = FlashFile.create(tmp_path / "node")
+    before = flash.load()
+    after = replace(before, epoch=before.epoch + 1)
+    seen = set()
+    for call in range(1, 40):
+        child = os.fork()
+        if child == 0:
+            _die_at(call, tmp_path / "node")
+            flash.commit(after)
+            os._exit(0)
+        died = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+        now = FlashFile(tmp_path / "node").load()
+        assert now in (before, after), call
+        seen.add(now.epoch)
+        if not died:
+            break
+        for draft in flash.path.parent.glob(".*"):
+            draft.unlink()  # a left-over draft is looked at by the next commit
+        flash.commit(before)
+    else:
+        pytest.fail("it never came to its end")
+    assert seen == {before.epoch, after.epoch}
+
+
+def _die_at(call: int, folder: Path) -> None:
+    """Have this process end at its ``call``-th call from now on that names a file of ``folder``."""
+    calls = itertools.count(1)
+
+    def step(event: str, arguments: tuple[object, ...]) -> None:
+        if str(folder) in str(arguments) and next(calls) == call:
+            os._exit(9)
+
+    sys.addaudithook(step)
 
 
 def test_a_running_node_is_refused_to_another_process(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from teds_provision.protocol.messages.frames import (
 )
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.session import StationSession
+from teds_provision.protocol.tim import Tim
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 
@@ -169,6 +170,16 @@ def test_a_second_change_of_the_address_within_10_s_gets_17_and_4_goes_before() 
     assert desk.plain(address(0x23)).ok, "the 10 s are of one power-up"
 
 
+def test_a_node_without_can_has_no_address_and_does_not_know_128_10() -> None:
+    desk = Desk().agree()
+    desk.tim = Tim(NODE, desk.memory, lambda: desk.now, max_message=desk.max_message, has_can=False)
+    assert desk.tim.identity().can_address == 0
+    assert desk.plain(address(0x21)) == refusal(Reason.UNKNOWN_COMMAND)
+    assert desk.plain(address(0x21), tapped=False) == refusal(Reason.UNKNOWN_COMMAND)
+    desk.open()
+    assert desk.sealed(address(0x21)) == refusal(Reason.UNKNOWN_COMMAND)
+
+
 def test_the_address_that_stands_in_flash_is_not_written_again_and_a_claim_is_undone() -> None:
     desk = Desk()
     assert desk.plain(address(0x21)).ok
@@ -187,6 +198,21 @@ def test_a_change_of_the_address_that_flash_refused_does_not_count() -> None:
     assert desk.plain(address(0x21)) == refusal(Reason.FLASH_FAILURE)
     desk.memory.fail = False
     assert desk.plain(address(0x21)).ok
+
+
+@pytest.mark.parametrize("what", ["an address", "a reset", "a datasheet"])
+def test_what_flash_took_and_reads_back_as_something_else_gets_11_and_does_not_count(what: str) -> None:
+    desk = Desk().provision().open()
+    before = desk.tim.identity()
+    desk.memory.garbles = True
+    if what == "a datasheet":
+        said = desk.commit({(0, 1): META})
+    else:
+        said = desk.sealed(address(0x21) if what == "an address" else security_command(Function.RESET, CHALLENGE))
+    assert said.reason == Reason.FLASH_FAILURE
+    assert desk.tim.identity() == before
+    desk.memory.garbles = False
+    assert desk.sealed(security_command(Function.RESET, CHALLENGE)).ok
 
 
 @pytest.mark.parametrize("chip", ["random", "one_time", "key"])

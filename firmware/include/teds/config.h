@@ -27,9 +27,16 @@
 #define TEDS_REPLIES (TEDS_SESSIONS + 1)
 #endif
 
-/* Stations that a node keeps ISO-TP state for at once (sources F1 to F7). */
+/* Stations that a node keeps ISO-TP state for at once (sources F1 to F7): each session keeps its own, and one more than
+ * sessions is for everybody else. With all seven, every station has one. */
 #ifndef TEDS_CAN_LINES
+#if TEDS_SESSIONS < 3
 #define TEDS_CAN_LINES 4
+#elif TEDS_SESSIONS < 6
+#define TEDS_CAN_LINES (TEDS_SESSIONS + 1)
+#else
+#define TEDS_CAN_LINES 7
+#endif
 #endif
 
 /* 1: answers CAN FD in FD. 0: classic frames alone. */
@@ -120,6 +127,9 @@
 #endif
 #if TEDS_CAN_LINES < 1 || TEDS_CAN_LINES > 7
 #error "one to seven lines: there are no more stations"
+#endif
+#if TEDS_CAN_LINES < 7 && TEDS_CAN_LINES <= TEDS_SESSIONS
+#error "a line more than sessions, or all seven: a stranger's question takes no line that a session needs"
 #endif
 #if TEDS_CAN_BLOCK < 0 || TEDS_CAN_BLOCK > 255
 #error "TEDS_CAN_BLOCK is 0 to 255"

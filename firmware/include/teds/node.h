@@ -15,8 +15,9 @@ enum {
     TEDS_E_USAGE = -1,    /* a port or configuration that cannot be */
     TEDS_E_FLASH = -2,    /* flash failed */
     TEDS_E_RANDOM = -3,   /* no randomness */
-    TEDS_E_IDENTITY = -4, /* the identity area is torn: a node never makes a second key over a first */
-    TEDS_E_CRYPTO = -5
+    TEDS_E_IDENTITY = -4, /* the identity area is torn: a node never makes a second key over one that it has shown */
+    TEDS_E_CRYPTO = -5,
+    TEDS_E_BUILD = -6 /* board and library were compiled with different options or sizes */
 };
 
 /* A link is the station's address: F1 to F7 on CAN, 1 on NFC, 2 and up on BLE. */
@@ -46,6 +47,7 @@ typedef struct teds_config {
     const teds_fixed *fixed;
     size_t fixed_count;
     bool quick_points; /* the chip's point arithmetic takes 5 ms at most */
+    bool no_can;       /* the board has no CAN: Identify reports address 0, and 128.10 gets 1 */
     struct {
         bool present;      /* the board has an antenna: a tap is a tap, and its bus is never one */
         uint8_t wt_int;    /* how soon a reader may look for an answer: 2^(wt_int / 4 - 1) ms; multiples of 4 */
@@ -198,7 +200,6 @@ typedef struct teds_line {
     uint32_t touched;             /* the later the greater */
     uint64_t out_due;             /* next frame, or when a flow control is given up */
     uint64_t asked_due;
-    uint8_t everyone[27];
 } teds_line;
 
 typedef struct teds_can {
@@ -207,12 +208,18 @@ typedef struct teds_can {
     bool announces;
     uint8_t bus_offs; /* in a row */
     uint8_t announced_at;
+    uint8_t moves; /* because of another node's claim, since the start or the last ten minutes without a conflict */
+    bool gives_up; /* this address, at move_at */
+    bool rx_wanted; /* another pair was refused because of the long request that is coming in */
+    bool turned_away_fd;
+    uint8_t turned_away, turned_away_transaction; /* a station that finds no line is refused; 0: none */
     /* the one long request that may be coming in */
     uint8_t rx_number, rx_block, rx_frame; /* rx_frame: octets of its first frame, and so of all but the last */
     uint16_t rx_length, rx_at;
     teds_line *rx_line;
-    uint64_t rx_until;
+    uint64_t rx_until, rx_ends; /* its next frame, the whole of it */
     uint64_t announce_due, back_at; /* back_at: after bus-off it is silent until then */
+    uint64_t move_at, conflict_at;
     uint32_t touches;
 #if TEDS_OPERATION
     /* the one data message that is being sent */
@@ -223,6 +230,7 @@ typedef struct teds_can {
     uint8_t data[TEDS_MESSAGE];
 #endif
     uint8_t heard[30];
+    uint8_t everyone[27]; /* the answer to everyone: of all lines, but for its first octet, which leaves at once */
     uint32_t announced[20];
 } teds_can;
 
@@ -264,11 +272,13 @@ typedef struct teds_node {
     const teds_config *config;
     uint8_t slot; /* the one that counts */
     bool free_slot_dirty, old_slot_due;
+    bool spare_slot_fails; /* it could not be erased when that was last tried: the node answers and writes nothing */
     teds_session *staging_of; /* NULL: nobody's */
     uint16_t staging_end;
     uint32_t slot_counter, records_end;
     uint64_t opens; /* c */
     uint64_t staged_until; /* then another session may take the staging */
+    uint64_t old_slot_by; /* then the old slot is erased, whoever still waits for a reply */
     uint64_t address_again, strangers_again; /* from then on: a write of the address, a plain Read or List beside streams */
 #if TEDS_OPERATION
     uint32_t safe, stopped; /* bits by place */
@@ -304,9 +314,32 @@ typedef struct teds_node {
 
 /* -- public functions --------------------------------------------------------------------------------------------- */
 
+/* All that board and library have to agree on, as one number: the sizes of what they share, and the options. */
+static inline uint32_t teds_built(void)
+{
+    const uint32_t facts[] = {
+        sizeof(teds_node), sizeof(teds_port), sizeof(teds_config), sizeof(teds_can_frame), sizeof(teds_channel),
+        TEDS_MAX_MESSAGE, TEDS_STAGING, TEDS_SESSIONS, TEDS_REPLIES, TEDS_CAN_LINES, TEDS_CAN_FD, TEDS_OPERATION,
+        TEDS_CHANNELS, TEDS_STREAMS, TEDS_DRIVE_OCTETS, TEDS_EVENT_CHANNELS, TEDS_EVENTS, TEDS_EVENT_OCTETS,
+        TEDS_SHA256_OCTETS, TEDS_NFC, TEDS_MAX_NDEF, TEDS_BLE, TEDS_BLE_CONNECTIONS,
+    };
+    uint32_t built = 0;
+    for (size_t i = 0; i < sizeof facts / sizeof facts[0]; i++) {
+        built = (built ^ facts[i]) * 16777619u;
+    }
+    return built;
+}
+
+/* `built` is the board's teds_built: where it differs from the library's, TEDS_E_BUILD, and nothing is written. */
+int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *config, const teds_port *port);
+
 /* Read both slots, take the newer good one, erase the other if it is not blank; make the identity key at the very first
- * start. `config` and `port` must outlive the node. */
-int teds_node_init(teds_node *node, const teds_config *config, const teds_port *port);
+ * start. A spare slot that cannot be erased stops no node whose other slot is whole: it refuses what would write (11).
+ * `config` and `port` must outlive the node. Inline, so that it carries what the board was compiled with. */
+static inline int teds_node_init(teds_node *node, const teds_config *config, const teds_port *port)
+{
+    return teds_node_init_as_built(node, teds_built(), config, port);
+}
 
 /* One whole command frame to one whole reply frame; gives its length. `frame` is never written and does not overlap
  * `reply`, which has room for TEDS_MAX_MESSAGE octets. Call teds_node_reply_left when its last frame was taken. */

@@ -397,6 +397,7 @@ int main(int count, char **words)
         watch(&port, &own);
     }
     config.quick_points = true;
+    config.no_can = given.can == NULL;
     config.nfc.present = given.nfc != NULL;
     config.nfc.wt_int = 4;
     config.nfc.n_wait = 15;

@@ -7,6 +7,7 @@ size, gap and padding the other side uses.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -37,6 +38,8 @@ FUNCTIONAL: Final = 0x18DBFF00
 _PHYSICAL: Final = 0x18DA0000
 _TIMEOUT_MS: Final = 1000
 """N_Bs and N_Cr of ISO 15765-2: the wait for a flow control or the next consecutive frame."""
+_WHOLE_SECONDS: Final = 5.0
+"""A message as a whole comes within so long (profile.md, "CAN"); we ask for no gap between its frames."""
 _HARMLESS: Final = frozenset(
     {
         "UnexpectedFlowControlError",
@@ -71,11 +74,15 @@ def padded(data: bytes, *, fd: bool) -> bytes:
 
 
 def read_single(data: bytes) -> bytes | None:
-    """Content of a single frame (ISO 15765-2, N_PDU table); None when it is none, or says more than it has."""
+    """Content of a single frame (ISO 15765-2, SF_DL); None when it is none.
+
+    The length is in the first octet of a frame of up to 8 octets, and behind an escape in a longer one.
+    """
     if len(data) < 2 or data[0] >> 4 != _SINGLE:
         return None
-    start, length = (1, data[0]) if data[0] else (2, data[1])
-    if not length or start + length > len(data):
+    escaped = len(data) > 8
+    start, length = (2, data[1]) if escaped else (1, data[0])
+    if (escaped and (data[0] or length < 8)) or not length or start + length > len(data):
         return None
     return data[start : start + length]
 
@@ -92,10 +99,19 @@ class Pair:
     to add to it, and take ten times as long over it.
     """
 
-    def __init__(self, own: int, peer: int, send_frame: Callable[[Frame], None], *, fd: bool = False) -> None:
+    def __init__(
+        self,
+        own: int,
+        peer: int,
+        send_frame: Callable[[Frame], None],
+        *,
+        fd: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         import isotp
 
         self.own, self.peer = own, peer
+        self._clock, self._whole_by = clock, 0.0
         self._receive_id, self._send_id = physical_id(own, peer), physical_id(peer, own)
         self._send_frame = send_frame
         self._waiting: deque[Any] = deque()
@@ -137,6 +153,8 @@ class Pair:
             self.speak(fd=frame.fd)
         if kind == _SINGLE and self._take_single(data):
             return True
+        if kind == _FIRST:
+            self._whole_by = self._clock() + _WHOLE_SECONDS
         self._waiting.append(
             self._message(arbitration_id=frame.identifier, data=data, extended_id=True, is_fd=frame.fd)
         )
@@ -154,7 +172,7 @@ class Pair:
 
     def _take_single(self, data: bytes) -> bool:
         """Take a message of one frame without the state machine; False where that has to see it."""
-        body = read_single(data) if _is_plain(data) and not self._is_busy else None
+        body = read_single(data) if not self._is_busy else None
         if body is None:
             return False
         self._singles.append(body)
@@ -169,6 +187,8 @@ class Pair:
 
     def run(self) -> None:
         """Do what is due: send the next consecutive frame, give up on what never came."""
+        if self.receiving and self._clock() >= self._whole_by:
+            self._logic.stop_receiving()
         self._logic.process()
         while self._waiting:
             self._logic.process()
@@ -251,16 +271,11 @@ def _not_waited_for(_seconds: float) -> None:
     """Only the library's own thread waits; we have none."""
 
 
-def _is_plain(single_frame: bytes) -> bool:
-    """Whether a single frame says its length where ISO 15765-2 wants it: by an escape in frames of more than 8."""
-    return single_frame[0] != 0 if len(single_frame) <= 8 else single_frame[0] == 0 and single_frame[1] > 7
-
-
 def _tolerable(data: bytes) -> bytes | None:
     """Drop what ISO 15765-2 says to ignore and can-isotp would take for the end of a transfer.
 
-    Unknown frame types, single frames with an impossible length, first frames of 7 octets or fewer, or of 4095 or fewer
-    by 32 bits, and unknown flow states are ignored; a reserved STmin counts as 127 ms.
+    Unknown frame types, single frames with an impossible length, first frames of a message that fits one frame, or of
+    4095 octets or fewer by 32 bits, and unknown flow states are ignored; a reserved STmin counts as 127 ms.
     """
     if len(data) < 2:
         return None
@@ -268,7 +283,7 @@ def _tolerable(data: bytes) -> bytes | None:
     if kind == _SINGLE:
         return data if read_single(data) is not None else None
     if kind == _FIRST:
-        return data if len(data) >= 8 and _announced(data)[0] > 7 else None
+        return data if len(data) >= 8 and _announced(data)[0] >= _least_length(data) else None
     if kind == _CONSECUTIVE:
         return data
     return _tolerable_flow(data) if kind == _FLOW else None
@@ -280,6 +295,11 @@ def _announced(first: bytes) -> tuple[int, int]:
         return length, 2
     length = int.from_bytes(first[2:6], "big")
     return (length if length > LONGEST else 0), 6
+
+
+def _least_length(first: bytes) -> int:
+    """Return FF_DLmin of ISO 15765-2: the shortest message that begins with a first frame of this length."""
+    return max(8, len(first) - 1)
 
 
 def _tolerable_flow(data: bytes) -> bytes | None:
@@ -324,7 +344,7 @@ class Reassembly:
         if len(data) < 8 or data[0] >> 4 != 1:
             return None
         length, start = _announced(data)
-        if length <= 7:
+        if length < _least_length(data):
             return None
         return cls(peer, length, bytearray(data[start : start + length]), data, frame.fd)
 

@@ -47,6 +47,7 @@ class Addresses:
         self._seats, self._at_time, self._moved, self._tell, self._echoes = seats, at_time, moved, tell, echoes
         self._known: set[int] = set()
         self._at: dict[int, list[Seat]] = {}
+        self._moves_due: dict[Seat, float] = {}
         self.find()
 
     def at(self, address: int) -> Sequence[Seat]:
@@ -105,12 +106,24 @@ class Addresses:
     def _contested(self, seat: Seat, announce: Announce) -> None:
         now, before, told = time.monotonic(), seat.address, seat.claim.conflict
         address = seat.claim.take(announce, before, now, pinned=seat.handler.actuator_claimed())
+        if (due := seat.claim.move_due) is not None and due != self._moves_due.get(seat):
+            self._moves_due[seat] = due
+            self._at_time(due, functools.partial(self._give_up_address, seat, due))
         if seat.claim.conflict and not told:
             self._tell(
                 f"Another node announces the UUID {seat.uuid.hex()} (or one of equal CRC-32) "
                 f"from the CAN address 0x{before:02x}: disconnect one of them."
             )
-        if address != before:
+        self._go(seat, address)
+
+    def _give_up_address(self, seat: Seat, due: float) -> None:
+        """Make the move that had to wait, unless the node has left that address meanwhile."""
+        if seat.claim.move_due == due:
+            pinned = seat.handler.actuator_claimed()
+            self._go(seat, seat.claim.move(seat.address, time.monotonic(), pinned=pinned))
+
+    def _go(self, seat: Seat, address: int) -> None:
+        if address != seat.address:
             self._moved(seat)
             seat.move(address)
             self.find()
@@ -380,9 +393,11 @@ class CanServer:
         with self._lock:
             if line.seat.address != line.seat.handler.can_address():  # 128.10
                 line.seat.address = line.seat.handler.can_address()
+                line.seat.claim.relocated()
                 self._addresses.find()
             if self._stop.is_set() or line.gone or line.pairs.get(pair.own) is not pair:
                 return  # lost meanwhile
+            self._end_answer_to_everyone(line, pair)
             try:
                 pair.send(reply)
             except LinkFailure:
@@ -410,13 +425,17 @@ class CanServer:
         return random.uniform(0, _SPREAD_SECONDS)
 
     def _answer_everyone(self, seat: Seat, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
-        """It leaves the stored reply alone."""
-        _, pair = seat.pair(station, own)
-        if pair.waits_for_flow:
-            pair.stop_sending()  # nobody has taken the answer before this one
+        """It leaves the stored reply alone, and waits while a reply of this line is under way."""
+        line, pair = seat.pair(station, own)
+        self._end_answer_to_everyone(line, pair)
         pair.speak(fd=fd)
         pair.send(transaction + Reply(True, seat.handler.identify()).encode())
         self._note(seat, pair)
+
+    def _end_answer_to_everyone(self, line: StationLine, pair: Pair) -> None:
+        """Let an answer to everyone that nobody takes up give way; a reply is none."""
+        if pair.waits_for_flow and line.replying is not pair:
+            pair.stop_sending()
 
     # -- losses ----------------------------------------------------------------------------------------------------
 

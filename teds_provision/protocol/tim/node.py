@@ -52,7 +52,8 @@ class Tim:
     from the first moment after a start; ``one_time`` makes the key pair of one Open or one Request (a board may have
     one ready), ``verify`` checks a signature.
     ``sessions`` and ``streams`` are its room for them; ``hardware`` is what it measures and acts with, None: nothing.
-    ``quick_points``: its point arithmetic holds no Sealed frame up by more than 5 ms.
+    ``quick_points``: its point arithmetic holds no Sealed frame up by more than 5 ms. Without CAN (``has_can``) it
+    reports the address 0 and does not know 128.10.
     """
 
     key: PrivateKey
@@ -67,6 +68,7 @@ class Tim:
     sessions: int = 8
     streams: int = 8
     quick_points: bool = True
+    has_can: bool = True
 
     def __post_init__(self) -> None:
         self._flash = self.memory.load()
@@ -100,6 +102,7 @@ class Tim:
             self.clock,
             self._role,
             self.quick_points,
+            self.has_can,
         )
         self._security: dict[int, Callable[[bytes, Origin], bytes]] = {
             Function.REQUEST: self._request,
@@ -124,7 +127,8 @@ class Tim:
     def identity(self) -> Identity:
         """What Identify says now."""
         flash = self._flash
-        return Identity(flash.uuid, flash.state, flash.epoch, flash.sequence, self.max_message, self.can_address)
+        address = self.can_address if self.has_can else 0
+        return Identity(flash.uuid, flash.state, flash.epoch, flash.sequence, self.max_message, address)
 
     @property
     def can_address(self) -> int:
@@ -376,6 +380,8 @@ class Tim:
         if safe and self._role is not None:
             self._role.claims.everything_safe()
         self.memory.commit(state)
+        if self.memory.load() != state:
+            raise FlashFailure  # it took something else: what is not there does not count
         self._flash = state
 
 

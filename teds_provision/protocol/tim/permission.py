@@ -53,13 +53,17 @@ class Permission:
     clock: Callable[[], float]
     role: OperationRole | None
     quick_points: bool
+    has_can: bool = True
     _stranger_at: float | None = None
 
     def check(self, command: Command, origin: Origin) -> None:
         """Raise Refused where the command may not be run now, or is not known."""
         if command.command_class == SECURITY:
             # class 128 goes to channel 0; a function that nobody knows gets 1 in every state
-            if command.channel != 0 or command.function not in _FUNCTIONS:
+            unknown = command.function not in _FUNCTIONS or (
+                command.function == Function.SET_CAN_ADDRESS and not self.has_can
+            )
+            if command.channel != 0 or unknown:
                 raise Refused(Reason.UNKNOWN_COMMAND)
             if origin.session is None:
                 self._plain_security(Function(command.function), command.payload, origin)

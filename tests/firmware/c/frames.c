@@ -147,6 +147,15 @@ static void a_broken_question_is_dropped(void)
     in(board, TO_NODE, "\x05", 1, false);
     in(board, TO_NODE, "\x40\x01\x02", 3, false);
     CHECK(silent(board), "frames that say nothing");
+    in(board, TO_NODE, "\x10\x07\x05\x00\x00\x80\x07\x00", 8, false);
+    CHECK(silent(board), "a first frame of 7 octets: FF_DLmin of a classic frame is 8");
+    in(board, TO_NODE, "\x00\x06\x05\x00\x00\x80\x07\x00", 8, false);
+    in(board, 0x18DBFFF1u, "\x00\x07\x05\x00\x00\x80\x07\x00\x00", 9, false);
+    in(board, TO_NODE, "\x00\x06\x05\x00\x00\x80\x07\x00", 8, true);
+    CHECK(silent(board), "the escape of a length in a frame of 8 octets");
+    in(board, TO_NODE, "\x07\x05\x00\x00\x80\x07\x00\x00\xcc\xcc\xcc\xcc", 12, true);
+    in(board, TO_NODE, "\x00\x07\x05\x00\x00\x80\x07\x00\x00\xcc\xcc\xcc", 12, true);
+    CHECK(silent(board), "a longer frame without it, or with a length that needs none");
     memory_free(board);
 }
 
@@ -326,6 +335,7 @@ static void the_old_slot_is_erased_when_the_reply_has_left(void)
     memory_ble_connected(board, 0, 23);
     memory_ble_written(board, 0, identify, sizeof identify);
     board->node.old_slot_due = board->node.free_slot_dirty = true;
+    board->node.old_slot_by = now + 15000 * MS;
     memory_cut(board, 0, false);
     (void)memory_poll(board);
     CHECK(memory_ble_notify(board, 0, data) == 20 && memory_steps(board) == 0, "the first of two notifications");
@@ -350,6 +360,7 @@ static void the_old_slot_is_erased_when_the_reader_is_quiet(void)
         memory_nfc_field(board, true);
         CHECK(memory_nfc_written(board, select, sizeof select - 1), "a reader writes");
         board->node.old_slot_due = board->node.free_slot_dirty = true;
+        board->node.old_slot_by = now + 15000 * MS;
         memory_cut(board, 0, false);
         due = memory_poll(board);
         CHECK(memory_steps(board) == 0 && due == now + 1000 * MS, "its answer is there, and is to be read");
@@ -395,6 +406,21 @@ static void a_new_address_counts_though_its_reply_is_lost(void)
         CHECK(memory_start(board) == 0 && address_of(board) == 0x55, "and stays there");
         memory_free(board);
     }
+}
+
+/* A board that has no CAN says so: address 0, and 128.10 is unknown in every state. */
+static void a_board_without_can_has_no_address(void)
+{
+    static const uint8_t command[7] = {0, 0, 128, 10, 0, 1, 0x55};
+    static uint8_t reply[TEDS_MAX_MESSAGE];
+    memory_board *board = fresh();
+    board->config.no_can = true;
+    CHECK(address_of(board) == 0, "Identify");
+    for (int tapped = 0; tapped < 2; tapped++) {
+        CHECK(memory_handle(board, 1, TEDS_AT_NFC, tapped != 0, command, 7, reply) == 4 && reply[0] == 0 && reply[3] == 1,
+              "128.10: %u", reply[3]);
+    }
+    memory_free(board);
 }
 
 static int identified(memory_board *board)
@@ -563,7 +589,11 @@ static void any_flow_control_is_borne(void)
     } rows[] = {
         {"\x30\x00", 2, 0},        {"\x35\x00\x00", 3, 0}, {"\x32\x00\x00", 3, 255}, {"\x30\x00\xfa", 3, 127},
         {"\x30\x00\x80", 3, 127}, {"\x30\x00\xff", 3, 127}, {"\x30\x00\x03", 3, 3},   {"\x30\x00\x7f", 3, 127},
+        {"\x30\x00\xf0", 3, 127},
     };
+    for (uint32_t stmin = 0xF1; stmin <= 0xF9; stmin++) {
+        CHECK(teds_isotp_gap((uint8_t)stmin) == (stmin - 0xF0) * 100000u, "STmin %02x", (unsigned)stmin);
+    }
     for (size_t i = 0; i < sizeof rows / sizeof rows[0]; i++) {
         memory_board *board = fresh();
         uint32_t identifier;
@@ -588,8 +618,22 @@ static void any_flow_control_is_borne(void)
     }
 }
 
-/* Four stations' answers are under way, and there is room for no fifth line; of lines at rest the oldest gives way. */
-static void a_fifth_station_is_heard_when_a_line_is_at_rest(void)
+/* Whether this station's plain Open (2 in factory state, one frame each way) is answered at once. */
+static bool is_answered(memory_board *board, uint8_t station)
+{
+    uint32_t identifier = 0;
+    uint8_t data[64];
+    in(board, 0x18DA0000u | OWN << 8 | station, "\x07\x2e\x00\x00\x80\x03\x00\x00", 8, false);
+    while (out(board, &identifier, data) >= 0) {
+        if ((identifier >> 8 & 0xFF) == station && data[0] == 5) {
+            return memcmp(data, "\x05\x2e\x00\x00\x01\x02", 6) == 0;
+        }
+    }
+    return false;
+}
+
+/* Answers to everyone that nobody takes up hold every line: whoever asks the node itself is heard all the same. */
+static void an_answer_to_everyone_gives_way(void)
 {
     memory_board *board = fresh();
     uint32_t identifier;
@@ -601,23 +645,169 @@ static void a_fifth_station_is_heard_when_a_line_is_at_rest(void)
     for (uint8_t i = 0; i < 4; i++) {
         CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "answer %u begins", i);
     }
-    in(board, 0x18DBFFF5u, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
-    in(board, 0x18DA21F5u, "\x07\x2c\x00\x00\x80\x07\x00\x00", 8, false);
-    now += 50 * MS;
-    CHECK(silent(board), "no line for a fifth");
-    in(board, 0x18DBFFF1u, "\x07\x2d\x00\x00\x80\x07\x00\x00", 8, false);
     in(board, 0x18DA21F1u, "\x30\x00\x0a", 3, false);
-    now += 60 * MS;
-    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x21, "an answer that is taken up goes on");
-    now += 1100 * MS;
-    (void)memory_poll(board);
-    for (uint8_t i = 0; i < 7; i++) {
-        now += 10 * MS;
-        in(board, 0x18DA21F1u + i, "\x07\x2e\x00\x00\x80\x03\x00\x00", 8, false);
-        while (out(board, &identifier, data) == 8 && (identifier >> 8 & 0xFF) != 0xF1u + i) {
-        }
-        CHECK((identifier >> 8 & 0xFF) == 0xF1u + i, "station %u, one after another", i);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x21, "one is taken up");
+    for (uint8_t i = 4; i < 7; i++) {
+        CHECK(is_answered(board, (uint8_t)(0xF1 + i)), "station %u", i);
     }
+    now += 10 * MS;
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x22 && (identifier >> 8 & 0xFF) == 0xF1,
+          "what is taken up goes on");
+    memory_free(board);
+}
+
+static void has_session(memory_board *board, size_t place, uint8_t station)
+{
+    board->node.sessions[place].used = true;
+    board->node.sessions[place].link = station;
+    board->node.sessions[place].good_at = now;
+}
+
+/* What strangers ask, of everyone and of the node, from every address and without a flow control: two stations with
+ * sessions are answered each time, a newcomer is answered or refused, and the old slot is erased. */
+static void what_strangers_ask_takes_no_place_of_a_session(void)
+{
+    memory_board *board = fresh();
+    unsigned answered = 0, newcomer = 0;
+    has_session(board, 0, 0xF1);
+    has_session(board, 1, 0xF2);
+    board->node.old_slot_due = board->node.free_slot_dirty = true;
+    board->node.old_slot_by = now + 15000 * MS;
+    for (unsigned round = 0; round < 100; round++) {
+        uint32_t identifier;
+        uint8_t data[64];
+        for (uint8_t station = 0xF1; station <= 0xF7; station++) {
+            in(board, 0x18DBFF00u | station, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+            if (station < 0xF3) {
+                continue;
+            }
+            in(board, 0x18DA0000u | OWN << 8 | station, "\x07\x2b\x00\x00\x80\x07\x00\x00", 8, false);
+            if (round % 2 != 0) {
+                in(board, 0x18DA0000u | OWN << 8 | station, "\x10\x60\x2c\x00\x00\x80\x03\x00", 8, false);
+            }
+            while (out(board, &identifier, data) >= 0) {
+            }
+        }
+        now += 60 * MS;
+        while (out(board, &identifier, data) >= 0) {
+        }
+        answered += is_answered(board, 0xF1) + is_answered(board, 0xF2);
+        in(board, 0x18DA0000u | OWN << 8 | 0xF1, "\x10\x0c\x05\x00\x00\x01\x02\x00", 8, false);
+        (void)out(board, &identifier, data);
+        CHECK((identifier >> 8 & 0xFF) == 0xF1 && data[0] == 0x30, "round %u: its long question is taken", round);
+        in(board, 0x18DA0000u | OWN << 8 | 0xF1, "\x21\x05\x80\x00\x00\x00\x00\xcc", 8, false);
+        in(board, 0x18DA0000u | OWN << 8 | 0xF1, "\x30\x00\x00", 3, false);
+        for (int frames = 0; frames < 36 && out(board, &identifier, data) >= 0; frames++) {
+        }
+        newcomer += is_answered(board, 0xF5);
+        now += 190 * MS;
+    }
+    CHECK(answered == 200, "%u of 200 answers to stations with a session", answered);
+    CHECK(newcomer > 90, "%u of 100 to another station", newcomer);
+    CHECK(!board->node.free_slot_dirty, "the old key is gone from flash");
+    CHECK(board->node.sessions[0].used && board->node.sessions[1].used, "no session ended");
+    memory_free(board);
+}
+
+/* One spare line is that of a long request that comes in, the other's answer has just begun: a station without a line is
+ * refused, not ignored. */
+static void a_station_without_a_line_is_refused(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    has_session(board, 0, 0xF1);
+    has_session(board, 1, 0xF2);
+    CHECK(is_answered(board, 0xF1) && is_answered(board, 0xF2), "their lines");
+    in(board, TO_NODE + 2, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "a long question comes in");
+    in(board, TO_NODE + 3, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "an answer begins");
+    in(board, TO_NODE + 4, "\x07\x2c\x00\x00\x80\x07\x00\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF500u | OWN) &&
+              memcmp(data, "\x05\x2c\x00\x00\x01\x11", 6) == 0, "17");
+    in(board, TO_NODE + 5, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF600u | OWN) &&
+              memcmp(data, "\x05\x79\x00\x00\x01\x11", 6) == 0, "17 in place of a flow control");
+    in(board, TO_NODE + 4, "\x22\x00\x00\x01\x02\x00\x00\x00", 8, false);
+    CHECK(silent(board), "what asks nothing gets nothing");
+    now += 100 * MS;
+    CHECK(is_answered(board, 0xF5), "an answer that nobody takes up within 100 ms gives way");
+    memory_free(board);
+}
+
+/* A long request as a whole ends in bounded time, whoever sends it, and however: by frames that come just in time, or by
+ * beginning again and again. */
+static void one_station_does_not_hold_the_place_of_long_requests(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64], next[8] = {0x20};
+    unsigned taken = 0;
+    in(board, TO_NODE, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "flow control");
+    for (unsigned frames = 1; frames < 100 && taken == 0; frames++) {
+        now += 900 * MS;
+        next[0] = (uint8_t)(0x20 | (frames & 15));
+        in(board, TO_NODE, (const char *)next, 8, false);
+        while (out(board, &identifier, data) >= 0) {
+        }
+        in(board, TO_NODE + 1, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+        CHECK(out(board, &identifier, data) == 8, "an answer of some kind");
+        taken = data[0] == 0x30 ? frames : 0;
+    }
+    CHECK(taken == 6, "taken after %u frames of the one before: 5 s", taken);
+    memory_free(board);
+    board = fresh();
+    for (unsigned i = 0; i < 2; i++) {
+        in(board, TO_NODE, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "it may begin again while nobody else waits");
+    }
+    in(board, TO_NODE + 1, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x79\x00\x00\x01\x11", 6) == 0, "17");
+    in(board, TO_NODE, "\x14\x00\x05\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x05\x00\x00\x01\x11", 6) == 0, "now it waits itself");
+    in(board, TO_NODE + 1, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "and the other one is heard");
+    has_session(board, 0, 0xF3);
+    in(board, TO_NODE + 2, "\x10\x0c\x7a\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x79\x00\x00\x01\x11", 6) == 0,
+          "a pair with a session goes before it, which gets 17");
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF300u | OWN) && data[0] == 0x30, "flow control");
+    memory_free(board);
+}
+
+/* A line whose reply another link's took the place of points to none. */
+static void a_reply_that_is_another_link_s_is_nobodys(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    for (uint8_t i = 0; i < 4; i++) {
+        now += MS;
+        in(board, TO_NODE + i, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "an answer begins");
+    }
+    for (const teds_line *line = board->node.lines; line < board->node.lines + TEDS_CAN_LINES; line++) {
+        CHECK(line->out_reply == NULL || line->out_reply->link == line->source, "the reply of station %02x", line->source);
+    }
+    memory_free(board);
+}
+
+/* What Identify says changes while an answer to everyone is under way: it is not continued with other octets. */
+static void an_answer_to_everyone_is_of_one_moment(void)
+{
+    static const uint8_t command[7] = {0, 0, 128, 10, 0, 1, 0x55};
+    static uint8_t reply[TEDS_MAX_MESSAGE];
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    in(board, 0x18DBFFF3u, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    now += 50 * MS;
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "it begins");
+    CHECK(memory_handle(board, 1, TEDS_AT_NFC, true, command, 7, reply) == 3 && reply[0] == 1, "128.10 at the reader");
+    in(board, TO_NODE + 2, "\x30\x00\x00", 3, false);
+    CHECK(silent(board), "it is not continued");
     memory_free(board);
 }
 
@@ -667,14 +857,71 @@ static void a_move_waits_for_its_own_reply(void)
     memory_free(board);
 }
 
-static void a_chip_without_randomness_answers_everyone_at_once(void)
+/* Nodes that start together without randomness do not speak together: each waits for as long as its UUID says. */
+static void a_chip_without_randomness_waits_by_its_uuid(void)
 {
+    uint64_t waits[2][2];
+    for (uint8_t i = 0; i < 2; i++) {
+        const uint8_t uuid[10] = {1, 2, 3, 4, 5, 6, 7, 8, 9, (uint8_t)(10 + i)};
+        memory_board *board = fresh();
+        memcpy(board->node.identity.uuid, uuid, sizeof uuid);
+        memory_chip_fails(board, 1);
+        memory_at(board, now);
+        teds_can_start(&board->node, now);
+        waits[i][0] = memory_poll(board) - now;
+        memory_chip_fails(board, 1);
+        in(board, 0x18DBFFF1u, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+        waits[i][1] = board->node.lines[0].asked_due - now;
+        CHECK(waits[i][0] > 0 && waits[i][0] <= 500 * MS, "an Announce after %u ms", (unsigned)(waits[i][0] / MS));
+        CHECK(waits[i][1] > 0 && waits[i][1] <= 50 * MS, "an answer after %u ms", (unsigned)(waits[i][1] / MS));
+        memory_free(board);
+    }
+    CHECK(waits[0][0] != waits[1][0] && waits[0][1] != waits[1][1], "each its own");
+}
+
+/* An Announce proves nothing, and each move ends sessions: three are immediate, then each waits twice as long as before. */
+static void forged_announces_move_a_node_less_and_less(void)
+{
+    static const uint8_t waits[] = {1, 2, 4, 8, 16, 32, 60, 60};
+    static const char forged[] = "\x01\x00\x00\x00\x00\x01\x00\x00";
     memory_board *board = fresh();
+    unsigned moves = 0;
     uint32_t identifier;
-    uint8_t data[64];
-    memory_chip_fails(board, 1);
-    in(board, 0x18DBFFF1u, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
-    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "at once");
+    uint8_t before, data[64];
+    for (unsigned i = 0; i < 12; i++) {
+        before = address_of(board);
+        in(board, 0x1CFF0000u | before, forged, 8, false);
+        (void)memory_poll(board);
+        moves += address_of(board) != before;
+        now += 250 * MS;
+    }
+    CHECK(moves == 4, "%u moves in 3 s: three, and one after 1 s", moves);
+    now += 2000 * MS;
+    memory_at(board, now);
+    (void)memory_poll(board);
+    for (size_t i = 2; i < sizeof waits; i++) {
+        before = address_of(board);
+        in(board, 0x1CFF0000u | before, forged, 8, false);
+        now += 100 * MS;
+        in(board, 0x1CFF0000u | before, forged, 8, false);
+        now += (waits[i] * UINT64_C(1000) - 101) * MS;
+        while (out(board, &identifier, data) >= 0) {
+        }
+        CHECK(address_of(board) == before && memory_poll(board) == now + MS, "move %u: it stays for %u s", (unsigned)i, waits[i]);
+        now += MS;
+        memory_at(board, now);
+        (void)memory_poll(board);
+        CHECK(address_of(board) != before, "move %u", (unsigned)i);
+    }
+    now += 599999 * MS;
+    before = address_of(board);
+    in(board, 0x1CFF0000u | before, "\x01\x00\xff\xff\xff\xff\x00\x00", 8, false);
+    now += 600000 * MS;
+    for (unsigned i = 0; i < 4; i++) {
+        before = address_of(board);
+        in(board, 0x1CFF0000u | before, forged, 8, false);
+        CHECK((address_of(board) != before) == (i < 3), "after ten minutes without a conflict, move %u", i);
+    }
     memory_free(board);
 }
 
@@ -810,6 +1057,7 @@ int main(void)
     the_old_slot_is_erased_when_the_reply_has_left();
     the_old_slot_is_erased_when_the_reader_is_quiet();
     a_new_address_counts_though_its_reply_is_lost();
+    a_board_without_can_has_no_address();
     after_bus_off_it_is_silent_for_longer_and_longer();
     nodes_that_meet_sort_themselves_out();
     a_classic_frame_has_eight_octets_at_most();
@@ -817,11 +1065,17 @@ int main(void)
     no_frame_of_a_message_is_shorter_but_the_last();
     one_station_does_not_cut_into_another_s_question();
     any_flow_control_is_borne();
-    a_fifth_station_is_heard_when_a_line_is_at_rest();
+    an_answer_to_everyone_gives_way();
+    what_strangers_ask_takes_no_place_of_a_session();
+    a_station_without_a_line_is_refused();
+    one_station_does_not_hold_the_place_of_long_requests();
+    a_reply_that_is_another_link_s_is_nobodys();
+    an_answer_to_everyone_is_of_one_moment();
     everyone_waits_for_a_station_s_own_answer();
     who_asks_on_after_a_move_asks_nobody();
     a_move_waits_for_its_own_reply();
-    a_chip_without_randomness_answers_everyone_at_once();
+    a_chip_without_randomness_waits_by_its_uuid();
+    forged_announces_move_a_node_less_and_less();
     an_announce_that_is_none_moves_nobody();
     a_board_that_cannot_be_is_told_at_the_start();
     a_key_that_cannot_be_made_ahead_is_made_when_it_is_due();

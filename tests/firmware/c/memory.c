@@ -60,6 +60,9 @@ static int write(void *user, int area, uint32_t at, const uint8_t *octets, size_
     if (!fails || board->torn) {
         memcpy(there, octets, fails ? length / 2 : length);
     }
+    if (++board->written == board->garbled) {
+        *there ^= 0x10;
+    }
     board->next[area] = at + (uint32_t)length;
     return fails ? -1 : 0;
 }
@@ -381,6 +384,22 @@ void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t m
     own->model = model;
     own->octets = octets_of_one;
     own->shortest = shortest;
+}
+
+void memory_garble(memory_board *board, long unit)
+{
+    board->written = 0;
+    board->garbled = unit;
+}
+
+long memory_written(const memory_board *board)
+{
+    return board->written;
+}
+
+bool memory_spare_slot_fails(const memory_board *board)
+{
+    return board->node.spare_slot_fails;
 }
 
 void memory_no_channels(memory_board *board)

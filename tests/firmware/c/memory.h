@@ -30,6 +30,7 @@ typedef struct memory_board {
     uint8_t values[TEDS_CHANNELS][8];
     teds_fixed fixed[8];
     bool fails;
+    long written, garbled;  /* units; the one that is taken and reads back as something else, 0: none */
     long reads, unreadable; /* of flash; the one that fails, 0: none */
     memory_hook hook;
     teds_port chip; /* its cryptography, behind what fails */
@@ -47,6 +48,10 @@ int memory_start(memory_board *board);
 int memory_start_cut(memory_board *board, long step, bool torn);
 void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t model, uint8_t octets,
                     uint32_t shortest);
+/* This unit from now on reads back as something else; 0: none. How many were written. */
+void memory_garble(memory_board *board, long unit);
+long memory_written(const memory_board *board);
+bool memory_spare_slot_fails(const memory_board *board);
 void memory_no_channels(memory_board *board);
 void memory_halt(memory_board *board, uint8_t number, uint8_t halt);
 void memory_hook_up(memory_board *board, memory_hook hook);

@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 
 from teds_provision.links.can import pacing
 from teds_provision.links.can.bus import Bus, Frame
-from teds_provision.links.can.isotp import Pair, Reassembly, addresses, padded, physical_id, read_single, single
+from teds_provision.links.can.isotp import (
+    Pair,
+    Reassembly,
+    addresses,
+    gap_seconds,
+    padded,
+    physical_id,
+    read_single,
+    single,
+)
 from teds_provision.links.can.pacing import Pacer, classic_bits, fd_seconds
 from teds_provision.links.can.shared import Gathering
 from teds_provision.links.can.spec import parse_spec
@@ -138,6 +147,84 @@ def test_a_consecutive_frame_as_long_as_none_can_be_is_ignored(first: int, octet
         take(bytes([0x20 | number & 15]) + body[at : at + first - 1])
         at, number = at + first - 1, number + 1
     assert pair.received() == body
+
+
+@pytest.mark.parametrize(
+    ("octets", "data"),
+    [
+        (8, "00065500008007ff"),  # the escape of a length in a frame of 8 octets
+        (8, "000755000080070000"),
+        (12, "0755000080070000cccccccc"),  # a longer frame without it
+        (12, "000755000080070000cccccc"),  # with a length that needs none
+        (12, "000b55000080070000cccccc"),  # with one that it does not hold
+    ],
+)
+def test_a_single_frame_has_its_length_where_the_standard_wants_it(octets: int, data: str) -> None:
+    frame = Frame(physical_id(NODE, STATION), bytes.fromhex(data)[:octets].ljust(octets, b"\xcc"), octets > 8)
+    wire = Wire()
+    wire.node.take(frame)
+    assert wire.node.received() is None
+    assert read_single(frame.data) is None
+
+
+@pytest.mark.parametrize(("octets", "least"), [(8, 8), (12, 11), (64, 63)])
+def test_a_first_frame_of_what_fits_one_frame_is_ignored(octets: int, least: int) -> None:
+    """FF_DLmin of ISO 15765-2."""
+    for length in (1, 7, 8, least - 1, least):
+        data = (b"\x10" + bytes([length])).ljust(octets, b"A")
+        wire = Wire(fd=octets > 8)
+        wire.node.take(Frame(physical_id(NODE, STATION), data, octets > 8))
+        assert wire.node.receiving is (length >= least), length
+        assert (Reassembly.begin(STATION, Frame(0, data, octets > 8)) is not None) is (length >= least)
+
+
+def test_a_message_that_comes_by_and_by_is_dropped_as_a_whole() -> None:
+    """Each frame just in time for N_Cr, and the message takes longer than 5 s: the next one is heard."""
+    now = 100.0
+    sent: list[Frame] = []
+    pair = Pair(NODE, STATION, sent.append, clock=lambda: now)
+
+    def take(data: bytes) -> None:
+        pair.take(Frame(physical_id(NODE, STATION), data))
+
+    take(b"\x10\x64" + bytes(6))
+    for number in range(1, 9):
+        now += 0.7
+        take(bytes([0x20 | number]) + bytes(7))
+        assert pair.receiving is (now < 105.0), now
+        pair.run()
+    assert pair.received() is None
+    take(b"\x10\x0a" + bytes(6))
+    take(b"\x21" + bytes(7))
+    assert pair.received() == bytes(10)
+
+
+@pytest.mark.parametrize("octet", range(0xF1, 0xFA))
+def test_a_gap_of_hundreds_of_microseconds_is_kept(octet: int) -> None:
+    sent: list[Frame] = []
+    station = Pair(STATION, NODE, sent.append)
+    station.send(bytes(30))
+    station.take(Frame(physical_id(STATION, NODE), bytes([0x30, 0, octet])))
+    gap = (octet - 0xF0) / 10_000
+    assert 0 <= station.due_in(1.0) <= gap
+    began = time.monotonic()
+    while station.sending:
+        time.sleep(station.due_in(1.0))
+        station.run()
+    assert [frame.data[0] for frame in sent] == [0x10, 0x21, 0x22, 0x23, 0x24]
+    assert time.monotonic() - began >= 3 * gap
+    assert gap_seconds(octet) == pytest.approx((octet - 0xF0) / 10_000)
+
+
+def test_a_frame_out_of_sequence_tears_a_message_and_the_one_before_does_not() -> None:
+    partial = Reassembly.begin(NODE, Frame(0, b"\x10\x30" + bytes(6)))
+    assert partial is not None
+    assert partial.take(b"\x21" + bytes(7)) == "more"
+    assert partial.take(b"\x21" + bytes(7)) == "again"
+    assert partial.take(b"\x21" + b"another") == "torn"
+    assert partial.take(b"\x23" + bytes(7)) == "torn"
+    assert partial.take(b"\x20" + bytes(7)) == "torn"
+    assert partial.take(b"\x22" + bytes(7)) == "more"
 
 
 def test_a_second_first_frame_begins_again() -> None:
