@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-coverage firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -121,6 +121,12 @@ faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
 	$(BIN)/pytest -q -m "soak or not soak" tests/plant/test_cut.py tests/plant/test_line_cut.py \
 	  tests/plant/test_server_faults.py
+
+# Every changing command beside every long-running one, started before, during and after it (tests/pairs): about 150
+# pairs, each at three times; 15 minutes on two cores. CELLS="vault rewrap": those whose name contains it. BUSY=1: beside
+# other work, where no rule about time is held.
+pairs: $(VENV)/.dev
+	$(BIN)/python -m tests.pairs.bench $(if $(CELLS),--only '$(CELLS)') $(if $(BUSY),--busy)
 
 # A service on bad days: its clock set, its disk filled, an adapter pulled, 10,000 invented nodes, in rounds.
 MINUTES ?= 30
