@@ -148,7 +148,7 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
 
 _FIELDS = (
     "uuid", "name", "profile", "state", "epoch", "sequence", "fingerprint", "whitelisted", "assurance", "verdict",
-    "last_seen", "due", "channels", "can_address", "group",
+    "last_seen", "due", "channels", "can_address", "group", "retired",
 )  # fmt: skip
 
 
@@ -157,7 +157,7 @@ _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str], int], ...] = (
     ("UUID", lambda node: node["uuid"], 0),
     ("name", lambda node: _cut(shown(node["name"]), _NAME_COLUMNS), 1),
     ("state", lambda node: node["state"] or "unseen", 2),
-    ("verdict", lambda node: node["verdict"] or "", 3),
+    ("verdict", lambda node: node["retired"] or node["verdict"] or "", 3),
     ("profile", lambda node: node["profile"] or "", 6),
     ("epoch", lambda node: str(node["epoch"]), 8),
     ("sequence", lambda node: str(node["sequence"]), 9),
@@ -221,16 +221,17 @@ def _remarks(node: dict[str, Any]) -> str:
 
 
 def _verdict(node: dict[str, Any]) -> str:
-    """The verdict, and what it rests on."""
-    read = node["reading"]
+    """The verdict, and what it rests on; why the node is out of service goes before it."""
+    read, retired = node["reading"], node["retired"]
     if read is None:
-        return node["verdict"] or "never verified"
+        return retired or node["verdict"] or "never verified"
     how = {
         "session": "read in a session",
         "kept": "Security TEDS read in a session, the rest from the stored copy",
         "plain": "read without a session",
     }
-    return f"{node['verdict']} ({how[read['from']]} {local_time(read['at'])}, by {read['by']})"
+    verdict = f"{node['verdict']} ({how[read['from']]} {local_time(read['at'])}, by {read['by']})"
+    return f"{retired}; {verdict}" if retired else verdict
 
 
 def _charge(charging: dict[str, Any] | None) -> str:

@@ -85,7 +85,7 @@ def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any
         "fingerprint": hashlib.sha256(point).hexdigest() if point is not None else entry.get("fingerprint"),
         "whitelisted": known.whitelist is not None,
         "assurance": entry.get("assurance"),
-        "verdict": node.get("retired") or (judged.verified.verdict if judged is not None else None),
+        "verdict": judged.verified.verdict if judged is not None else None,
         "retired": node.get("retired"),
         "reading": judged and {"from": judged.origin, "at": judged.at, "by": judged.by},
         "last_seen": node.get("last_seen"),

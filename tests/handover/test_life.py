@@ -15,6 +15,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import ResetReceipt, agree, reset_node
 from teds_provision.steps.identify import identify
+from teds_provision.steps.inventory import inventory
 from teds_provision.steps.verify import verify_image
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.image import Image
@@ -119,6 +120,14 @@ def test_a_node_out_of_service_signed_that_it_is_reset(pair: Pair) -> None:
         pair.north.nodes.resolve("finger 1")
     with talk(pair.board) as node, pytest.raises(NotWhitelisted):
         agree(pair.north, node, identify(pair.north, node))
+
+
+def test_a_node_out_of_service_is_listed_with_its_verdict_and_with_why_it_is_out(pair: Pair) -> None:
+    """`nodes`, `verify` and `ncap status` name one verdict; the reason is another fact, with a key for itself."""
+    provisioned(pair.north, pair.board)
+    retire(pair.north, pair.board.uuid, None)
+    (listed,) = inventory(pair.north, [pair.board.uuid])
+    assert (listed["verdict"], listed["retired"]) == ("authentic", "decommissioned, unconfirmed")
 
 
 def test_a_node_that_does_not_answer_is_unconfirmed_and_can_be_tried_again(pair: Pair) -> None:
