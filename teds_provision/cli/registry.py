@@ -487,7 +487,7 @@ def sync(app: App, files: Path | None) -> None:
     post, connected = _post(station, files)
     try:
         done = plant.sync.sync(station, post, connected=connected)
-        doors = post.open_doors() if isinstance(post, plant.postgres.PostgresPost) else []
+        doors = plant.reaching.check_database(station, post)
     finally:
         post.close()
     alarms = [one for one in station.plant.tables.alarms() if not one.seen]
@@ -502,9 +502,7 @@ def sync(app: App, files: Path | None) -> None:
     }
     if doors:
         app.warn(
-            f"The stations' database login has rights that it should not have: {', '.join(doors)}. As the"
-            " database's superuser, run:"
-            " registry sql | psql"
+            f"The database allows what it should not: {', '.join(doors)}. As its superuser, run: registry sql | psql"
         )
     app.emit(told, _synced(station, done, alarms))
     if alarms:
@@ -562,6 +560,7 @@ def status(app: App) -> None:
         "alarms": [_alarm(station, one) for one in found.alarms],
         "to_rotate": plant.leaving.due(station),
         "heads": list(found.heads),
+        "open_doors": station.plant.tables.doors(),
     }
     app.emit(told, _shown(station, found))
     if found.exit_code:
@@ -601,6 +600,9 @@ def _shown(station: Station, found: PlantStatus) -> str:
         need = "needs" if review.alone == 1 else "need"
         lines.append(f"{_count(review.alone, 'node')} {need} a tap: only a station that left held the key")
     lines += [f"{'alarm' if one.seen else 'ALARM'} {_alarm_line(station, one)}" for one in found.alarms]
+    doors = station.plant.tables.doors()
+    if doors:
+        lines.append(f"The database allows what it should not: {', '.join(doors)}")
     if found.expired:
         lines.append("The roster has EXPIRED: on the station with the CA key: registry renew")
     elif found.expires_soon:

@@ -35,6 +35,8 @@ MOST_SHOWN: Final = 20
 _SOON: Final = 1.0
 """Seconds to wait after a failure of the connection that listens, and at most for the end of this."""
 _BUSY: Final = 2.0
+_DATABASE_CHECK: Final = 3600.0
+"""Seconds between two looks at what the database allows."""
 _EMPTY_PAGE: Final = 24 * 3600.0
 
 
@@ -48,6 +50,7 @@ class PlantWatch:
         self._post: Post | None = None
         self._listener: Registry | None = None
         self._told = ("", "")
+        self._look_again = 0.0
 
     def start(self) -> None:
         """Begin; raises PolicyRefused where no registry was joined."""
@@ -162,6 +165,9 @@ class PlantWatch:
                 return False
             self._say_daily()
             done = plant.sync.sync(station, self._post)
+            if time.monotonic() >= self._look_again:
+                plant.reaching.check_database(station, self._post)
+                self._look_again = time.monotonic() + _DATABASE_CHECK
         except StoreLocked:
             return True
         except NotMember as error:
@@ -213,11 +219,13 @@ class PlantWatch:
                     if self._listener is None:
                         return
                 self._listener.listen()
+                swept = 0.0
                 while not self._stop.is_set():
+                    if time.monotonic() - swept >= EVERY:  # also finds out whether the connection is there
+                        self._listener.sweep()
+                        swept = time.monotonic()
                     if self._listener.wait(EVERY):
                         self._wake.set()
-                    else:
-                        self._listener.listen()  # also finds out whether the connection is there
             except TedsProvisionError:
                 self._stop.wait(EVERY if self._told[0] == "unreachable" else _SOON)
 

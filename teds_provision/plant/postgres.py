@@ -103,7 +103,11 @@ select what from (values
   ('CREATE on schema public', coalesce((select has_schema_privilege(oid, 'CREATE') from pg_namespace
     where nspname = 'public'), false)),
   ('pg_notify', has_function_privilege('pg_catalog.pg_notify(text, text)', 'EXECUTE')),
-  ('session advisory locks', has_function_privilege('pg_catalog.pg_advisory_lock(bigint)', 'EXECUTE')),
+  ('advisory locks', exists (select from pg_proc where pronamespace = 'pg_catalog'::regnamespace
+    and proname ~ '^pg_(try_)?advisory_' and has_function_privilege(oid, 'EXECUTE'))),
+  ('prepared transactions (max_prepared_transactions must be 0)',
+    current_setting('max_prepared_transactions')::int > 0),
+  ('temporary files without limit', current_setting('temp_file_limit') = '-1'),
   ('large objects', has_function_privilege('pg_catalog.lo_from_bytea(oid, bytea)', 'EXECUTE')),
   ('writing pages past the functions', has_table_privilege('registry.page', 'INSERT, UPDATE, DELETE')),
   ('a superuser''s login', (select rolsuper or rolcreaterole or rolbypassrls from pg_roles
@@ -267,6 +271,20 @@ class Registry:
         """What this login may do that no member should; empty where the schema was run by a superuser."""
         return [str(row[0]) for row in self._rows(_OPEN_DOORS, ())]
 
+    def open_logins(self) -> list[str]:
+        """Return the fingerprints of the stations that can log in."""
+        asked = "select station from registry.member join pg_roles on rolname = role where rolcanlogin"
+        return [row[0].hex() for row in self._rows(asked, ())]
+
+    def sweep(self) -> None:
+        """End other members' transactions that are too old or hold too many locks; any member keeps the others to it.
+
+        A login may change its own time-outs, so the server's settings alone end nothing. Does nothing in a database
+        whose schema has no such function yet.
+        """
+        with suppress(StoreFailure):
+            self._rows("select registry.sweep()", ())
+
     def listen(self) -> None:
         """Be told from now on of what others do; on a connection that does nothing else."""
         self._rows(f"listen {_CHANNEL}", ())
@@ -324,6 +342,14 @@ class PostgresPost:
     def open_doors(self) -> list[str]:
         """What this station's login may do there that no member should: after a pg_restore, for one."""
         return self._registry.open_doors()
+
+    def open_logins(self) -> list[str]:
+        """Return the fingerprints of the stations that can log in."""
+        return self._registry.open_logins()
+
+    def sweep(self) -> None:
+        """End other members' transactions that are too old or hold too many locks."""
+        self._registry.sweep()
 
     def rosters(self) -> Iterator[bytes]:
         """What members posted."""

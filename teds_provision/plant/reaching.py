@@ -39,6 +39,18 @@ def listener(station: Station) -> postgres.Registry | None:
     return postgres.Registry(_login(station, record.url))
 
 
+def check_database(station: Station, post: Post) -> list[str]:
+    """Return what the database allows and should not, and keep it for ``registry status``; empty for a folder."""
+    if not isinstance(post, postgres.PostgresPost):
+        return []
+    post.sweep()
+    doors, roster = post.open_doors(), station.plant.roster
+    left = {one.fingerprint: one.name for one in roster.removed} if roster is not None else {}
+    doors += [f"login of {left[one]}, which was removed" for one in post.open_logins() if one in left]
+    station.plant.tables.put_doors(doors)
+    return doors
+
+
 def absolute(url: str) -> str:
     """A URL whose root certificate is found from any folder."""
     parts = urlsplit(url)

@@ -1,16 +1,30 @@
 -- registry/2. A post office: it carries signed pages and sealed parcels and decides nothing. `registry sql` prints this, with :registry filled in,
 -- as one transaction; it may be run again at any time (after a pg_restore it must be). Run it as a superuser in a database of its own: a mere owner gets
 -- warnings, and the last revokes do not take (measured). What members may call belongs to teds_owner, who is no superuser and cannot log in.
+-- A member may hold locks as long as it likes: its open transactions end first, and again until every table is ours.
 begin;
 set local lock_timeout = '500ms';
+do $$ declare attempt int; part text; begin
+  for attempt in 1..20 loop
+    perform pg_stat_clear_snapshot();
+    perform pg_terminate_backend(a.pid, 2000) from pg_stat_activity a join pg_auth_members x on x.member = a.usesysid
+      join pg_roles r on r.oid = x.roleid and r.rolname = 'teds_member' where a.xact_start is not null;
+    begin
+      for part in select oid::regclass from pg_class where relnamespace = (select oid from pg_namespace where nspname = 'registry') and relkind = 'r' loop
+        execute format('lock table %s in access exclusive mode', part); end loop;
+      exit;
+    exception when lock_not_available then if attempt = 20 then raise; end if; end;
+  end loop; end $$;
 revoke all on schema public from public;
 do $$ begin execute format('revoke all on database %I from public', current_database()); -- no TEMP, no CONNECT
   if not exists (select from pg_roles where rolname = 'teds_member') then create role teds_member nologin; end if;
   if not exists (select from pg_roles where rolname = 'teds_reader') then create role teds_reader nologin; end if;
   if not exists (select from pg_roles where rolname = 'teds_owner') then create role teds_owner nologin; end if;
+  if not exists (select from pg_roles where rolname = 'teds_sweeper') then create role teds_sweeper nologin; end if;
   execute format('grant connect on database %I to teds_member, teds_reader', current_database()); end $$;
 create schema if not exists registry authorization teds_owner;
 grant execute on function pg_catalog.pg_notify(text, text) to teds_owner;
+drop function if exists registry.sweep(); -- it is not teds_owner's, who could not revoke it below
 set local role teds_owner;
 grant usage on schema registry to teds_member, teds_reader;
 create table if not exists registry.meta (one bool primary key default true check (one), version int not null, registry uuid not null);
@@ -96,6 +110,24 @@ grant delete on registry.parcel to teds_member;
 grant select on registry.page, registry.member, registry.roster, registry.meta, registry.found, registry.handed to teds_reader;
 reset role;
 -- what every login may do by default and a thief would like
-revoke execute on function pg_catalog.lo_create(oid), pg_catalog.lo_creat(integer), pg_catalog.lo_from_bytea(oid, bytea), pg_catalog.lowrite(integer, bytea), pg_catalog.lo_put(oid, bigint, bytea), pg_catalog.lo_truncate(integer, integer), pg_catalog.lo_truncate64(integer, bigint) from public;
-revoke execute on function pg_catalog.pg_advisory_lock(bigint), pg_catalog.pg_advisory_lock(integer,integer), pg_catalog.pg_notify(text, text) from public;
+do $$ declare f regprocedure; begin
+  for f in select oid::regprocedure from pg_proc where pronamespace = 'pg_catalog'::regnamespace
+    and (proname ~ '^pg_(try_)?advisory_' or proname ~ '^(lo_(creat|create|from_bytea|put|truncate|truncate64|import|open)|lowrite)$' or proname = 'pg_notify') loop
+    execute format('revoke execute on function %s from public', f); end loop; end $$;
+-- Settings of a login are only defaults, which it may change, but for temp_file_limit. So members hold each other to the limits: sweep(), which each of them
+-- calls now and then, ends a member's transaction that is older than two minutes (a statement of ours takes 60 s at most) or holds more than 1,000 locks.
+create or replace function registry.sweep() returns int language sql security definer set search_path = pg_catalog, pg_temp as $$
+  select count(*) filter (where pg_terminate_backend(a.pid))::int from pg_stat_activity a
+    where a.pid <> pg_backend_pid() and a.usesysid in (select x.member from pg_auth_members x join pg_roles r on r.oid = x.roleid where r.rolname = 'teds_member')
+      and (a.xact_start < clock_timestamp() - interval '120 seconds' or (select count(*) from pg_locks l where l.pid = a.pid) > 1000) $$;
+alter function registry.sweep() owner to teds_sweeper;
+grant pg_signal_backend, pg_read_all_stats to teds_sweeper;
+revoke all on function registry.sweep() from public;
+grant execute on function registry.sweep() to teds_member;
+do $$ declare login name; begin
+  for login in select m.role from registry.member m join pg_roles r on r.rolname = m.role loop
+    execute format('alter role %I connection limit 6', login);
+    execute format('alter role %I set temp_file_limit = %L', login, '512MB');
+    execute format('alter role %I set statement_timeout = %L', login, '60s');
+    execute format('alter role %I set idle_in_transaction_session_timeout = %L', login, '60s'); end loop; end $$;
 commit;

@@ -17,7 +17,8 @@ from teds_provision.plant.scram import is_verifier
 
 VERSION: Final = 2
 """The newest schema that this program knows; it refuses newer ones."""
-CONNECTIONS: Final = 4
+CONNECTIONS: Final = 6
+"""Connections of a login: two each for the service and a production line, one for a sync, one for another command."""
 _FINGERPRINT = re.compile(r"[0-9a-f]{64}")
 
 
@@ -46,8 +47,14 @@ def member_sql(fingerprint: str, verifier: str) -> str:
     return f"""\
 begin;
 set local lock_timeout = '500ms';
+do $$ begin if exists (select from registry.member where role = '{role}' and not open) then
+  raise exception 'this login was closed' using hint = 'To open it: update registry.member set open = true '
+    'where role = ''{role}''; then run this again.'; end if; end $$;
 do $$ begin if not exists (select from pg_roles where rolname = '{role}') then create role {role}; end if; end $$;
 alter role {role} login connection limit {CONNECTIONS} password '{verifier}';
+alter role {role} set temp_file_limit = '512MB';
+alter role {role} set statement_timeout = '60s';
+alter role {role} set idle_in_transaction_session_timeout = '60s';
 grant teds_member to {role};
 insert into registry.member(role, station) values ('{role}', '\\x{fingerprint}') on conflict do nothing;
 commit;
@@ -55,15 +62,27 @@ commit;
 
 
 def close_sql(fingerprint: str) -> str:
-    """Nothing more from this station: its row closed, its login off, its connections ended."""
+    """Return SQL that closes a station's row, disables its login and ends its connections.
+
+    Connections end first: an open transaction of the station may hold the rows that have to change.
+    """
     role = role_of(fingerprint)
+    end = f"pg_terminate_backend(pid, 2000) from pg_stat_activity where usename = '{role}'"
     return f"""\
 begin;
 set local lock_timeout = '500ms';
-update registry.member set open = false where station = '\\x{fingerprint}';
-do $$ begin if exists (select from pg_roles where rolname = '{role}') then alter role {role} nologin; end if; end $$;
+do $$ declare attempt int; begin
+  for attempt in 1..20 loop
+    perform pg_stat_clear_snapshot();
+    perform {end};
+    begin
+      if exists (select from pg_roles where rolname = '{role}') then alter role {role} nologin; end if;
+      update registry.member set open = false where station = '\\x{fingerprint}';
+      exit;
+    exception when lock_not_available then if attempt = 20 then raise; end if; end;
+  end loop; end $$;
 commit;
-select pg_terminate_backend(pid) from pg_stat_activity where usename = '{role}';
+select {end};
 """
 
 

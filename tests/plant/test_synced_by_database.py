@@ -21,6 +21,7 @@ from teds_provision.plant.sync import Synced, resume, sync
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
 from teds_provision.store import TrustRecord, WhitelistEntry
+from tests.cli.shell import call
 from tests.plant.handing import board_of
 from tests.plant.postgres import Database
 from tests.plant.relay import relay
@@ -202,6 +203,20 @@ def test_the_doors_that_a_restore_opens_are_seen_by_every_member(office: Office)
     assert post.open_doors() == ["TEMP for PUBLIC"]
     office.database.sql(registry_sql(office.database.registry))
     assert post.open_doors() == []
+    post.close()
+
+
+def test_what_the_database_allows_too_much_is_kept_for_the_status(office: Office) -> None:
+    west, post = office.member("west", "line"), office.post(office.north)
+    office.sync(office.north, west)
+    assert plant_room.reaching.check_database(office.north, post) == []
+    office.plant.change(plant_room.owner.without(office.north, "west", "stolen", 0))
+    assert plant_room.reaching.check_database(office.north, post) == ["login of west, which was removed"]
+    shown = call(office.north.home, "--json", "registry", "status").json
+    assert shown["open_doors"] == ["login of west, which was removed"]
+    removed = [one.fingerprint for one in office.north.plant.roster.removed]  # type: ignore[union-attr]
+    office.database.sql(registry_sql(office.database.registry, removed))
+    assert plant_room.reaching.check_database(office.north, post) == []
     post.close()
 
 

@@ -177,6 +177,16 @@ class PlantTables:
             for name, value in (("registry-login", wrapped.hex()), ("registry-request", request.decode())):
                 self._database.execute("INSERT OR REPLACE INTO meta VALUES(?, ?)", (name, value))
 
+    def doors(self) -> list[str]:
+        """Return what the database allowed and should not, at the last sync that looked."""
+        row = self._database.one("SELECT value FROM meta WHERE name = 'plant-doors'")
+        return list(json.loads(row[0])) if row is not None else []
+
+    def put_doors(self, doors: Sequence[str]) -> None:
+        """Keep what the database allows and should not."""
+        if self.doors() != list(doors):
+            self._database.execute("INSERT OR REPLACE INTO meta VALUES('plant-doors', ?)", (json.dumps(list(doors)),))
+
     # -- what this station says ------------------------------------------------------------------------------------
 
     def add_event(self, id: str, event: str, uuid: bytes | None) -> None:
