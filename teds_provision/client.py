@@ -62,8 +62,8 @@ class ApiError(TedsProvisionError):
 _EXIT: Final = {
     "usage": 2, "not-found": 3, "not-authentic": 4, "link": 5, "no-reader": 5, "no-node": 5, "node-silent": 5,
     "garbled": 5, "address-conflict": 5, "unproven": 5, "store": 7, "store-changed": 7, "store-locked": 7,
-    "vault-changed": 7, "node-busy": 7, "vault": 7, "no-keyring": 7, "no-passphrase": 7, "wrong-passphrase": 7,
-    "bad-data": 8, "bug": 1,
+    "vault-changed": 7, "vault-locked": 7, "node-busy": 7, "vault": 7, "no-keyring": 7, "no-passphrase": 7,
+    "wrong-passphrase": 7, "bad-data": 8, "bug": 1,
     "bad-request": 2,
 }  # fmt: skip
 _EXIT_BY_STATUS: Final = {401: 6, 403: 6, 404: 3, 409: 6, 413: 8, 415: 8, 421: 6, 422: 6, 423: 6, 429: 6, 503: 5}

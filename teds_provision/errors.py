@@ -234,6 +234,12 @@ class VaultChanged(VaultFailure):
     code = "vault-changed"
 
 
+class VaultLocked(VaultChanged):
+    """Another command changed passphrase and master key, and this process cannot open the vault again by itself."""
+
+    code = "vault-locked"
+
+
 class NoPassphrase(VaultFailure):
     """A passphrase or PIN is needed, and nobody can be asked for it."""
 

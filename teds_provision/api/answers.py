@@ -258,6 +258,13 @@ class Budget(TypedDict):
     limit: float
 
 
+class VaultStatus(TypedDict):
+    """Whether this service can use the station's keys; if not, why, and the command that helps."""
+
+    state: Literal["open", "locked"]
+    problem: Problem | None
+
+
 class Status(TypedDict):
     """The station, its links, measurements and sinks."""
 
@@ -281,6 +288,7 @@ class Status(TypedDict):
     clock_error: float | None
     budget: Budget
     plant: bool
+    vault: NotRequired[VaultStatus]
     write: Annotated[bool, Meta(description="whether this token may change anything")]
 
 

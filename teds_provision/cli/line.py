@@ -446,6 +446,7 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
         threading.Timer(seconds, stop.set).start()
     app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")
     while True:
+        station.unlock()  # ends with vault-locked if another command changed passphrase and master key
         for one in plant.office.answer_all(station, post, inbox, ids, stop=stop.is_set):
             _tell(app, station, one)
         if stop.is_set():

@@ -268,6 +268,9 @@ def status(app: App) -> None:
 def _status(console: Console, found: dict[str, Any]) -> None:
     served = found["url"] or "no page (start it with --http)"
     console.print(f"{found['station']['name']}: {found['detection']} mode, {served}", markup=False)
+    problem = found.get("vault", {}).get("problem")
+    if problem:
+        console.print(f"The vault is locked: {problem['message']} {problem['hint']}", markup=False)
     for link in found["links"]:
         console.print(_link(link), markup=False)
     for node in found["nodes"]:

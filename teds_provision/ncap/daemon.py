@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final, get_args
 
 from teds_provision import __version__
-from teds_provision.errors import Frozen, NotFound, UsageFailure
+from teds_provision.errors import Frozen, NotFound, UsageFailure, VaultFailure
 from teds_provision.links import Port
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
@@ -81,6 +81,7 @@ class Daemon:
         self.url: str | None = None
         self.started = time.time()
         self._version = station.version()
+        self._vault_problem: dict[str, str] | None = None
         self._stop = threading.Event()
         self._guard = threading.Lock()
         source = own_source(station.id)
@@ -164,12 +165,31 @@ class Daemon:
     def _observe(self) -> None:
         """What the command line does beside us is seen within a second."""
         while not self._stop.wait(_LOOK):
+            self._look_at_vault()
             version = self.station.version()
             if version != self._version:
                 self._version = version
                 self.roster.refresh()
                 self.names.forget()
                 self.live.event("store", state="changed")
+
+    def _look_at_vault(self) -> None:
+        """Report when another command locks this process out of the vault, and when it is open again."""
+        problem: dict[str, str] | None = None
+        try:
+            self.station.current_vault()
+        except VaultFailure as failure:
+            problem = {"code": failure.code, "message": failure.message, "hint": failure.hint}
+        if (problem is None) == (self._vault_problem is None):
+            return
+        self._vault_problem = problem
+        if problem is not None:
+            self.live.event("vault", state="locked", why=problem["message"], hint=problem["hint"])
+            return
+        self.live.event("vault", state="open")
+        self.measuring.look_who_is_meant()
+        for watch in self.watches:
+            watch.look_at_all()
 
     # -- links -------------------------------------------------------------------------------------------------------
 
@@ -223,6 +243,7 @@ class Daemon:
             "clock_error": self.measuring.clock_error(),
             "budget": self.measuring.budget(),
             "plant": self.station.plant.joined is not None,
+            "vault": {"state": "open" if self._vault_problem is None else "locked", "problem": self._vault_problem},
         }
 
     def _admits(self, set_point: SetPointCommand) -> bool:

@@ -22,6 +22,7 @@ from teds_provision.ncap.web.app import build
 from teds_provision.ncap.web.guard import Guard, front
 from teds_provision.ncap.web.server import Servers, listen
 from teds_provision.station.station import Station
+from teds_provision.vault.master_socket import MasterSocket
 
 LOCK: Final = "ncap.lock"
 
@@ -79,7 +80,8 @@ def run(station: Station, settings: Settings, tell: Tell) -> None:
         tcp = listen(*settings.http) if settings.http is not None else None
         daemon = Daemon(station, settings)
         try:
-            asyncio.run(_serve(daemon, local, tcp, tell))
+            with MasterSocket(station.home, station.accept_masters):
+                asyncio.run(_serve(daemon, local, tcp, tell))
         finally:
             for listener in (local, tcp):
                 if listener is not None:

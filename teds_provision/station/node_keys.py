@@ -7,7 +7,14 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import NoKeyring, UnknownMaster, VaultChanged, VaultFailure, WrongPassphrase
+from teds_provision.errors import (
+    NoKeyring,
+    UnknownMaster,
+    VaultChanged,
+    VaultFailure,
+    VaultLocked,
+    WrongPassphrase,
+)
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant import Plant
 from teds_provision.station.seals import Seals
@@ -86,7 +93,7 @@ class NodeKeys:
         for record in self._store.keys(uuid):
             try:
                 key = self.unwrap(record)
-            except (WrongPassphrase, NoKeyring):
+            except (WrongPassphrase, NoKeyring, VaultLocked):
                 raise
             except VaultFailure as failure:
                 damaged = failure

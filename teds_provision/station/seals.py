@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import StoreChanged
+from teds_provision.errors import StoreChanged, VaultFailure
 from teds_provision.store import ExportFacts, NodeRecord, StationRecord, Store, TrustRecord, WhitelistEntry
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
+    from teds_provision.vault.master import MasterKeys
 
 SEAL_OCTETS = 16
 _KEY_OCTETS = 32
@@ -161,6 +162,17 @@ class Seals:
             yield f"the end of trust in CA {ca[:_DIGITS]}", mac, "ended ca", (ca,)
 
     # -- when the vault opens --------------------------------------------------------------------------------------
+
+    def opened_by(self, masters: MasterKeys) -> bool:
+        """True if these master keys open the key of the seals, and it is the one that is in use here."""
+        facts = self._store.facts()
+        if facts is None or facts.seal_key is None or self._keyed is None:
+            return False
+        try:
+            key = masters.unwrap(facts.seal_key, context=self._context())
+        except VaultFailure:
+            return False
+        return hmac.compare_digest(_keyed(key).digest(), self._keyed.digest())
 
     def unlocked(self, vault: Vault) -> None:
         """The vault has opened: look at the station's own facts and at trust.

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from teds_provision import vault as vaults
-from teds_provision.errors import NotFound, UnknownMaster, VaultFailure
+from teds_provision.errors import NoPassphrase, NotFound, UnknownMaster, VaultChanged, VaultFailure, VaultLocked
 from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
 from teds_provision.station.identity import DEFAULT_NAME, StationIdentity
@@ -44,11 +44,13 @@ from teds_provision.store.behind import Behind
 from teds_provision.store.database import has_store
 from teds_provision.store.dump import dump
 from teds_provision.store.records import Direction
+from teds_provision.vault import master_socket
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys
     from teds_provision.vault import Ask, Vault
+    from teds_provision.vault.master import MasterKeys
 else:  # cryptography: not for commands that only list
     keys = late("teds_provision.protocol.keys")
 
@@ -123,7 +125,7 @@ class Station:
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
         self.seals = Seals(store, self._opened, tell)
         self.identity = StationIdentity(store, self._opened, self.seals)
-        self.plant = Plant(store, self._opened, self.identity, self.seals)
+        self.plant = Plant(store, self.current_vault, self.identity, self.seals)
         self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened, self.plant)
         self.pins = Pins(store, self.keys, self.seals, self.plant)
         self.policy = Policy(store, self.identity, self.keys, self.pins, self.seals, self.plant)
@@ -222,10 +224,50 @@ class Station:
         self._ask = ask
 
     def _reopened(self) -> Vault:
-        """Take in what another process has written into the vault; nobody is asked, as the store may be held."""
+        """Read the master keys again after another command has changed them. No person is asked: the store may be held.
+
+        Raises VaultLocked if the vault has another passphrase by now and ``unlock`` does not hold it open.
+        """
+        with self._opening:
+            vault = self._opened()
+            try:
+                vault.reread()
+                return vault
+            except VaultChanged as changed:
+                if self.identity.master in vault.masters():  # handed over by the command that made it
+                    return vault
+                try:
+                    opened = vaults.open_vault(self.home, self.id, self.identity.keystore, _ask_no_one, use_agent=True)
+                except VaultFailure:
+                    raise VaultLocked(
+                        "The vault's passphrase and master key were changed by another command.",
+                        hint="To let a running ncap continue: teds-provision unlock. Start any other command again.",
+                    ) from changed
+                self.adopt(opened)
+                return opened
+
+    def current_vault(self) -> Vault:
+        """Return the vault with the master key that wraps now; raises VaultLocked, VaultFailure."""
         vault = self._opened()
-        vault.refresh()
-        return vault
+        return vault if self.identity.master in vault.masters() else self._reopened()
+
+    def accept_masters(self, masters: MasterKeys) -> bool:
+        """Use master keys that a command of this user hands over; False if they are not those of this store.
+
+        They are if the sender knows one that is in use here, or if they open the key that seals this store's rows.
+        """
+        with self._opening:
+            vault = self._vault
+            if vault is None or self.identity.master not in masters.keys:
+                return False
+            here = vault.master_keys().keys
+            common = here.keys() & masters.keys.keys()
+            if any(here[number] != masters.keys[number] for number in common):
+                return False
+            if not common and not self.seals.opened_by(masters):
+                return False
+            vault.accept(masters)
+            return True
 
     def unlock(self, uuid: bytes | None = None) -> None:
         """Open the vault now: nobody is asked for a passphrase while the store is locked or a node lies there.
@@ -233,7 +275,7 @@ class Station:
         With ``uuid`` only where a key of that node is held, as nothing is unwrapped otherwise.
         """
         if uuid is None or self.keys.held(uuid):
-            _ = self.vault
+            self.current_vault()
 
     def credentials(self, uuid: bytes | None = None) -> agreement.Credentials:
         """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
@@ -343,6 +385,10 @@ class Station:
         return self._store.audit
 
 
+def _ask_no_one(_prompt: str, _confirm: bool) -> str:
+    raise NoPassphrase("The vault's passphrase is needed.", hint="teds-provision unlock")
+
+
 def not_initialised(home: Path) -> NotFound:
     """The error for a home without a station."""
     return NotFound(f"There is no base station in {home} yet.", hint="To create one: teds-provision init")
@@ -429,6 +475,7 @@ def rewrap(station: Station) -> Rewrapped:
     if identity.rewrapping != vault.masters()[-1]:
         if vault.masters()[-1] <= identity.master:  # else a run was cut before it noted the one that it had made
             vault.add_master()
+        master_socket.hand_over(station.home, vault.master_keys())  # before a row needs the new one
         identity.begin_rewrapping(vault.masters()[-1])
     damaged = 0
 
@@ -446,6 +493,7 @@ def rewrap(station: Station) -> Rewrapped:
     station.seals.rewrap(vault)
     station.plant.rewrap(vault)
     vault.retire_masters()
+    master_socket.hand_over(station.home, vault.master_keys())
     with station.transaction():
         identity.end_rewrapping()
         station.audit("vault", None, "rewrapped", keys=count - damaged, damaged=damaged)

@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision import __version__
-from teds_provision.errors import NotWhitelisted, OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.errors import (
+    NotWhitelisted,
+    OtherKey,
+    PolicyRefused,
+    TedsProvisionError,
+    UsageFailure,
+    VaultLocked,
+)
 from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -397,6 +404,8 @@ class Boards:
             with Conversation(contact, notice=told.notice) as node:
                 done = self._provision(node, questions, told)
             error = self._lacks_calibration(uuid, done.image)
+        except VaultLocked:  # of the whole command, and of no board
+            raise
         except TedsProvisionError as failure:
             error = failure
         except SessionLost as lost:

@@ -11,7 +11,15 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
-from teds_provision.errors import AddressConflict, NoNode, NoReader, StoreLocked, TedsProvisionError, UsageFailure
+from teds_provision.errors import (
+    AddressConflict,
+    NoNode,
+    NoReader,
+    StoreLocked,
+    TedsProvisionError,
+    UsageFailure,
+    VaultLocked,
+)
 from teds_provision.links import Contact, LinkSettings, Notice, open_place, open_port, open_ports
 from teds_provision.links.ports import NoticeSink, Port
 from teds_provision.protocol.announce import default_can_address
@@ -384,6 +392,8 @@ def _watch(
         try:
             with Conversation(contact, notice=reporter.notice) as node:
                 result = work(node)
+        except VaultLocked:  # of the whole command, and of no node
+            raise
         except TedsProvisionError as failure:
             error = failure
         except SessionLost as lost:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         file_vault,
         hardening,
         keyring_vault,
+        master_socket,
         passphrase,
         pkcs11,
         pkcs11_token,

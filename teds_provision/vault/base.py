@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from teds_provision.protocol.keys import PrivateKey
+    from teds_provision.vault.master import MasterKeys
 
 Ask = Callable[[str, bool], str]
 """``ask(prompt, confirm)`` returns a passphrase or PIN; raises where nobody can be asked."""
@@ -64,6 +65,19 @@ class Vault(Protocol):
 
     def refresh(self) -> bool:
         """Take in what another process has written since; False where nothing was. Nobody is asked."""
+
+    def reread(self) -> None:
+        """Read the master keys again with what this process has opened already, for a process that runs for long.
+
+        A token's PIN may be another one by now: an open session does not need it. Raises VaultChanged if only the new
+        passphrase opens the vault.
+        """
+
+    def master_keys(self) -> MasterKeys:
+        """Return the master keys, for another process of this user that has the vault open."""
+
+    def accept(self, masters: MasterKeys) -> None:
+        """Use these master keys from now on, in this process alone: nothing is written."""
 
     def opener(self) -> bytes:
         """What opens this vault without asking, for an agent (``unlock``): the key of a passphrase file.

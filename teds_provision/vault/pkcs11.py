@@ -171,6 +171,23 @@ class Pkcs11Vault:
         self._content, self._members = content, members
         return True
 
+    def reread(self) -> None:
+        """Read the master keys again in the session that is open: it lasts beyond a change of the PIN.
+
+        Raises VaultFailure. The count of PINs stays that of the opening, so :meth:`refresh` still reports a new one.
+        """
+        with exclusive(self._module_path):
+            content, _ = _load(self._home, self._store_id, self._session)
+        self._content = replace(self._content, masters=content.masters)
+
+    def master_keys(self) -> MasterKeys:
+        """Return the master keys, for another process of this user that has the vault open."""
+        return self._content.masters
+
+    def accept(self, masters: MasterKeys) -> None:
+        """Use these master keys from now on, in this process alone."""
+        self._content = replace(self._content, masters=masters)
+
     def add_master(self) -> None:
         """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""
         self.refresh()

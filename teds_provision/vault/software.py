@@ -98,6 +98,18 @@ class SoftwareVault(ABC):
         self._material = there
         return True
 
+    def reread(self) -> None:
+        """Read the master keys again; raises VaultChanged, VaultFailure as :meth:`refresh` does."""
+        self.refresh()
+
+    def master_keys(self) -> MasterKeys:
+        """Return the master keys, for another process of this user that has the vault open."""
+        return self._material.masters
+
+    def accept(self, masters: MasterKeys) -> None:
+        """Use these master keys from now on, in this process alone."""
+        self._material = Material(self._material.identity, self._material.ca, masters)
+
     def add_master(self) -> None:
         """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""
         self.refresh()

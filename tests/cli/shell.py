@@ -130,6 +130,17 @@ def begin(
         os.close(read)
 
 
+def set_passphrase(home: Path, old: str, new: str) -> Outcome:
+    """Change the passphrase of a vault file by command."""
+    read, write = os.pipe()
+    try:
+        os.write(write, new.encode() + b"\n")
+        os.close(write)
+        return call(home, "vault", "passphrase", "--new-passphrase-fd", read, passphrase=old)
+    finally:
+        os.close(read)
+
+
 def spawn(*words: object, passphrase: str | None = None, environment: dict[str, str] | None = None) -> Outcome:
     """Run the program as a process of its own to its end; ``passphrase`` is given through --passphrase-fd."""
     with TemporaryFile() as out, TemporaryFile() as err:

@@ -6,6 +6,8 @@ import signal
 
 import pytest
 
+from tests.bench import PASSPHRASE
+from tests.cli.shell import call, set_passphrase
 from tests.pace import until
 from tests.places import free_reader
 
@@ -127,3 +129,19 @@ def test_several_readers_serve_several_taps_and_a_slow_board_holds_nobody_up(des
     watch.signal(signal.SIGTERM)
     assert watch.end().code == 0
     assert station.log_is_whole()
+
+
+def test_a_watch_ends_when_passphrase_and_master_key_were_changed(desk: Desk, station: Station) -> None:
+    """It cannot open the vault again, and keeps no passphrase: exit 7 at the next board, which is not harmed."""
+    first, second = desk.node("first"), desk.node("second")
+    first.start()
+    watch = station.start("--json", "provision", "--watch", "--yes", "--profile", ANGLE, *desk.links.over("nfc"))
+    assert watch.wait_for_lines(1)[-1]["verdict"] == "authentic"
+    first.stop()
+    assert set_passphrase(station.home, PASSPHRASE, "a new one for all").code == 0
+    assert call(station.home, "vault", "rewrap", passphrase="a new one for all").code == 0
+    second.start()
+    outcome = watch.end()
+    assert (outcome.code, "vault-locked" in outcome.out) == (7, True), outcome
+    station.passphrase = "a new one for all"
+    assert station.provision("nfc", "--profile", ANGLE)["verdict"] == "authentic"

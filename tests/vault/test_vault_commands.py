@@ -12,12 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import VaultChanged, WrongPassphrase
+from teds_provision.errors import VaultChanged, VaultLocked, WrongPassphrase
 from teds_provision.station.station import Station, rewrap
 from teds_provision.store import StoreLock
 from teds_provision.store.database import Database
-from teds_provision.vault import forget_vaults
+from teds_provision.vault import agent, forget_vaults
 from teds_provision.vault.file_vault import FileVault
+from teds_provision.vault.master import MasterKeys
+from teds_provision.vault.master_socket import MasterSocket, hand_over
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import clean_environment, spawn
@@ -226,6 +228,82 @@ def test_nobody_changes_the_vault_while_another_command_holds_the_store(home: Pa
     assert process.json["error"]["code"] == "store-locked"
 
 
+def changed_passphrase(home: Path) -> Station:
+    """The station as a command opens it after the passphrase was changed."""
+    station = opened(home)
+    set_it = station.vault.new_passphrase(asking(NEW))
+    with station.lock("test"):
+        set_it()
+    return station
+
+
+def test_a_process_that_is_handed_the_master_key_loses_no_key_wherever_rewrap_is_cut(home: Path) -> None:
+    long_running = opened(home)
+    before = keys(long_running)
+    changed_passphrase(home).close()
+    with MasterSocket(home, long_running.accept_masters):
+        step, came = 0, True
+        while came:
+            step += 1
+            other = opened(home, NEW)
+            other.unlock()
+            came = False
+            with dying_at(step):
+                try:
+                    rewrap(other)
+                except Killed:
+                    came = True
+            other.close()
+            assert keys(long_running) == before, f"cut before durable step {step}"
+            long_running.keys.add_pending(NODES[1], key=b"made here.......", key_id=b"made....", epoch=step + 2)
+            restarted = opened(home, NEW)
+            assert (step + 2, b"made here.......") in keys(restarted)
+            restarted.keys.remove_key(NODES[1], b"made....".hex())
+            restarted.close()
+    assert long_running.vault.masters() == opened(home, NEW).vault.masters()
+    long_running.close()
+
+
+def test_a_process_that_is_locked_out_says_so_until_the_vault_is_unlocked(home: Path) -> None:
+    long_running = opened(home)
+    before = keys(long_running)
+    other = changed_passphrase(home)
+    assert long_running.current_vault() is long_running.vault, "the master key is the same"
+    rewrap(other)
+    forget_vaults()  # the other process ends
+    for act in (lambda: keys(long_running), long_running.unlock, lambda: long_running.plant.keep_login(b"", b"")):
+        with pytest.raises(VaultLocked) as error:
+            act()
+    assert (error.value.exit_code, error.value.code) == (7, "vault-locked")
+    agent.start(home, "file", other.vault.opener(), 60)
+    try:
+        assert keys(long_running) == before
+    finally:
+        agent.lock(home)
+    assert keys(long_running) == before
+    long_running.close()
+    other.close()
+
+
+def test_master_keys_come_only_from_a_process_that_knows_one_of_this_store(home: Path) -> None:
+    station = opened(home)
+    before = keys(station)
+    foreign = MasterKeys.generate()
+    assert not station.accept_masters(foreign), "the vault was not opened" if station._vault is None else "another key"
+    assert not station.accept_masters(foreign.with_new().newest_only())
+    assert station.accept_masters(station.vault.master_keys().with_new())
+    assert keys(station) == before
+    rewrap(other := opened(home))
+    assert hand_over(home, other.vault.master_keys()) is None, "no process listens"
+    fresh = opened(home)
+    fresh.unlock()
+    fresh.vault.accept(MasterKeys({1: bytes(32)}))
+    assert fresh.accept_masters(other.vault.master_keys()), "they open the key of the seals"
+    assert keys(fresh) == before
+    for one in (station, other, fresh):
+        one.close()
+
+
 def test_three_processes_that_wait_for_the_store_lose_no_key(home: Path) -> None:
     """The real thing: all have opened the vault when the first of them gets the store."""
     with ThreadPoolExecutor() as pool, StoreLock(home, command="provision"):
@@ -262,6 +340,10 @@ def test_what_another_process_did_to_a_tokens_file_is_taken_in(tmp_path: Path, m
             with pytest.raises(VaultChanged):
                 change()
         Pkcs11Vault.open(tmp_path, store, uri, asking("654321")).retire_masters()
+        other.reread()
+        assert other.masters() == (2,), "an open session outlasts the PIN that opened it"
+        with pytest.raises(VaultChanged):
+            other.add_master()
         assert one.refresh()
         assert one.masters() == (2,)
     finally:

@@ -98,7 +98,7 @@ function connection(pill) {
     if (!banner.firstElementChild) {
       fill(banner, "This browser is no longer signed in. Open the address that this command prints: ", h("code", {}, "teds-provision ncap open"));
     }
-  } else banner.replaceChildren();
+  } else text(banner, state.status?.vaultProblem ? `The vault is locked. ${state.status.vaultProblem}` : "");
 }
 
 async function detect(mode, why) {

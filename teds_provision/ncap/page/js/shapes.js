@@ -90,7 +90,9 @@ export function status(wire) {
     hint: link.problem?.hint ?? "",
     nodes: link.nodes ?? null,
   }));
-  return { ...wire, now: moment(wire.time), started: moment(wire.started), links };
+  const problem = wire.vault?.problem;
+  const vaultProblem = problem ? `${problem.message} ${problem.hint}` : "";
+  return { ...wire, now: moment(wire.time), started: moment(wire.started), links, vaultProblem };
 }
 
 /** One message of /live as an event with a name. */

@@ -194,6 +194,7 @@ const AFTER = {
   detection: ["status", "nodes"],
   sink: ["status", "measurements"],
   link: ["status", "nodes"],
+  vault: ["status", "nodes", "measurements"],
   log: [],
 };
 

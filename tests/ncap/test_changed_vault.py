@@ -1,0 +1,95 @@
+"""A vault that is changed beside a running `ncap`: it gets the new master key, or reports that it is locked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from teds_provision.client import Client
+from teds_provision.vault import master_socket
+from tests.bench import PASSPHRASE
+from tests.cli.shell import call, set_passphrase
+from tests.e2e.desk import Desk
+from tests.ncap.service import Service, virtual
+from tests.pace import until
+
+pytestmark = pytest.mark.link
+
+NEW = "four other random words"
+
+
+@pytest.fixture
+def running(desk: Desk) -> Iterator[Service]:
+    """A daemon of a home that each test may change."""
+    service = Service(desk, desk.station())
+    yield service.start()
+    service.end()
+
+
+def measured_in_a_new_session(asked: Client, uuid: str) -> dict[str, Any]:
+    """End what is measured of a node, measure it again, and wait for its values."""
+    for one in asked.request("GET", "/measurements")["measurements"]:
+        asked.end_measurement(one["id"])
+    until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") is None)
+    asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
+
+    def running() -> dict[str, Any] | None:
+        node = asked.node(uuid)
+        return node if (node["measuring"] or {}).get("state") == "running" else None
+
+    return dict(until(running))
+
+
+def told(service: Service, event: str) -> list[dict[str, Any]]:
+    """Events of one kind that the daemon has printed."""
+    assert service.process is not None
+    while service.process.read(0.3):
+        pass
+    lines = service.process.out.split("\n")[:-1]
+    return [line for line in map(json.loads, lines) if line.get("event") == event]
+
+
+def test_a_new_passphrase_and_two_new_master_keys_do_not_lock_a_running_ncap(running: Service) -> None:
+    home, asked = running.station.home, running.client()
+    hand = virtual(running)
+    assert set_passphrase(home, PASSPHRASE, NEW).code == 0
+    measured_in_a_new_session(asked, hand)
+    for _ in range(2):
+        assert call(home, "vault", "rewrap", passphrase=NEW).code == 0
+        measured_in_a_new_session(asked, hand)
+    made = virtual(running, name="other")
+    assert call(home, "--json", "sample", made, passphrase=NEW).code in (0, 5), "the key that ncap made opens"
+    assert asked.status()["vault"] == {"state": "open", "problem": None}
+    assert not told(running, "vault")
+
+
+def test_an_ncap_that_is_locked_out_says_so_and_returns_to_work_when_unlocked(running: Service) -> None:
+    home, asked = running.station.home, running.client()
+    hand = virtual(running)
+    (home / master_socket.SOCKET).unlink()  # the new key cannot be handed over
+    assert set_passphrase(home, PASSPHRASE, NEW).code == 0
+    assert call(home, "vault", "rewrap", passphrase=NEW).code == 0
+    locked = until(lambda: (found := asked.status()["vault"])["state"] == "locked" and found)
+    assert locked["problem"]["code"] == "vault-locked"
+    assert "unlock" in locked["problem"]["hint"]
+    assert "The vault is locked" in call(home, "ncap", "status").out
+    assert asked.node(hand)["uuid"] == hand, "it stays up"
+    try:
+        assert call(home, "unlock", "--for", "5m", passphrase=NEW).code == 0
+        until(lambda: asked.status()["vault"]["state"] == "open")
+        measured_in_a_new_session(asked, hand)
+    finally:
+        call(home, "lock")
+    assert [line["state"] for line in told(running, "vault")] == ["locked", "open"]
+
+
+def test_no_one_without_a_key_of_this_store_changes_the_master_keys(running: Service) -> None:
+    home, asked = running.station.home, running.client()
+    hand = virtual(running)
+    foreign = master_socket.MasterKeys.generate()
+    assert master_socket.hand_over(home, foreign) is False, "number 1 is another key here"
+    assert master_socket.hand_over(home, foreign.with_new().newest_only()) is False
+    measured_in_a_new_session(asked, hand)
