@@ -494,6 +494,7 @@ def sync(app: App, files: Path | None) -> None:
     told = {
         "pushed": done.pushed,
         "fetched": done.fetched,
+        "returned": done.returned,
         "parcels": {"in": done.parcels_in, "out": done.parcels_out, "waiting": done.waiting},
         "alarms": [_alarm(station, one) for one in alarms],
         "told": done.told,

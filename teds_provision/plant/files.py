@@ -14,7 +14,7 @@ from typing import Final
 
 from teds_provision.errors import BadData, LinkFailure, NotFound, TedsProvisionError
 from teds_provision.files import SHARED, read_limited, write_new
-from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Parcel
+from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Parcel, Returned
 from teds_provision.protocol.plant.document import PAGE, ROSTER, hash_of
 
 _STATION: Final = re.compile("[0-9a-f]{64}")
@@ -28,6 +28,7 @@ class FilesPost:
     """A folder as a post; a name that is none of its own is left alone and not read."""
 
     everybody = True
+    returned: Returned | None = None
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():

@@ -7,7 +7,7 @@ PolicyRefused where it lets nobody in.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
@@ -18,11 +18,55 @@ AT_ONCE: Final = 16
 
 @dataclass(frozen=True)
 class Carried:
-    """A page as it lies there: whose, which number, its octets; none of it is checked."""
+    """A page as it lies there: whose, which number, its octets; none of it is checked.
+
+    ``by``: the member that handed it in for its author; "" if the author put it there, or a folder holds it.
+    """
 
     station: str
     n: int
     octets: bytes = field(repr=False)
+    by: str = ""
+
+
+@dataclass(frozen=True)
+class Offer:
+    """A page that a database holds: author, number, H, SHA-256 of its octets, and who handed it in ("": its author)."""
+
+    station: str
+    n: int
+    hash: str
+    digest: str
+    by: str
+
+
+class Returned(Protocol):
+    """Pages of stations that are no open member, which others hand in: see :class:`.postgres.ReturnedPages`."""
+
+    @property
+    def takes_pages(self) -> bool:
+        """False if the database cannot take such pages."""
+
+    def state(self, station: str) -> str:
+        """A text that changes with what was handed in of a station; "" if it is an open member and nothing was."""
+
+    def was_handed_in(self, station: str) -> bool:
+        """True if a member handed in a page of this station."""
+
+    def is_open(self, station: str) -> bool:
+        """True if the station appends its pages itself."""
+
+    def head(self, station: str) -> int:
+        """The number of the newest page that the station appended itself."""
+
+    def offers(self, station: str) -> list[Offer]:
+        """Every page of a station that is there, whoever put it there."""
+
+    def octets(self, offers: Sequence[Offer]) -> list[Carried]:
+        """The pages that were offered; one that is gone is left out."""
+
+    def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
+        """Hand in pages (number, octets) of a station. Raises PolicyRefused."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +88,9 @@ class Post(Protocol):
 
     everybody: bool
     """Whether pages of others are brought there too: a folder has no other way to get them."""
+
+    returned: Returned | None
+    """What members handed in for stations that left; None for a folder, which everybody fills."""
 
     where: str
     """For people: the folder, or the URL without anything secret."""

@@ -33,7 +33,7 @@ from teds_provision.errors import (
 )
 from teds_provision.lazy import how_to_install, late
 from teds_provision.plant import schema, scram
-from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Parcel
+from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Offer, Parcel, Returned
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
@@ -49,7 +49,8 @@ PAGES_AT_ONCE: Final = 32
 _GRACE: Final = 5.0
 _CHANNEL: Final = "teds"
 _FROM_URL: Final = frozenset({"host", "hostaddr", "port", "dbname", "sslrootcert", "sslcrl", "sslcrldir"})
-_NO_SCHEMA: Final = frozenset({"42P01", "3F000", "42883"})  # no such table, schema, function
+_NO_SCHEMA: Final = frozenset({"42P01", "3F000", "42883", "42703"})  # no such table, schema, function, column
+_RETURNING: Final = 2  # the first schema that has `found`
 
 
 @dataclass(frozen=True)
@@ -78,18 +79,33 @@ class DatabaseState:
     parcels: tuple[Waiting, ...]
     newest: tuple[int, bytes] | None = field(repr=False)
     """This station's own newest page there, where it is a short one: each sync looks at it."""
+    open: frozenset[str] = frozenset()
+    """The stations whose row is there and open: they append their pages themselves."""
+    handed_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """By author, one text for each member that handed in pages of it; the text changes with each page."""
+    schema: int = schema.VERSION
 
 
-_LOOK: Final = """\
+_LOOK_1: Final = """\
 select 'meta', null::bytea, version, registry::text, null::bytea, null::timestamptz from registry.meta
 union all select 'roster', null, bool_or(station = registry.me())::int, jws, null, null
   from registry.roster group by jws
-union all select 'head', station, n, encode(hash, 'hex'), null, null from registry.member
+union all select 'head', station, n, encode(hash, 'hex'), case when open then '\\x01'::bytea end, null
+  from registry.member
 union all select 'parcel', sender, octet_length(document), id::text, recipient, expires from registry.parcel
   where recipient = registry.me() or sender = registry.me()
 union all select 'page', p.station, p.n, p.jws, null, null from registry.page p
   join registry.member m on (m.station, m.n) = (p.station, p.n)
   where p.station = registry.me() and octet_length(p.jws) <= 65536"""
+_LOOK: Final = f"""{_LOOK_1}
+union all select 'handed', author, pages, at::text, by, null from registry.handed"""
+
+# Every page of an author, whoever put it there: the author itself (by null), or others.
+_OFFERS: Final = """\
+select n, encode(hash, 'hex'), encode(sha256(convert_to(jws, 'UTF8')), 'hex'), null::text
+  from registry.page where station = %s
+union all select n, encode(hash, 'hex'), encode(sha256(convert_to(jws, 'UTF8')), 'hex'), encode(by, 'hex')
+  from registry.found where author = %s"""
 
 _SMALL_PARCELS: Final = """\
 select id::text, document, expires, sender from registry.parcel
@@ -199,7 +215,12 @@ class Registry:
 
     def look(self) -> DatabaseState:
         """All that tells whether anything is new, in one round trip."""
-        rows = self._rows(_LOOK, ())
+        try:
+            rows = self._rows(_LOOK, ())
+        except _NoSchemaError:  # of an older schema, or a newer one that has other tables, or none
+            rows = self._rows("select 'meta', null, version from registry.meta", ())
+            if rows and rows[0][2] < _RETURNING:
+                rows = self._rows(_LOOK_1, ())
         meta = next((row for row in rows if row[0] == "meta"), None)
         if meta is None:
             raise StoreFailure(
@@ -217,6 +238,9 @@ class Registry:
             {row[1].hex(): (row[2], row[3]) for row in rows if row[0] == "head"},
             tuple(Waiting(row[3], row[1].hex(), row[4].hex(), row[2], row[5]) for row in rows if row[0] == "parcel"),
             next(((row[2], row[3].encode()) for row in rows if row[0] == "page"), None),
+            frozenset(row[1].hex() for row in rows if row[0] == "head" and row[4]),
+            _handed_in(rows),
+            meta[2],
         )
 
     def pages(self, after: Mapping[str, int]) -> Iterator[tuple[str, int, bytes]]:
@@ -231,6 +255,40 @@ class Registry:
                 for last, jws in rows:
                     yield station, last, jws.encode()
                 more = len(rows) == PAGES_AT_ONCE
+
+    def offers(self, station: str) -> list[Offer]:
+        """Every page of a station that is there, whoever put it there; one round trip."""
+        author = bytes.fromhex(station)
+        return [Offer(station, n, hash, octets, by or "") for n, hash, octets, by in self._rows(_OFFERS, (author,) * 2)]
+
+    def offered(self, offers: Sequence[Offer]) -> list[Carried]:
+        """The octets of some offers of one author, in one round trip."""
+        asked: list[tuple[str, int, str, str]] = [(one.station, one.n, one.hash, one.by) for one in offers]
+        rows = self._rows(
+            "select asked.place, coalesce(p.jws, f.jws) from"
+            " unnest(%s::int[], %s::bytea[], %s::int[], %s::bytea[], %s::bytea[]) asked(place, author, n, hash, by)"
+            " left join registry.page p on by = '' and (p.station, p.n, p.hash) = (asked.author, asked.n, asked.hash)"
+            " left join registry.found f"
+            " on (f.author, f.by, f.n, f.hash) = (asked.author, asked.by, asked.n, asked.hash) order by asked.place",
+            (
+                list(range(len(asked))),
+                [bytes.fromhex(author) for author, _, _, _ in asked],
+                [n for _, n, _, _ in asked],
+                [bytes.fromhex(hash) for _, _, hash, _ in asked],
+                [bytes.fromhex(by) for _, _, _, by in asked],
+            ),
+        )
+        there = {place: jws for place, jws in rows if jws is not None}
+        return [Carried(one.station, one.n, there[k].encode(), one.by) for k, one in enumerate(offers) if k in there]
+
+    def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
+        """Hand in pages (number, octets) of a station that is no open member: one round trip, one transaction.
+
+        Raises AuthorIsMember when it is one by now, PolicyRefused beyond a member's limit.
+        """
+        with self._connected() as connection, connection.pipeline():
+            for n, octets in pages:
+                connection.execute("select registry.restore(%s, %s, %s)", (bytes.fromhex(author), n, octets.decode()))
 
     def append(self, pages: Sequence[tuple[int, str, bytes]]) -> None:
         """Push own pages (number, H of the one before or "", octets): one round trip, one transaction.
@@ -332,6 +390,7 @@ class PostgresPost:
     def __init__(self, registry: Registry, where: str, station: str) -> None:
         self._registry, self._station = registry, station
         self.where = where
+        self.returned: Returned | None = ReturnedPages(self)
         self._seen: DatabaseState | None = None
 
     def registry(self) -> str | None:
@@ -413,6 +472,62 @@ class PostgresPost:
         return self._seen
 
 
+class ReturnedPages:
+    """Pages in the database that their authors did not append themselves: others handed them in (table ``found``)."""
+
+    def __init__(self, post: PostgresPost) -> None:
+        self._post = post
+
+    @property
+    def takes_pages(self) -> bool:
+        """False for a database of schema 1, which has no such table."""
+        return self._post._look.schema >= _RETURNING
+
+    def state(self, station: str) -> str:
+        """A text that changes with whatever changes about the pages of a station that others handed in, or may.
+
+        "" for an open member of which nothing was handed in.
+        """
+        look = self._post._look
+        handed_in = look.handed_in.get(station, ())
+        if station in look.open and not handed_in:
+            return ""
+        n, hash = look.heads.get(station, (0, ""))
+        return " ".join((station, str(station in look.open), str(n), hash, *handed_in))
+
+    def was_handed_in(self, station: str) -> bool:
+        """True if a member handed in a page of this station."""
+        return station in self._post._look.handed_in
+
+    def is_open(self, station: str) -> bool:
+        """True if the station appends its pages itself."""
+        return station in self._post._look.open
+
+    def head(self, station: str) -> int:
+        """The number of the newest page that the station appended itself."""
+        return self._post._look.heads.get(station, (0, ""))[0]
+
+    def offers(self, station: str) -> list[Offer]:
+        """Every page of a station that is there, whoever put it there."""
+        return self._post._registry.offers(station)
+
+    def octets(self, offers: Sequence[Offer]) -> list[Carried]:
+        """The pages that were offered; one that is gone is left out."""
+        return self._post._registry.offered(offers)
+
+    def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
+        """Hand in pages of a station. Raises AuthorIsMember, PolicyRefused."""
+        self._post._registry.restore(author, pages)
+
+
+def _handed_in(rows: Sequence[tuple[Any, ...]]) -> dict[str, tuple[str, ...]]:
+    found: dict[str, list[str]] = {}
+    for kind, author, pages, at, by, *_ in (row for row in rows if row[0] == "handed"):
+        assert kind
+        found.setdefault(author.hex(), []).append(f"{by.hex()}:{pages}:{at}")
+    return {author: tuple(sorted(texts)) for author, texts in found.items()}
+
+
 def where_of(url: str) -> str:
     """A registry's URL as people are shown it: host and database."""
     parts = urlsplit(url)
@@ -441,6 +556,14 @@ def _shut(connection: psycopg.Connection[Any]) -> None:
         end.shutdown(socket.SHUT_RDWR)
 
 
+class AuthorIsMember(PolicyRefused):
+    """The author of a page is an open member, who appends its pages itself."""
+
+
+class _NoSchemaError(StoreFailure):
+    """A table or function of the schema is missing."""
+
+
 class _AlreadyThere(TedsProvisionError):
     """A parcel with this ID already exists."""
 
@@ -460,16 +583,18 @@ def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
             return StoreFailure(f"The registry rejected a page: {words}", hint="Run it again: registry sync")
         case "TE004":
             return PolicyRefused(
-                f"The registry accepts no more parcels: {words}.", hint="They are sent with a later sync."
+                f"The registry accepts no more from this station: {words}.", hint="A later sync sends the rest."
             )
         case "23505":
             return _AlreadyThere("A parcel with this ID already exists.")
         case "53100" | "53200":
             return RegistryFailure(f"The database is full: {words}", hint="Its administrator must free some space.")
         case _ if state in _NO_SCHEMA:
-            return StoreFailure(
+            return _NoSchemaError(
                 "The database does not contain a registry.", hint="Ask its administrator to run: registry sql | psql"
             )
+        case "TE006":
+            return AuthorIsMember("The author of these pages is an open member, who appends them itself.")
         case "42501":
             return StoreFailure(
                 f"The database does not allow a member to do this: {words}",

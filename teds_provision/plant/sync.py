@@ -13,10 +13,9 @@ from dataclasses import dataclass, field, replace
 from shlex import quote
 from typing import Final, NoReturn
 
-from teds_provision.errors import Fork, NotAuthentic, NotMember, PolicyRefused, TedsProvisionError
-from teds_provision.plant import leaving, parcels
+from teds_provision.errors import Fork, NotAuthentic, NotMember, PolicyRefused
+from teds_provision.plant import fetching, leaving, parcels, returned
 from teds_provision.plant.folding import (
-    EVENTS_AT_ONCE,
     alarm,
     apply_claims,
     now,
@@ -26,11 +25,11 @@ from teds_provision.plant.folding import (
     take_rosters,
     views,
 )
-from teds_provision.plant.post import Carried, Post
+from teds_provision.plant.post import Post
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.document import NewerFormat, hash_of
+from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.evidence import PASSED
 from teds_provision.protocol.plant.fold import View
 from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, seal_page
@@ -51,6 +50,8 @@ class Synced:
 
     pushed: int = 0
     fetched: int = 0
+    returned: int = 0
+    """Pages of stations that left which the registry lacked: handed in for them."""
     judged: int = 0
     parcels_in: int = 0
     parcels_out: int = 0
@@ -89,7 +90,8 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
         while close_page(station, roster) is not None:
             pass
         _push(station, post, roster, done, connected=connected)
-        _fetch(station, post, roster, done)
+        done.fetched += fetching.fetch(station, post, roster)
+        _return_pages(station, post, roster, done)
         done.judged = apply_claims(station)
         hearsay(station, roster, done)
         _parcels(station, post, roster, done)
@@ -99,6 +101,20 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
                 assert joined is not None
                 station.plant.tables.put_plant(replace(joined, synced=utc_now()))
         return done
+
+
+def _return_pages(station: Station, post: Post, roster: Roster, done: Synced) -> None:
+    """Take what others handed in for stations that left, and hand in what the registry lacks of them."""
+    if post.returned is None or not returned.is_new(station, post.returned, roster):
+        return
+    done.fetched += returned.take(station, post.returned, roster)
+    done.returned, refused = returned.hand_in(station, post.returned, roster)
+    if done.returned:
+        pages = "1 page" if done.returned == 1 else f"{done.returned} pages"
+        done.told.append(f"{pages} of stations that are no longer members, which the registry lacked, handed in")
+    done.told += refused
+    if post.returned.takes_pages:
+        returned.note(station, post.returned, roster)
 
 
 def _rosters(station: Station, post: Post, done: Synced) -> list[tuple[Roster, str, str]]:
@@ -147,7 +163,8 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
     restored = station.plant.restored
     known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(chain.chain)}
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
-    found = _own_pages(station, post, roster, done, above)
+    appended = _own_pages(station, post, roster, done, above)
+    found = appended + returned.own(station, post.returned, roster, {page.hash for page in appended})
     new = [page for page in found if (page.n, page.hash) not in known]
     if new and restored and _follows(chain, new):
         adopt(station, roster, new)
@@ -169,7 +186,7 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
                 "this home was restored from a backup and publishes nothing new until it has synced with its"
                 " own registry"
             )
-    there = max((page.n for page in found), default=0)
+    there = max((page.n for page in appended), default=0)
     if connected and there < joined.acknowledged and not post.everybody:
         there = post.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
@@ -179,7 +196,7 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
 
 def _own_pages(station: Station, post: Post, roster: Roster, done: Synced, above: int) -> list[Page]:
     """The pages under this station's key; where only members can write, what it did not sign stops everything."""
-    found, junk = read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
+    found, junk = fetching.read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
     if junk and not post.everybody:
         alarm(
             station,
@@ -338,7 +355,8 @@ def strange(station: Station, post: Post) -> list[Page]:
 
 def _under_our_key(station: Station, post: Post, roster: Roster) -> list[Page]:
     post.registry()  # a database is looked at anew
-    return read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)[0]
+    found, _ = fetching.read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)
+    return found + returned.own(station, post.returned, roster, {page.hash for page in found}, always=True)
 
 
 def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
@@ -395,23 +413,6 @@ def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
 # -- out and in --------------------------------------------------------------------------------------------------------
 
 
-def read_pages(carried: Iterator[Carried], roster: Roster, station: str) -> tuple[list[Page], list[int]]:
-    """The pages that a station signed among those under its name, and the numbers of those that it did not."""
-    good: list[Page] = []
-    junk: list[int] = []
-    for one in carried:
-        try:
-            page = open_page(one.octets, roster.registry, roster.point_of)
-            if page.station != station or page.n != one.n:
-                raise NotAuthentic("It is in the place of another page.")
-            good.append(page)
-        except NewerFormat:
-            raise
-        except TedsProvisionError:
-            junk.append(one.n)
-    return good, junk
-
-
 def _push(station: Station, post: Post, roster: Roster, done: Synced, *, connected: bool) -> None:
     """Put there what is lacking: one's own pages, and in a folder everybody's."""
     heads = post.heads()
@@ -432,56 +433,6 @@ def _push(station: Station, post: Post, roster: Roster, done: Synced, *, connect
     assert joined is not None
     if connected and joined.acknowledged != newest:
         station.plant.tables.put_plant(replace(joined, acknowledged=newest))
-
-
-def _fetch(station: Station, post: Post, roster: Roster, done: Synced) -> None:
-    """Take in what others say, station by station; what one of them broke holds up nobody else's."""
-    heads = post.heads()
-    for one in roster.by_key:
-        if one == station.fingerprint or one not in heads:
-            continue
-        chain = station.plant.tables.chain(one)
-        names = station.plant.tables.page_names(chain.chain)
-        known, numbers = {hash for _, hash, _ in names}, {n for n, _, _ in names} | {0}
-        batch: list[Page] = []
-        junk: list[int] = []
-        waits = None
-        for carried in post.pages(one, max(numbers)):
-            if hash_of(carried.octets) in known:
-                continue
-            try:
-                page = open_page(carried.octets, roster.registry, roster.point_of)
-                if page.station != one or page.n != carried.n:
-                    raise NotAuthentic("It is in the place of another page.")
-            except NewerFormat as newer:
-                waits = newer.message
-                break
-            except TedsProvisionError:  # nobody's page: it ends nothing, and is asked for again
-                junk.append(carried.n)
-                continue
-            if page.n - 1 not in numbers:
-                break
-            numbers.add(page.n)
-            known.add(page.hash)
-            batch.append(page)
-            if sum(len(each.events) for each in batch) >= EVENTS_AT_ONCE:
-                take_pages(station, roster, batch)
-                done.fetched += len(batch)
-                batch = []
-        take_pages(station, roster, batch)
-        done.fetched += len(batch)
-        _tell_junk(station, roster, one, junk, post)
-        if waits is not None:
-            alarm(station, "newer-format", one, max(numbers) + 1, waits)
-        if waits != chain.waits:
-            station.plant.tables.put_chain(replace(station.plant.tables.chain(one), waits=waits))
-
-
-def _tell_junk(station: Station, roster: Roster, one: str, junk: Sequence[int], post: Post) -> None:
-    if not junk:
-        station.plant.tables.end_alarms("junk", one)
-    for n in junk[:1]:
-        alarm(station, "junk", one, n, f"{post.where}: {len(junk)} pages of {roster.name_of(one)} that it did not sign")
 
 
 def hearsay(station: Station, roster: Roster, done: Synced) -> None:

@@ -22,6 +22,8 @@ class Relay:
     """Cut everything once ``sent`` has come so far; 0: never."""
     sent: int = 0
     """How often the station began to say something after the server had spoken: its round trips."""
+    received: int = 0
+    """How many octets came from the server."""
     _pairs: list[tuple[socket.socket, socket.socket]] = field(default_factory=list)
     _ended: bool = False
 
@@ -80,6 +82,7 @@ class Relay:
                         if not octets:
                             return
                         self.sent += source is station and spoke is server
+                        self.received += len(octets) if source is server else 0
                         spoke = source
                         if self.cut_after and self.sent >= self.cut_after:
                             self.cut()

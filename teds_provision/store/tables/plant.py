@@ -119,6 +119,16 @@ class PlantTables:
                 "conflicts", "to_judge", "pages", "chains", "parcels", "shared",
             ):  # fmt: skip
                 self._database.execute(f"DELETE FROM {table}")
+            self._database.execute("DELETE FROM meta WHERE name = 'plant-returned'")
+
+    def returned_state(self) -> str:
+        """Return the digest of what the database and this store had of stations that left, at the last comparison."""
+        rows = self._database.execute("SELECT value FROM meta WHERE name = 'plant-returned'")
+        return str(rows[0][0]) if rows else ""
+
+    def put_returned_state(self, digest: str) -> None:
+        """Keep that digest: while it stays the same, there is nothing to take and nothing to hand in."""
+        self._database.execute("INSERT OR REPLACE INTO meta VALUES('plant-returned', ?)", (digest,))
 
     def held_roster(self) -> RosterRow | None:
         """Return the roster that counts."""
@@ -158,6 +168,10 @@ class PlantTables:
     def end_alarms(self, code: str, about: str) -> int:
         """Take alarms away whose cause is gone; returns how many."""
         return self._database.change("DELETE FROM alarms WHERE code = ? AND about = ?", (code, about))
+
+    def end_alarms_of(self, code: str) -> int:
+        """Take all alarms of one code away; returns how many."""
+        return self._database.change("DELETE FROM alarms WHERE code = ?", (code,))
 
     def see_alarms(self) -> int:
         """Note that a person knows of every alarm; returns of how many he did not."""

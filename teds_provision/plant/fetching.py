@@ -1,0 +1,121 @@
+"""Take in the pages that others wrote (contract/plant.md section 2): whoever carries them, the signature decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+from teds_provision.errors import NotAuthentic, TedsProvisionError
+from teds_provision.plant.folding import EVENTS_AT_ONCE, alarm, take_pages
+from teds_provision.plant.post import Carried, Post
+from teds_provision.protocol.plant.document import NewerFormat, hash_of
+from teds_provision.protocol.plant.page import Page, open_page
+from teds_provision.protocol.plant.roster import Roster
+from teds_provision.station.station import Station
+
+
+@dataclass
+class Taken:
+    """The result of reading pages of one station: how many were taken, and which ones it did not sign."""
+
+    pages: int = 0
+    junk: list[Carried] = field(default_factory=list)
+    waits: str | None = None
+    """Why the chain is not read on: a page of a newer format."""
+
+
+def open_carried(carried: Carried, roster: Roster, station: str) -> Page:
+    """Return a page that its station signed and that is in its own place; raises NotAuthentic, NewerFormat."""
+    page = open_page(carried.octets, roster.registry, roster.point_of)
+    if page.station != station or page.n != carried.n:
+        raise NotAuthentic("It is in the place of another page.")
+    return page
+
+
+def read_pages(carried: Iterable[Carried], roster: Roster, station: str) -> tuple[list[Page], list[int]]:
+    """Return the pages that a station signed among those under its name, and the numbers of those that it did not."""
+    good: list[Page] = []
+    junk: list[int] = []
+    for one in carried:
+        try:
+            good.append(open_carried(one, roster, station))
+        except NewerFormat:
+            raise
+        except TedsProvisionError:
+            junk.append(one.n)
+    return good, junk
+
+
+def fetch(station: Station, post: Post, roster: Roster) -> int:
+    """Take in what others say, station by station, and return how many pages came.
+
+    Whatever is wrong with the pages of one station holds up no other's.
+    """
+    heads, fetched = post.heads(), 0
+    for one in roster.by_key:
+        if one == station.fingerprint or one not in heads:
+            continue
+        chain = station.plant.tables.chain(one)
+        newest = max((n for n, _, _ in station.plant.tables.page_names(chain.chain)), default=0)
+        taken = take_carried(station, roster, one, post.pages(one, newest))
+        fetched += taken.pages
+        _report_junk(station, roster, one, [carried.n for carried in taken.junk], post)
+        note_waiting(station, one, taken)
+    return fetched
+
+
+def take_carried(
+    station: Station,
+    roster: Roster,
+    author: str,
+    pages: Iterable[Carried],
+    on_junk: Callable[[Carried], None] = lambda _: None,
+) -> Taken:
+    """Keep the pages of one station that are new and follow one that is here; ``pages`` ascend by number.
+
+    A page that the station did not sign is no page: it ends nothing and may be asked for again.
+    """
+    names = station.plant.tables.page_names(station.plant.tables.chain(author).chain)
+    known, numbers = {hash for _, hash, _ in names}, {n for n, _, _ in names} | {0}
+    taken = Taken()
+    batch: list[Page] = []
+    for carried in pages:
+        if hash_of(carried.octets) in known:
+            continue
+        try:
+            page = open_carried(carried, roster, author)
+        except NewerFormat as newer:
+            taken.waits = newer.message
+            break
+        except TedsProvisionError:
+            taken.junk.append(carried)
+            on_junk(carried)
+            continue
+        if page.n - 1 not in numbers:
+            break
+        numbers.add(page.n)
+        known.add(page.hash)
+        batch.append(page)
+        taken.pages += 1
+        if sum(len(each.events) for each in batch) >= EVENTS_AT_ONCE:
+            take_pages(station, roster, batch)
+            batch = []
+    take_pages(station, roster, batch)
+    return taken
+
+
+def note_waiting(station: Station, author: str, taken: Taken) -> None:
+    """Note that a chain waits for a newer version of this program, or that it does so no longer."""
+    chain = station.plant.tables.chain(author)
+    if taken.waits is not None:
+        newest = max((n for n, _, _ in station.plant.tables.page_names(chain.chain)), default=0)
+        alarm(station, "newer-format", author, newest + 1, taken.waits)
+    if taken.waits != chain.waits:
+        station.plant.tables.put_chain(replace(chain, waits=taken.waits))
+
+
+def _report_junk(station: Station, roster: Roster, one: str, junk: Sequence[int], post: Post) -> None:
+    if not junk:
+        station.plant.tables.end_alarms("junk", one)
+    for n in junk[:1]:
+        alarm(station, "junk", one, n, f"{post.where}: {len(junk)} pages of {roster.name_of(one)} that it did not sign")
