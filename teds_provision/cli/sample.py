@@ -91,8 +91,10 @@ def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) ->
     """
     station = app.station()
     uuid = station.nodes.resolve(node)
+    standing = measure.standing.NodeStanding(station, uuid)
     with trusted_node(app, station, links, uuid, by="sample") as trusted:
         samples = measure.sampling.take_samples(trusted, channels)
+        standing.require()
     origin = "kept" if trusted.kept else "session"
     result = {"uuid": uuid.hex(), "from": origin, "samples": [one.as_json() for one in samples]}
     app.emit(result, lambda console: _samples(console, samples))
@@ -210,7 +212,9 @@ def set_value(
         raise UsageFailure("VALUE is not a finite number.")
     station = app.station()
     uuid = station.nodes.resolve(node)
-    measure.trusting.require_whitelisted(station, uuid)
+    measure.standing.require_whitelisted(station, uuid)
+    standing = measure.standing.NodeStanding(station, uuid)
+    standing.drives = True
     stop = talk.meeting.IdleStop(None)
     links = where_met(station, over_the_bus(links), [uuid])
     with (
@@ -226,6 +230,7 @@ def set_value(
             until = None if hold is None else time.monotonic() + hold
             told = False
             while True:
+                standing.require()
                 applied = actuator.apply(value)
                 if not told:
                     told = True

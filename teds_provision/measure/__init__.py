@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         sightings,
         sinks,
         sources,
+        standing,
         topic_actuators,
         trusting,
         zeroing,

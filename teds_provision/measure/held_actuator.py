@@ -23,6 +23,8 @@ from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Channel
 from teds_provision.teds.units import WrittenUnit, parse_unit
 
+LONGEST_PAUSE = 0.5  # seconds; a node that may not be moved any more is let go within two
+
 
 @dataclass(frozen=True)
 class Applied:
@@ -91,8 +93,8 @@ class HeldActuator:
 
     @property
     def pause(self) -> float:
-        """Seconds after which a value that stays is sent again."""
-        return self._dead_man / 4000
+        """Seconds after which a value that stays is sent again, and the node's standing is looked at."""
+        return min(self._dead_man / 4000, LONGEST_PAUSE)
 
     def apply(self, value: float) -> Applied:
         """Send one value; raises PolicyRefused (limits, the node), LinkFailure where it was not taken in time."""

@@ -38,11 +38,11 @@ from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.patience import Patience
 from teds_provision.measure.running.streams import NodeStreams, added
 from teds_provision.measure.sightings import Sighting
+from teds_provision.measure.standing import NodeStanding
 from teds_provision.measure.topic_actuators import TopicActuators
 from teds_provision.measure.trusting import (
     LEASE_EACH,
     LONGEST_LEASE,
-    NodeStanding,
     Trusted,
     claim,
     open_trusted,
@@ -100,6 +100,7 @@ class NodeKeeper:
         self._lost_at = 0.0
         self._proven = True  # whether what failed last did so in a session
         self._patience = Patience(None)
+        self._standing: NodeStanding | None = None  # of the present try
         self.sighting: Sighting | None = None  # where it was last
         self._halved = 0
         self._lease, self._claimed = request.lease, [0]
@@ -174,7 +175,8 @@ class NodeKeeper:
                     else:
                         self._say("refused" if final else "lost", error)
                     return
-                if patience.gives_up(error, proven=self._proven, elsewhere=self._is_elsewhere):
+                decided = self._standing is not None and error is self._standing.ended
+                if patience.gives_up(error, proven=self._proven, decided=decided, elsewhere=self._is_elsewhere):
                     self._say("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:
@@ -229,6 +231,8 @@ class NodeKeeper:
 
     def _once(self) -> None:
         self._let_others_finish()
+        standing = self._standing = NodeStanding(self._station, self.uuid)
+        standing.require_measurable()
         seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._request.timeout, self._patience.left), 1))
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self.sighting = sighting
@@ -237,7 +241,7 @@ class NodeKeeper:
             if other is not self.bus:
                 other.share.leave(self.uuid)
         try:
-            self._in_session(self.bus, sighting)
+            self._in_session(self.bus, sighting, standing)
         except NoRoom:
             raise
         except BaseException as error:
@@ -248,8 +252,7 @@ class NodeKeeper:
                 self._buses.sightings.wrong(sighting)
             raise
 
-    def _in_session(self, bus: MeasuredBus, sighting: Sighting) -> None:
-        standing = NodeStanding(self._station, self.uuid)
+    def _in_session(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:
         self._announced = self._elsewhere = 0.0
         self._buses.sightings.on_announce(sighting, self._heard_announce, self._seen_elsewhere)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
@@ -270,6 +273,7 @@ class NodeKeeper:
             try:
                 self._measure(bus, trusted, sighting.address)
                 standing.drives = self._driven is not None
+                standing.unsigned = trusted.unsigned or trusted.unverified
                 self._keep(bus, trusted, standing)
                 answers = True
             except (NotAuthentic, PolicyRefused, BadData, KeyStolen):
@@ -399,10 +403,13 @@ class NodeKeeper:
 
     def _watch(self, bus: MeasuredBus, trusted: Trusted, standing: NodeStanding, rest: Rest | None) -> None:
         told = time.monotonic()
-        lied = False
+        lied, mark = False, ""
         while not self._stop.is_set():
             self._anew.wait(LOOK)
             standing.require()
+            if standing.mark != mark:
+                mark = standing.mark
+                self._say("running", why=mark)
             now = time.monotonic()
             if self._doubted(now) or now - told >= self._lease / 3:
                 with self.turn:

@@ -138,16 +138,6 @@ class Of:
         return "" if judged is not None and judged.verified.verdict == "authentic" else "it was not adopted here"
 
 
-def why_not_measured(station: Station, uuid: bytes) -> str:
-    """Why a node cannot be measured whatever is asked for; "" where it can, if its datasheet holds in the session."""
-    banned = station.policy.denied(uuid, None)
-    if banned is not None:  # which takes its keys away, too
-        return f"it was revoked: {banned.why}"
-    if station.policy.tombstone(uuid) is not None:
-        return "its key was given away"
-    return "" if station.keys.held(uuid) else "this station holds no key for it"
-
-
 @dataclass(frozen=True)
 class Load:
     """What a node would take by the datasheet that is kept of it.

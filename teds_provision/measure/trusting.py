@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
-from teds_provision.errors import BadData, KeyStolen, PolicyRefused
+from teds_provision.errors import BadData, PolicyRefused
 from teds_provision.links.ports import Timed
 from teds_provision.measure.blocks import ChannelFacts, Kind
 from teds_provision.measure.clock import ClockMap, Exchange
+from teds_provision.measure.standing import require_measurable
 from teds_provision.protocol.operation import commands
 from teds_provision.protocol.operation.commands import OperationReply
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
@@ -141,8 +142,9 @@ class Trusted:
 def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: bool = False) -> Trusted:
     """Open a session and verify the datasheet for the command ``by``; ``unsigned`` also takes one that nobody signed.
 
-    Raises PolicyRefused (no key, banned), NotAuthentic and Unproven (the datasheet), LinkFailure.
+    Raises PolicyRefused (no key, not listed), NotAuthentic and Unproven (revoked, the datasheet), LinkFailure.
     """
+    require_measurable(station, node.uuid)
     require_session(station, node)
     return trusted_from(station, node, look_in_session(station, node, by=by), unsigned=unsigned)
 
@@ -153,6 +155,7 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Trusted
     The session says that it is this node's; that it is right, nobody says. Raises PolicyRefused where somebody signed
     it, and what :func:`open_trusted` raises.
     """
+    require_measurable(station, node.uuid)
     require_session(station, node)
     looked = look_in_session(station, node, by=by)
     if looked.verified.verdict == "authentic":
@@ -181,52 +184,6 @@ def trusted_from(station: Station, node: Conversation, looked: Looked, *, unsign
     sheet = Sheet.of(image).shown_in(shown_units(station, node.uuid))
     frames = {number: one for (uuid, number), one in station.measurements.frames.items() if uuid == node.uuid}
     return Trusted(node, sheet, digest, name, bare, looked.kept, channel_profiles(station, node.uuid), frames)
-
-
-def require_whitelisted(station: Station, uuid: bytes) -> None:
-    """Actuators move only for nodes on the whitelist (operation.md section 7); raises PolicyRefused."""
-    if station.pins.entry(uuid) is None:
-        raise PolicyRefused(
-            f"Node {uuid.hex()} is not on the whitelist, so its actuators are not moved.",
-            hint=f"To add it: teds-provision whitelist add {uuid.hex()}",
-        )
-
-
-class NodeStanding:
-    """What a person decides of a node while it is measured: a ban, its key given away, the whitelist.
-
-    ``drives``: whether set points are taken for its actuators. Looked at where another process has changed the store.
-    """
-
-    def __init__(self, station: Station, uuid: bytes) -> None:
-        self._station, self._uuid = station, uuid
-        self._version = station.version()
-        self._stolen = station.keys.stolen(uuid)  # known when it began: the session was opened all the same
-        self.drives = False
-
-    def require(self) -> None:
-        """Raise PolicyRefused where the node may not be measured, or not be moved, any more.
-
-        KeyStolen where it may, under a new key: the session ends, and the next one begins with a rotation.
-        """
-        version = self._station.version()
-        if version == self._version:
-            return
-        self._version = version
-        policy = self._station.policy
-        policy.require_not_given_away(self._uuid)
-        revoked = policy.denied(self._uuid, None) if not self._station.keys.held(self._uuid) else None
-        if revoked is not None:
-            raise PolicyRefused(f"Node {self._uuid.hex()} was revoked: {revoked.why}.")
-        if not self._station.keys.held(self._uuid):
-            raise PolicyRefused(f"The key of node {self._uuid.hex()} is no longer held here.")
-        stolen = self._station.keys.stolen(self._uuid)
-        if stolen is None:
-            self._stolen = None
-        elif stolen != self._stolen:
-            raise KeyStolen(f"Node {self._uuid.hex()} gets a new key: {stolen}.")
-        if self.drives:
-            require_whitelisted(self._station, self._uuid)
 
 
 def exchange_clock(node: Conversation, clock: ClockMap) -> Clock:

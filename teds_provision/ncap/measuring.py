@@ -25,13 +25,14 @@ from teds_provision.errors import (
 from teds_provision.measure.blocks import ChannelFacts, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.lookout import Lookout
-from teds_provision.measure.matching import Match, Of, Unsigned, why_not_measured
+from teds_provision.measure.matching import Match, Of, Unsigned
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.sinks.base import BUDGET
+from teds_provision.measure.standing import require_measurable, why_not_measured
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.newcomers import Newcomers
@@ -254,12 +255,8 @@ class Measuring:
             raise NodeBusy(f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first.")
 
     def _require_plan(self, uuid: bytes, kept: KeptMeasurement) -> None:
-        """Raise BadData or PolicyRefused where the datasheet that is known says that it can never be measured so."""
-        why = why_not_measured(self._station, uuid)
-        if why:
-            raise PolicyRefused(
-                f"Node {uuid.hex()} cannot be measured: {why}.", hint=f"Provision it first: provision {uuid.hex()}"
-            )
+        """Raise what :func:`require_measurable` does, and BadData if the known datasheet can never be measured so."""
+        require_measurable(self._station, uuid)
         image = self._station.nodes.datasheet(uuid)
         if image is None:
             return
@@ -585,7 +582,6 @@ class Measuring:
                 job,
                 self._who(one.kept),
                 elsewhere=lambda uuid: self.of(uuid) is not None or uuid in self._loans or self._is_for(uuid, one),
-                listed=lambda: self._station.measurements.detection == "whitelist",
                 joined=joined,
                 left=left,
                 waiting=waiting,

@@ -21,13 +21,13 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.keeper import NodeKeeper
 from teds_provision.measure.lookout import Lookout
-from teds_provision.measure.matching import Load, Match, Of, Unsigned, load_of, why_not_measured
+from teds_provision.measure.matching import Load, Match, Of, Unsigned, load_of
 from teds_provision.measure.runner import Measurement
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.measure.sightings import Sighting
+from teds_provision.measure.standing import why_not_measured
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.looking import is_listed
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 
@@ -77,7 +77,7 @@ class Newcomers:
 
     ``joined`` and ``left`` are told each node (UUID in hex), ``waiting`` each that cannot join, and why; ``past`` each
     that is meant no more, or waited and has gone: what was told of it is of no use to anybody.
-    ``elsewhere``: whether another measurement has a node; ``listed``: whether the whitelist alone is measured.
+    ``elsewhere``: whether another measurement has a node.
     ``budget`` is how many messages a second may go to topics, None where none do; ``rows``: arrays go to them too.
     """
 
@@ -91,7 +91,6 @@ class Newcomers:
         match: Match | Unsigned | Of,
         *,
         elsewhere: Callable[[str], bool],
-        listed: Callable[[], bool],
         joined: Callable[[str], None],
         left: Callable[[str], None],
         waiting: Callable[[str, str], None],
@@ -100,7 +99,7 @@ class Newcomers:
         rows: bool,
     ) -> None:
         self._station, self._roster, self._turns, self._buses, self._job = station, roster, turns, buses, job
-        self._match, self._elsewhere, self._listed, self._budget = match, elsewhere, listed, budget
+        self._match, self._elsewhere, self._budget = match, elsewhere, budget
         self._rows = rows
         self._told_joined, self._told_left, self._told_waiting = joined, left, waiting
         self._told_past = past
@@ -152,10 +151,7 @@ class Newcomers:
 
     def _why_not(self, uuid: str) -> str:
         octets = bytes.fromhex(uuid)
-        why = why_not_measured(self._station, octets)
-        if not why and self._listed() and not is_listed(self._station, octets):
-            why = "it is not on the whitelist"
-        return why or self._match.why_not(self._station, octets)
+        return why_not_measured(self._station, octets) or self._match.why_not(self._station, octets)
 
     def _arrive(self, uuid: str) -> None:
         try:

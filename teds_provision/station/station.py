@@ -285,6 +285,10 @@ class Station:
         """Changes when another process has changed the store, and only then: what was planned before is stale."""
         return self._store.version()
 
+    def changes(self) -> tuple[int, int]:
+        """Return what differs after any change of the store, by this process or another one."""
+        return self._store.changes()
+
     def rows(self) -> Iterator[bytes]:
         """The whole store as it is at one moment, as a stream (see :mod:`teds_provision.store.dump`)."""
         return dump(self._store)

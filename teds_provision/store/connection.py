@@ -192,6 +192,10 @@ class Connection:
         """Return a number that changes when another connection has changed the file."""
         return int(self.execute("PRAGMA data_version")[0][0])
 
+    def changes(self) -> tuple[int, int]:
+        """Return what differs after any change of the file, by this connection or another one."""
+        return self.version(), self._connection.total_changes
+
     def state(self) -> tuple[int, int]:
         """Return what changes when another connection has changed the file, or this one took changes back.
 

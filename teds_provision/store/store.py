@@ -151,6 +151,10 @@ class Store(
         """Return a number that changes when another connection has changed the file."""
         return self._database.version()
 
+    def changes(self) -> tuple[int, int]:
+        """Return what differs after any change of the file, by this connection or another one."""
+        return self._database.changes()
+
     def count(self, table: Literal["nodes", "whitelist", "keys", "trust"]) -> int:
         """Return how many rows a table has."""
         row = self._database.one(f"SELECT count(*) FROM {table}")

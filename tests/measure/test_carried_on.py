@@ -328,7 +328,34 @@ def test_a_node_that_is_revoked_in_the_middle_is_measured_no_more(hall: Hall) ->
         running.read(0.1)
     assert f'"event":"data","uuid":"{a}"' not in running.out[running.out.index("was revoked: stolen") :]
     running.signal(signal.SIGTERM)
-    assert running.end(60).code == 6
+    assert running.end(60).code == 4
+
+
+@pytest.mark.parametrize("command", ["measure", "set"])
+def test_a_node_that_is_taken_off_the_whitelist_is_measured_and_moved_no_more(hall: Hall, command: str) -> None:
+    """The command ends by itself, its node is let go, and it is refused until the node is listed again."""
+    g = hall.nodes["g"].uuid
+    row = hall.station.ask("whitelist", "list")["whitelist"]
+    fingerprint = next(one["fingerprint"] for one in row if one["uuid"] == g)
+    file = hall.folder / f"unlisted-{command}.csv"
+    if command == "measure":
+        running = hall.begin(g, "--rate", 20, "--to", file)
+        running.wait_for('"event":"data"')
+    else:
+        running = hall.station.start("--json", "set", g, 1, 0.05, "--dead-man", 10_000, "--can", hall.can)
+        running.wait_for('"applied"')
+    hall.station.ask("whitelist", "remove", g, "--yes")
+    try:
+        outcome = running.end(60)
+        assert (outcome.code, "not on the whitelist" in outcome.out) == (6, True), outcome
+        refused = hall.station.run("--json", "sample", g, 2, "--can", hall.can)
+        assert (refused.code, refused.json["error"]["code"]) == (6, "not-whitelisted")
+        if command == "measure":
+            assert "not on the whitelist" in file.read_text()
+    finally:
+        hall.station.ask("whitelist", "add", g, "--fingerprint", fingerprint)
+    mode = hall.station.ask("mode", g, "--can", hall.can)
+    assert all(one["claimant"] == 0 for one in mode["channels"]), mode
 
 
 def test_a_set_point_holds_its_source_address_too_where_it_was_named(hall: Hall) -> None:

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import PolicyRefused
-from teds_provision.measure.trusting import NodeStanding
+from teds_provision.errors import BadDatasheet, PolicyRefused, TedsProvisionError
+from teds_provision.measure.standing import NodeStanding, require_measurable
+from teds_provision.measure.trusting import open_trusted
 from teds_provision.station.station import Station
 from teds_provision.store import RevocationRecord
-from tests.bench import PASSPHRASE
-from tests.handover.desk import Pair
+from tests.bench import PASSPHRASE, MemoryLink, talk
+from tests.handover.desk import Pair, provisioned
 
 
 @pytest.fixture
@@ -52,16 +53,47 @@ def unlisted(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize(
-    ("decide", "why"), [(moved, "was moved to station"), (forgotten, "no longer held here"), (revoked, "lost")]
+    ("decide", "code", "why"),
+    [
+        (moved, 6, "was moved to station"),
+        (forgotten, 6, "holds no key"),
+        (revoked, 4, "lost"),
+        (unlisted, 6, "not on the whitelist"),
+    ],
 )
 def test_a_node_that_was_moved_forgotten_or_revoked_is_measured_no_more(
-    pair: Pair, measuring: Station, decide: Callable[[Pair], None], why: str
+    pair: Pair, measuring: Station, decide: Callable[[Pair], None], code: int, why: str
 ) -> None:
     standing = NodeStanding(measuring, pair.board.uuid)
     standing.require()
     decide(pair)
-    with pytest.raises(PolicyRefused, match=why):
+    with pytest.raises(TedsProvisionError, match=why) as refused:
         standing.require()
+    assert refused.value.exit_code == code
+    assert standing.ended is refused.value
+    with pytest.raises(TedsProvisionError, match=why):
+        require_measurable(measuring, pair.board.uuid)
+
+
+def test_a_node_whose_signer_is_trusted_no_more_is_measured_no_more(tmp_path: Path) -> None:
+    """Whichever connection wrote it: `trust remove` beside a measurement, or the process that measures."""
+    pair = Pair.make(tmp_path)
+    provisioned(pair.north, pair.board)
+    pair.take(pair.export()[0])
+    with talk(pair.board, MemoryLink(pair.board, via="can", tapped=False)) as node:
+        open_trusted(pair.south, node, by="measure")
+    beside = Station.open(pair.south.home, ask=lambda prompt, confirm: PASSPHRASE)
+    standings = [NodeStanding(pair.south, pair.board.uuid), NodeStanding(beside, pair.board.uuid)]
+    for standing in standings:
+        standing.require()
+    assert pair.south.policy.distrust("north")
+    pair.south.policy.end_ca(pair.north.ca)
+    for standing in standings:
+        with pytest.raises(BadDatasheet, match="not authentic now") as refused:
+            standing.require()
+        assert "do not count" in refused.value.message
+    beside.close()
+    pair.close()
 
 
 def test_a_copy_and_another_nodes_ban_end_no_measurement(pair: Pair, measuring: Station) -> None:
@@ -71,7 +103,10 @@ def test_a_copy_and_another_nodes_ban_end_no_measurement(pair: Pair, measuring: 
     standing.require()
 
 
-def test_off_the_whitelist_a_node_is_measured_on_and_not_moved(pair: Pair, measuring: Station) -> None:
+def test_in_transparent_mode_a_node_off_the_whitelist_is_measured_on_and_not_moved(
+    pair: Pair, measuring: Station
+) -> None:
+    pair.north.measurements.detection = "transparent"
     standing = NodeStanding(measuring, pair.board.uuid)
     unlisted(pair)
     standing.require()

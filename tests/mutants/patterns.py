@@ -167,15 +167,15 @@ PATTERNS = (
     # measuring and the service
     Pattern(
         "a node that was moved is measured no more",
-        "NodeStanding.require",
-        "policy.require_not_given_away(self._uuid)",
+        "require_measurable",
+        "station.policy.require_not_given_away(uuid)",
         "None",
         "tests/measure/test_standing.py",
     ),
     Pattern(
         "off the whitelist nothing moves",
-        "NodeStanding.require",
-        "require_whitelisted(self._station, self._uuid)",
+        "NodeStanding._require_today",
+        "require_whitelisted(station, uuid)",
         "None",
     ),
     Pattern("a set point grows old", "TopicActuators._seconds_left", "age > self._dead_man / 1000", "False"),

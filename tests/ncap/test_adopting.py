@@ -118,7 +118,7 @@ def test_a_node_without_a_key_is_not_measured_and_the_reason_is_that(desk: Desk)
         until(lambda: known(service, node) and verdict(asked.node(node.uuid)) is not None)
         with pytest.raises(ApiError) as refused:
             asked.request("POST", "/measurements", {"uuids": [node.uuid]})
-        assert "holds no key for it" in str(refused.value)
+        assert "holds no key of node" in str(refused.value)
     service.end()
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import KeyStolen
-from teds_provision.measure.trusting import NodeStanding
+from teds_provision.measure.standing import NodeStanding
 from teds_provision.plant import leaving
 from teds_provision.protocol.plant.roster import Share, Why
 from teds_provision.station.station import Station

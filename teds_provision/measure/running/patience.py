@@ -43,14 +43,19 @@ class Patience:
         left = self.left
         return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, giving up in {left:.0f} s"
 
-    def gives_up(self, error: TedsProvisionError, *, proven: bool, elsewhere: Callable[[], bool]) -> bool:
-        """Whether no other try is worth it.
+    def gives_up(
+        self, error: TedsProvisionError, *, proven: bool, elsewhere: Callable[[], bool], decided: bool = False
+    ) -> bool:
+        """True if no other try is worth it.
 
+        ``decided``: this station itself decided so, by a ban, its whitelist or its trust.
         ``proven``: the error came in a session. Outside one anybody on the bus can have given himself the node's UUID
         and refuse to open one: then it is looked for ``elsewhere``.
         """
         if self.left == math.inf:  # a datasheet that was changed under its values ends what has an end
-            return self._ends and proven and isinstance(error, BadDatasheet)
+            return self._ends and (decided or (proven and isinstance(error, BadDatasheet)))
+        if decided:
+            return True
         passing = isinstance(error, NodeRefused) and error.reason in CURED_BY_TIME
         if not isinstance(error, _FINAL) or passing:
             return not self.left

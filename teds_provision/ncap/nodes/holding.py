@@ -20,7 +20,8 @@ from teds_provision.errors import LinkFailure, NodeBusy, NodeRefused, NoNode, St
 from teds_provision.links.ports import Notice
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.held_actuator import HeldActuator
-from teds_provision.measure.trusting import DEAD_MAN, Trusted, open_trusted, require_whitelisted
+from teds_provision.measure.standing import NodeStanding, require_whitelisted
+from teds_provision.measure.trusting import DEAD_MAN, Trusted, open_trusted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk, Turns
 from teds_provision.protocol.messages.frames import Reason
@@ -249,6 +250,8 @@ class Holding:
         actuator: HeldActuator | None = None
         unit: str | None = None
         answered = 0
+        standing = NodeStanding(self._station, bytes.fromhex(held.uuid))
+        standing.drives = True
         self._until_there(held, session)
         try:
             while True:
@@ -258,6 +261,7 @@ class Holding:
                         held.let_go = True
                     if held.let_go:  # whoever asks from now on has it claimed anew
                         return
+                standing.require()
                 with session(held.uuid) as trusted:
                     if trusted is None:
                         raise LinkFailure("The node is not connected now.", hint="Connect it to a bus.")

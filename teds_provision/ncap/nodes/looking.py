@@ -42,12 +42,6 @@ class Look:
     power: dict[str, Any] | None = None
 
 
-def is_listed(station: Station, uuid: bytes) -> bool:
-    """Whether whitelist mode opens a session with a node: it is on the list, with the key that it has to show."""
-    entry = station.pins.entry(uuid)
-    return entry is not None and entry.fingerprint is not None
-
-
 def look(station: Station, node: Conversation) -> Look:
     """Verify a node: in a session where its key is held here, else what it shows; raises TedsProvisionError."""
     if station.keys.held(node.uuid) and node.identity.state != NodeState.FACTORY:

@@ -24,10 +24,11 @@ from teds_provision.measure.buses import Buses
 from teds_provision.measure.lookout import POLL
 from teds_provision.measure.sightings import Sighting
 from teds_provision.measure.sources import sole_user
+from teds_provision.measure.standing import is_listed
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look, read_anew
+from teds_provision.ncap.nodes.looking import Look, as_problem, look, read_anew
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost

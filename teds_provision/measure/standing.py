@@ -1,0 +1,144 @@
+"""The one rule for which nodes this station measures and moves today, before a session and all through it.
+
+A person decides by bans, handovers, the whitelist and trust, and any process may write that decision. ``measure``,
+``ncap``, ``sample``, ``set`` and the API ask here: :func:`require_measurable` before a session, and
+:class:`NodeStanding` while it lasts.
+"""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+from typing import Final
+
+from teds_provision.errors import (
+    BadDatasheet,
+    KeyStolen,
+    NotAuthentic,
+    NotWhitelisted,
+    PolicyRefused,
+    TedsProvisionError,
+)
+from teds_provision.station.station import Station
+from teds_provision.steps.reading import verdict_of
+from teds_provision.store.records import iso
+
+SETTLING: Final = 0.5
+"""Seconds between two judgements of one node while the store changes all the time."""
+
+
+def is_listed(station: Station, uuid: bytes) -> bool:
+    """True if whitelist mode opens a session with a node: it is listed with the key that it has to show."""
+    entry = station.pins.entry(uuid)
+    return entry is not None and entry.fingerprint is not None
+
+
+def require_measurable(station: Station, uuid: bytes) -> None:
+    """Raise unless the decisions made here let this station measure a node; its datasheet is the session's matter.
+
+    Raises NotAuthentic for a revoked node, NotWhitelisted in whitelist mode, PolicyRefused if its key was given away or
+    is not held.
+    """
+    banned = station.policy.denied(uuid, station.pins.pinned(uuid))
+    if banned is not None:
+        raise NotAuthentic(
+            f"Node {uuid.hex()} was revoked: {banned.why}.",
+            hint=f"If that was a mistake: teds-provision revoke --lift {uuid.hex()}",
+        )
+    station.policy.require_not_given_away(uuid)
+    if not station.keys.held(uuid):
+        raise PolicyRefused(
+            f"This station holds no key of node {uuid.hex()}.",
+            hint=f"Tap it and agree on one: teds-provision agree {uuid.hex()}",
+        )
+    if station.measurements.detection == "whitelist" and not is_listed(station, uuid):
+        raise NotWhitelisted(
+            f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"
+        )
+
+
+def why_not_measured(station: Station, uuid: bytes) -> str:
+    """Return why a node cannot be measured whatever is asked for; "" if its session decides."""
+    try:
+        require_measurable(station, uuid)
+    except (NotAuthentic, PolicyRefused) as error:
+        return error.message.rstrip(".")
+    return ""
+
+
+def require_whitelisted(station: Station, uuid: bytes) -> None:
+    """Actuators move only for nodes on the whitelist (operation.md section 7); raises PolicyRefused."""
+    if station.pins.entry(uuid) is None:
+        raise PolicyRefused(
+            f"Node {uuid.hex()} is not on the whitelist, so its actuators are not moved.",
+            hint=f"To add it: teds-provision whitelist add {uuid.hex()}",
+        )
+
+
+class NodeStanding:
+    """What a node may do while its session lasts, by today's decisions and today's verdict on its datasheet.
+
+    ``drives``: True while set points are taken for its actuators. ``unsigned``: True if a datasheet that nobody signed
+    is enough. ``mark`` is why its values are unproven, "" if they are not. ``ended`` is the error with which this
+    station itself ended the session: no other try changes that.
+    """
+
+    def __init__(self, station: Station, uuid: bytes) -> None:
+        self._station, self._uuid = station, uuid
+        self._changes, self._judged = station.changes(), 0.0
+        self._good = time.time()  # no decision against the node was made before this moment
+        self._stolen = station.keys.stolen(uuid)  # known when it began: the session was opened all the same
+        self.drives = self.unsigned = False
+        self.mark = ""
+        self.ended: TedsProvisionError | None = None
+
+    def require_measurable(self) -> None:
+        """As the function of this name; the error is also kept in ``ended``."""
+        try:
+            require_measurable(self._station, self._uuid)
+        except (NotAuthentic, PolicyRefused) as error:
+            self.ended = error
+            raise
+
+    def require(self) -> None:
+        """Raise NotAuthentic or PolicyRefused if the node may not be measured, or not be moved, any more.
+
+        KeyStolen if it may, under a new key: the session ends, and the next one begins with a rotation. Costs one
+        question to the store until any process has changed it.
+        """
+        changes, now = self._station.changes(), time.monotonic()
+        if changes == self._changes:
+            self._good = time.time()
+            return
+        if now - self._judged < SETTLING:
+            return
+        asked = time.time()
+        self._changes, self._judged = changes, now
+        try:
+            self._require_today()
+        except (NotAuthentic, PolicyRefused) as error:
+            self.ended = error
+            raise
+        self._good = asked
+
+    def _require_today(self) -> None:
+        station, uuid = self._station, self._uuid
+        require_measurable(station, uuid)
+        judged = verdict_of(station, uuid)
+        verdict = "authentic" if judged is None else judged.verified.verdict
+        failed = [] if judged is None else [one for one in judged.verified.checks if one.result == "failed"]
+        why = "; ".join(one.why or one.name for one in failed)
+        if verdict == "not authentic" or (verdict == "unsigned" and not self.unsigned):
+            raise BadDatasheet(
+                f"The datasheet of node {uuid.hex()} is {verdict} now: {why}. "
+                f"Values recorded of it since {iso(datetime.fromtimestamp(self._good, UTC))} do not count.",
+                hint=f"See: teds-provision verify {uuid.hex()}",
+            )
+        self.mark = f"its datasheet is unproven: {why}" if verdict == "unproven" else ""
+        stolen = station.keys.stolen(uuid)
+        if stolen is None:
+            self._stolen = None
+        elif stolen != self._stolen:
+            raise KeyStolen(f"Node {uuid.hex()} gets a new key: {stolen}.")
+        if self.drives:
+            require_whitelisted(station, uuid)
