@@ -157,6 +157,9 @@ def sealed_counter(probe: Probe) -> str:
         )
     demand(probe.plain(session.seal(security_command(Function.LIST), counter=9)), Reason.REPLAY, "Sealed, 9 again")
     probe.sealed_good(IDENTIFY)
+    first = probe.open().seal(IDENTIFY, counter=0)
+    demand(probe.plain(first), Reason.REPLAY, "Sealed (128.4), counter 0 as the first of a session")
+    probe.sealed_good(IDENTIFY)
     return "13 for the same frame, for 8, 0, and for another command under 9"
 
 

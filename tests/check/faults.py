@@ -301,6 +301,11 @@ FAULTS: Final[dict[str, Faulty]] = {
     "FAULT_ANY_COUNTER": Faulty(
         "a second sealed reply for a counter", "sealed-counter", "a second time", fault=faulty.any_counter,
         also=("sealed-last-counter",)),
+    "FAULT_LOWER_COUNTER": Faulty(
+        "a counter below the last one", "sealed-counter", "counter 8: refusal 13 is due", fault=faulty.lower_counters),
+    "FAULT_FIRST_COUNTER_0": Faulty(
+        "a session that begins with counter 0", "sealed-counter", "counter 0 as the first",
+        fault=faulty.first_counter_0),
     "FAULT_LAST_COUNTER": Faulty(
         "a session beyond the last counter", "sealed-last-counter", "refusal 2 is due",
         lambda patch: patch.setattr(node, "LAST_COUNTER", -1)),

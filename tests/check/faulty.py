@@ -225,6 +225,22 @@ def any_counter(board: Board, octets: bytes, reference: Next) -> bytes:
     return reference(octets)
 
 
+def lower_counters(board: Board, octets: bytes, reference: Next) -> bytes:
+    """Refuse the last counter alone."""
+    for line in board.tim._sessions._links.values():
+        if line.session is not None and _is(octets, Function.SEALED):
+            again = int.from_bytes(octets[6:10], "big") == line.session.counter
+            line.session.counter = line.session.counter if again else -1
+    return reference(octets)
+
+
+def first_counter_0(board: Board, octets: bytes, reference: Next) -> bytes:
+    for line in board.tim._sessions._links.values():
+        if line.half_open is not None and _is(octets, Function.SEALED):
+            line.half_open.counter = -1
+    return reference(octets)
+
+
 def close_is_ignored(board: Board, octets: bytes, reference: Next) -> bytes:
     lines = [(line, line.session) for line in board.tim._sessions._links.values()]
     reply = reference(octets)

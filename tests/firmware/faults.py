@@ -156,6 +156,10 @@ CHANGES: Final[dict[str, Change]] = {
         "(void)wrong; return count <= 16 ? (int)(length - count) : -1;",
     ),
     "FAULT_ANY_COUNTER": Change("session.c", "if (taken->counter <= last) {", "if (false) {"),
+    "FAULT_LOWER_COUNTER": Change("session.c", "if (taken->counter <= last) {", "if (taken->counter == last) {"),
+    "FAULT_FIRST_COUNTER_0": Change(
+        "session.c", "if (taken->counter <= last) {", "if (half == NULL && taken->counter <= last) {"
+    ),
     "FAULT_LAST_COUNTER": Change("node.c", "if (taken.counter == UINT32_MAX && ", "if (false && "),
     "FAULT_CLOSE_IGNORED": Change(
         "node.c", "    origin->after = TEDS_AFTER_END_SESSION;\n    return 0;", "    (void)origin;\n    return 0;"

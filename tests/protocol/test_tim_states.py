@@ -146,6 +146,17 @@ def test_prove_signs_the_challenge_for_this_uuid() -> None:
     assert verify(NODE.point, prove_message(UUID, CHALLENGE), Desk().plain(COMMANDS["prove"]).payload)
 
 
+def test_a_lower_counter_is_a_replay_and_so_is_0_at_first() -> None:
+    desk = Desk().agree().open()
+    assert desk.session is not None
+    session, identify = desk.session, COMMANDS["identify"]
+    assert desk.plain(session.seal(identify, counter=0)) == refusal(Reason.REPLAY)
+    assert desk.plain(session.seal(identify, counter=9)).ok
+    for counter in (9, 8, 1, 0):
+        assert desk.plain(session.seal(identify, counter=counter)) == refusal(Reason.REPLAY), counter
+    assert desk.plain(session.seal(identify, counter=10)).ok
+
+
 def test_an_address_is_durable() -> None:
     desk = Desk()
     assert desk.plain(COMMANDS["address"]).ok

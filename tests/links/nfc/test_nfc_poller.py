@@ -17,9 +17,11 @@ class Script:
     def __init__(self, *reads: bytes) -> None:
         self.reads = list(reads)
         self.written: list[bytes] = []
+        self.read_at: list[float] = []
         self.now = 0.0
 
     def read(self) -> bytes:
+        self.read_at.append(self.now)
         return self.reads.pop(0) if len(self.reads) > 1 else self.reads[0]
 
     def write(self, octets: bytes) -> None:
@@ -54,6 +56,14 @@ GOOD = answer(Piece(3, 2, 0, b"ok", answer=True))
 def test_a_station_bears_with_other_peoples_nodes(reads: list[bytes]) -> None:
     script = Script(*reads)
     assert script.transact(n_wait=0) == b"ok"
+
+
+@pytest.mark.parametrize("wt_int", [4, 20, 36, 44])
+def test_a_station_waits_before_its_first_read_too(wt_int: int) -> None:
+    """TNEP: the node's minimum waiting time runs from the write; a tag that is read sooner may be busy with it."""
+    script = Script(OK, b"", GOOD)
+    script.transact(wt_int=wt_int)
+    assert script.read_at == pytest.approx([2 ** (wt_int / 4 - 1) / 1000 * reads for reads in (1, 2, 3)])
 
 
 @pytest.mark.parametrize("wt_int", [0, 4, 20, 36, 44])

@@ -98,6 +98,18 @@ def test_a_drive_message_that_is_late_replayed_forged_or_too_much_moves_nothing(
     assert wheel.points == (1500, 1600)
 
 
+@pytest.mark.parametrize("short", [4, 6])
+def test_the_shortest_dead_man_of_all_its_actuators_limits_a_drive_message(short: int) -> None:
+    bench = Bench().open()
+    for channel in (4, 6):
+        bench.operate(channel, dead_man=100 if channel == short else 500)
+    wheel = Wheel(bench)
+    wheel.hear(wheel.message(1000, 1000, hold=101 * MS))
+    assert (wheel.points, clock(bench).last) == ((100, 100), 0), "heard, and too far ahead for one of them"
+    wheel.hear(wheel.message(1000, 1000, hold=100 * MS))
+    assert wheel.points == (1000, 1000)
+
+
 def test_until_runs_over_every_71_minutes(wheel: Wheel) -> None:
     bench = wheel.bench
     bench.hardware.tick = ((1 << 32) - 5) * 1000
