@@ -52,6 +52,7 @@ MOST: Final = 1000  # lines that may wait for somebody to read them
 LEAVING: Final = 2.0  # seconds for them to leave at the end
 _MOMENTS: Final = frozenset({"time", "since", "started", "until", "tapped"})
 """Members of events and of the status that are moments."""
+_NO_LINK = "No link is configured, so no board is found. To add one: teds-provision ncap run --can socketcan:can0"
 _NEEDED = ("starlette", "uvicorn", "websockets")
 _FILE = FileToRead(exists=True)
 
@@ -234,7 +235,8 @@ def _moment(unix: float) -> str:
 def _sentence(event: dict[str, Any]) -> str:
     if event.get("ready"):
         where = event["url"] or f"the Unix socket {event['api'].removeprefix('unix:')}"
-        return f"Ready on {where}. To open the page: teds-provision ncap open"
+        ready = f"Ready on {where}. To open the page: teds-provision ncap open"
+        return ready if event.get("links") else f"{ready}\n{_NO_LINK}"
     facts = {key: value for key, value in event.items() if key not in ("event", "time", "state") and value}
     told = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
     return f"{event['event']} {event.get('state', '')}: {told}"
@@ -271,6 +273,8 @@ def _status(console: Console, found: dict[str, Any]) -> None:
     problem = found.get("vault", {}).get("problem")
     if problem:
         console.print(f"The vault is locked: {problem['message']} {problem['hint']}", markup=False)
+    if all(link["virtual"] for link in found["links"]):
+        console.print(_NO_LINK, markup=False)
     for link in found["links"]:
         console.print(_link(link), markup=False)
     for node in found["nodes"]:

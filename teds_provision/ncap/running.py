@@ -112,7 +112,8 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
             name = allowed[0] if allowed and host in ("0.0.0.0", "::") else host
             daemon.url = f"{'https' if tls else 'http'}://{f'[{name}]' if ':' in name else name}:{port}"
         socket_path = str(Path(daemon.station.home) / SOCKET)
-        tell({"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid()})
+        links = list(daemon.settings.places)
+        tell({"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid(), "links": links})
         daemon.live.told = tell
         for event in early:
             tell(event)
