@@ -184,21 +184,25 @@ model: $(VENV)/.made
 
 # Stamps, not the files that are made: what was cut short is made anew.
 $(VENV)/.made:
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' || \
 	  { echo "Python 3.11 to 3.13 is needed; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	@echo "Making the virtual environment $(VENV) …"
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --upgrade pip
 	@touch $@
 
-$(VENV)/.run: $(VENV)/.made pyproject.toml
+# Exactly what was tested, by hash; `make test-other LOCKED=` takes the newest that pyproject.toml allows.
+LOCKED ?= yes
+$(VENV)/.run: $(VENV)/.made pyproject.toml locks/ncap.txt
 	@echo "Installing teds-provision with its service and page …"
-	@$(BIN)/python -m pip install --quiet --editable '.[ncap]'
+	@$(if $(LOCKED),$(BIN)/python -m pip install --quiet --require-hashes --requirement locks/ncap.txt)
+	@$(BIN)/python -m pip install --quiet $(if $(LOCKED),--no-deps) --editable '.[ncap]'
 	@touch $@
 
-$(VENV)/.dev: $(VENV)/.made pyproject.toml
+$(VENV)/.dev: $(VENV)/.made pyproject.toml locks/dev.txt
 	@echo "Installing teds-provision and what its tests need …"
-	@$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@$(if $(LOCKED),$(BIN)/python -m pip install --quiet --require-hashes --requirement locks/dev.txt)
+	@$(BIN)/python -m pip install --quiet $(if $(LOCKED),--no-deps) --editable '.[dev]'
 	@touch $@ $(VENV)/.run
 
 .venv-fuzz/.ready: pyproject.toml
@@ -240,16 +244,46 @@ firmware-arm: $(VENV)/.dev vectors-c
 	$(MAKE) --no-print-directory -C firmware arm others analyse
 	$(BIN)/python -m pytest tests/firmware/test_arm.py -m machine -rs
 
+.PHONY: dist locks docs test-versions test-all
+# What is released, in dist/: wheel and sdist (the wheel is built from the sdist), bills of materials (CycloneDX) of the tool and
+# of the C library, checksums. No time of day and no folder gets into them: two builds of a commit are equal.
+dist: .venv-release/.ready
+	.venv-release/bin/python scripts/dist.py dist
+
+# The documentation as a site, in build/site, with the references that follow from code. A dead link, a missing heading or a
+# page without an entrance is an error; the gate builds the same.
+docs: $(VENV)/.dev
+	$(BIN)/python -m mkdocs build --strict --quiet
+	@$(BIN)/python -c 'import pdoc' 2>/dev/null || $(BIN)/python -m pip install --quiet --editable '.[api]'
+	$(BIN)/python scripts/api.py build/site/python
+
+# Before a release: the gate, and what proves the same at greater length.
+test-all: test
+	$(BIN)/python -m pytest tests/release -m soak -rs
+
+# The tests with other versions than the locks have: RESOLUTION=lowest-direct takes the oldest that pyproject.toml
+# allows, highest the newest there are.
+RESOLUTION ?= lowest-direct
+test-versions: .venv-release/.ready
+	rm -rf .venv-versions
+	.venv-release/bin/python -m uv venv --quiet --python $(PYTHON) .venv-versions
+	.venv-release/bin/python -m uv pip install --quiet --python .venv-versions --resolution $(RESOLUTION) --editable '.[dev]'
+	.venv-versions/bin/python -m pytest -n $(WORKERS) --dist worksteal -m '$(USUAL) and not realtime and not system'
+
+# The locks, by purpose: base, ncap, dev and the tools of a release. Resolves anew and shows what changed.
+locks: .venv-release/.ready
+	.venv-release/bin/python scripts/locks.py
+
 # What is in an installation, as a CycloneDX bill of materials.
-sbom: .venv-sbom/.ready
+sbom: .venv-release/.ready $(VENV)/.run
 	@mkdir -p build
-	.venv-sbom/bin/cyclonedx-py environment $(VENV)/bin/python --output-format JSON --output-file build/sbom.json
+	.venv-release/bin/cyclonedx-py environment $(VENV)/bin/python --output-format JSON --output-file build/sbom.json
 	@echo "build/sbom.json"
 
-.venv-sbom/.ready: $(VENV)/.run
-	$(PYTHON) -m venv .venv-sbom
-	.venv-sbom/bin/python -m pip install --quiet 'cyclonedx-bom>=4'
+.venv-release/.ready: locks/release.txt
+	$(PYTHON) -m venv .venv-release
+	.venv-release/bin/python -m pip install --quiet --require-hashes --requirement locks/release.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-fuzz .venv-sbom .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .venv-fuzz .venv-release .venv-versions .mypy_cache .ruff_cache .pytest_cache

@@ -1,3 +1,3 @@
 """Provision smart transducers: identify, whitelist, key, sign and write their IEEE 1451.0 datasheets."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,7 +16,9 @@ from teds_provision.cli.config_file import config_path
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.table import COMMANDS
-from teds_provision.errors import BadData
+from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
+from teds_provision.files import SHARED, require_new, write_new
+from teds_provision.limits import load_toml
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,18 +28,36 @@ if TYPE_CHECKING:
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
 
 
-@command("teds-provision doctor", "teds-provision doctor --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2")
+@command(
+    "teds-provision doctor",
+    "teds-provision doctor --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2",
+    "teds-provision doctor --report -",
+)
 @click.option("--nfc", metavar="PATH", help="Also open this reader: usb, tty:USB0:pn532, udp:localhost:54321.")
 @click.option("--can", metavar="INTERFACE:CHANNEL", help="Also open this bus: socketcan:can0, …")
 @click.option("--ble", metavar="ADAPTER", help="Also require this Bluetooth adapter: auto, hci0.")
+@click.option(
+    "--report",
+    type=click.Path(dir_okay=False, allow_dash=True, path_type=Path),
+    metavar="FILE|-",
+    help="Write one document to paste into a bug report: versions, links, checks, last errors; no keys, no UUIDs.",
+)
+@click.option("--with-uuids", is_flag=True, help="With --report: keep the UUIDs of nodes.")
 @pass_app
-def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
+def doctor(app: App, nfc: str | None, can: str | None, ble: str | None, report: Path | None, with_uuids: bool) -> None:
     """Check Python, libraries, readers, buses, clock, keyring, vault and store; explain each problem and how to fix it.
 
     Opens only the readers and buses you name, and never asks for a passphrase; with --passphrase-fd it also checks the
     seals of pins and trust. Exits 0 unless a check failed (warnings do not count): 7 for the store, the keyring or the
     vault, 5 for a named reader or bus, 1 for the rest.
+
+    --report writes one document to paste into a bug report. It contains no keys, passphrases, fingerprints, paths of
+    this user or names of this machine; UUIDs only with --with-uuids.
     """
+    if with_uuids and report is None:
+        raise UsageFailure("--with-uuids needs --report.", hint="teds-provision doctor --report FILE --with-uuids")
+    if report is not None and str(report) != "-":
+        require_new(report)
     root = click.get_current_context().find_root()
     group = root.command
     settings = known_settings(group) if isinstance(group, click.Group) else None
@@ -48,10 +70,39 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
     code = doctor_room.checks.exit_code(found)
     counts = {word: sum(one.result == word for one in findings) for word in _STYLES}
-    app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
+    if report is None:
+        app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
+    else:
+        document = doctor_room.report.build_report(system, findings, _settings(app), with_uuids=with_uuids)
+        _give_report(app, document, report, {"checks": checks, **counts})
     app.note(", ".join(f"{count} {word}" for word, count in counts.items()) + ".")
     if code:
         raise click.exceptions.Exit(code)
+
+
+def _settings(app: App) -> Mapping[str, Any]:
+    """Return what config.toml sets; empty if it cannot be read, which a check reports."""
+    path = config_path(app.home)
+    try:
+        return load_toml(path.read_text(encoding="utf-8"), str(path))
+    except (TedsProvisionError, OSError, ValueError):
+        return {}
+
+
+def _give_report(app: App, document: Mapping[str, Any], path: Path, result: Mapping[str, Any]) -> None:
+    """Print the report, or write it to a new file and say where; with --json it is the member ``report``."""
+    text = json.dumps(document, indent=2, ensure_ascii=False)
+    if str(path) == "-":
+        if app.json:
+            app.emit({**result, "report": document})
+        else:
+            app.lines([text])
+        return
+    write_new(path, text.encode() + b"\n", mode=SHARED)
+    app.emit(
+        {**result, "report": str(path)},
+        lambda console: console.print(f"Report: {path}. Read it before you share it.", markup=False),
+    )
 
 
 def _bad_value(app: App, root: click.Context, values: Mapping[str, Any]) -> str:

@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.doctor import checks, fleet, links, machine, station
+    from teds_provision.doctor import checks, fleet, links, machine, report, station
 else:
     __getattr__ = lazy(__name__)

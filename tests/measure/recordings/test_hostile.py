@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +16,7 @@ from teds_provision.errors import BadData, TedsProvisionError
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.sinks.mcap.writer import CHUNK, CHUNK_HEAD, HEADER, MAGIC, record, text
+from teds_provision.measure.sinks.mcap.zstandard_frames import zstd
 from tests.measure.recordings.test_converting import FORMATS, convert_to, recorded
 
 
@@ -58,7 +58,7 @@ def test_what_is_no_recording_is_refused_with_its_place(tmp_path: Path, octets: 
 
 
 def test_a_chunk_that_unpacks_to_gigabytes_is_refused_unopened(tmp_path: Path) -> None:
-    bomb = zstandard.ZstdCompressor(level=19).compress(bytes(1 << 28))
+    bomb = zstd.compress(bytes(1 << 28), 19)
     head = MAGIC + record(HEADER, text("ros2") + text(""))
     for claimed in (1 << 28, 100):  # honest, and a lie
         body = CHUNK_HEAD.pack(0, 0, claimed, 0) + text("zstd") + struct.pack("<Q", len(bomb)) + bomb

@@ -43,6 +43,7 @@ from teds_provision.measure.sinks.mcap.writer import (
     record,
     text,
 )
+from teds_provision.measure.sinks.mcap.zstandard_frames import ZstdError, decompress_frame
 
 LARGEST_RECORD: Final = 1 << 28  # a length beyond it is damage
 _PRIVATE: Final = 0x80  # op codes from here on are free for anybody
@@ -494,8 +495,6 @@ def _fits(content: bytes) -> bool:
 
 def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[bytes, bool] | None:
     """The records in a chunk, and whether its checksum holds; None where it cannot be unpacked to ``most`` octets."""
-    import zstandard
-
     if not _fits(content):
         return None
     _, _, size, checksum = CHUNK_HEAD.unpack_from(content)
@@ -507,8 +506,8 @@ def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[by
         return None
     if compression == b"zstd":
         try:
-            body = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        except zstandard.ZstdError:
+            body = decompress_frame(packed, size)
+        except ZstdError:
             return None
     elif compression == b"":
         body = packed

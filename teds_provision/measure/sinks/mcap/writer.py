@@ -11,6 +11,8 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from teds_provision.measure.sinks.mcap.zstandard_frames import compress_frame
+
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 0x09, 0x0B, 0x0C, 0x0D, 0x0E, 0x0F
@@ -95,9 +97,6 @@ class McapWriter:
     """
 
     def __init__(self, put: Callable[[bytes], None], *, profile: str, library: str) -> None:
-        import zstandard
-
-        self._compressor = zstandard.ZstdCompressor(level=1)
         self._put_octets = put
         self._offset = 0
         self.summary = McapSummary()
@@ -169,7 +168,7 @@ class McapWriter:
         if not self._chunk:
             return
         content = b"".join(self._chunk)
-        packed = self._compressor.compress(content)
+        packed = compress_frame(content)
         head = CHUNK_HEAD.pack(self._first, self._last, len(content), zlib.crc32(content))
         chunk = record(CHUNK, head + text("zstd") + struct.pack("<Q", len(packed)) + packed)
         indexes, places = [], b""
