@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -34,11 +35,12 @@ def _channels_of(name_or_path: str, home: Path) -> Mapping[int, ChannelProfile]:
     folders = default_folders(home)
     try:
         path = find_profile(name_or_path, folders)
-        return _read(path, folders, path.stat().st_mtime_ns)
+        return _read(path, folders, path.stat().st_mtime_ns, int(time.monotonic()))
     except (TedsProvisionError, OSError):
         return {}
 
 
 @lru_cache(maxsize=64)  # a plant has a thousand nodes and a dozen types
-def _read(path: Path, folders: tuple[Path, ...], _changed: int) -> Mapping[int, ChannelProfile]:
+def _read(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) -> Mapping[int, ChannelProfile]:
+    """Read the channels of a profile; again each second, as the profiles that it extends may change."""
     return {one.number: one for one in load_profile(path, folders).channels}

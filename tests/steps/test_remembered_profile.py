@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import reset_node
 from teds_provision.steps.build import BuildOrder, NotNamed, build, nobody
@@ -14,6 +15,7 @@ from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.profile.load import shipped_profiles
 from tests.bench import Board, talk
+from tests.pace import until
 
 CELL = (shipped_profiles() / "load-cell.toml").read_text()
 OVEN = (shipped_profiles() / "temperature-sensor.toml").read_text()
@@ -69,3 +71,19 @@ def reset(station: Station, board: Board) -> None:
     """To factory state: its datasheet is judged by the profile that is remembered."""
     with talk(board) as node:
         reset_node(station, node, identify(station, node))
+
+
+def test_a_change_of_a_profile_that_another_one_extends_reaches_a_process_that_runs(station: Station) -> None:
+    """A base station shows units by profiles that it has read; one of them may rest on a file that changes later."""
+    folder = station.home / "profiles"
+    folder.mkdir()
+    uuid = bytes.fromhex("8d4d9da65281f7000000")
+
+    def show_in(unit: str) -> None:
+        (folder / "base.toml").write_text(OVEN.replace('unit = "degC"\n', f'unit = "degC"\ndisplay-unit = "{unit}"\n'))
+
+    (folder / "own.toml").write_text('extends = "base"\ntitle = "Own"\n')
+    station.nodes.remember(uuid, profile="own")
+    for unit in ("degF", "K"):
+        show_in(unit)
+        until(lambda unit=unit: shown_units(station, uuid) == {1: unit})

@@ -107,6 +107,20 @@ def test_an_ambiguous_prefix_lists_the_candidates(store: Store) -> None:
         store.resolve("0102")
 
 
+def test_a_renamed_node_leaves_its_old_name_although_the_whitelist_keeps_it(store: Store) -> None:
+    """An import puts one name into both tables; the whitelist's row is sealed, and not written again by a rename."""
+    store.put_whitelist(WhitelistEntry(FINGER, name="grip"))
+    assert store.resolve("grip") == FINGER
+    store.put_node(NodeRecord(FINGER, name="grip"))
+    store.put_node(NodeRecord(FINGER, name="wrist"))
+    assert store.resolve("wrist") == FINGER
+    with pytest.raises(NotFound):
+        store.resolve("grip")
+    assert store.bearers_of(["grip", "wrist"]) == {"wrist": FINGER}
+    assert store.all_named("grip") == []
+    assert store.beginning_with("", 9) == [(FINGER.hex(), "wrist"), ("wrist", FINGER.hex())]
+
+
 def test_a_name_that_two_nodes_have_is_ambiguous(store: Store) -> None:
     store.put_node(NodeRecord(FINGER, name="twin"))
     store.put_node(NodeRecord(JOINT, name="twin"))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from itertools import islice
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
 from teds_provision.store.database import PAGE, Database, places
@@ -103,7 +103,9 @@ class NodeTables:
 
     def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
         """Return who has each of these names (a page of them), in the nodes or in the whitelist."""
-        found = (f"SELECT name, uuid FROM {table} WHERE name IN ({places(names)})" for table in ("whitelist", "nodes"))
+        found = (
+            f"SELECT name, uuid FROM {table} WHERE name IN ({places(names)})" for table in (_LISTED_NAMES, "nodes")
+        )
         return {name: bytes(uuid) for statement in found for name, uuid in self._database.execute(statement, names)}
 
     def node(self, uuid: bytes) -> NodeRecord | None:
@@ -184,13 +186,13 @@ class NodeTables:
         found: dict[str, str] = {}
         upper = text + "\U0010ffff"
         digits = text.removeprefix("0x").lower()
-        for table in ("nodes", "whitelist"):
-            named = f"SELECT name, lower(hex(uuid)) FROM {table} WHERE name >= ? AND name < ? ORDER BY name LIMIT ?"
+        for table, names in (("nodes", "nodes"), ("whitelist", _LISTED_NAMES)):
+            named = f"SELECT name, lower(hex(uuid)) FROM {names} WHERE name >= ? AND name < ? ORDER BY name LIMIT ?"
             found.update((name, uuid) for name, uuid in self._database.execute(named, (text, upper, most)))
             if re.fullmatch("[0-9a-f]{0,20}", digits):
                 within = f"SELECT lower(hex(uuid)), name FROM {table} WHERE uuid BETWEEN ? AND ? LIMIT ?"
                 rows = self._database.execute(within, (*_bounds(digits), most))
-                found.update((uuid, name or found.get(uuid, "")) for uuid, name in rows)
+                found.update((uuid, found.get(uuid) or name or "") for uuid, name in rows)
         return sorted(found.items())[:most]
 
     def all_named(self, name: str) -> list[bytes]:
@@ -219,8 +221,15 @@ def _groups(listed: str) -> tuple[str, ...]:
     return tuple(json.loads(listed))
 
 
+_LISTED_NAMES: Final = (
+    "(SELECT w.uuid, w.name FROM whitelist w LEFT JOIN nodes n USING (uuid)"
+    " WHERE w.name IS NOT NULL AND n.name IS NULL)"
+)
+"""The names of the whitelist that count: a node that was named since has that name alone."""
+
+
 def _by_name(name: str) -> tuple[str, tuple[str, str]]:
-    return "SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM whitelist WHERE name = ?", (name, name)
+    return f"SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM {_LISTED_NAMES} WHERE name = ?", (name, name)
 
 
 def _by_prefix(digits: str) -> tuple[str, tuple[bytes, bytes, bytes, bytes]]:
