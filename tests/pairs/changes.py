@@ -84,6 +84,12 @@ def _holds_values(name: str) -> Looks:
     return lambda scene: (scene.files / name).exists() and '"event":"data"' in (scene.files / name).read_text()
 
 
+def _drop_empty_recording(scene: Scene, ended: Ended) -> None:
+    """Remove the recording of a refused measurement: the same command would refuse to write over it."""
+    if ended.code:
+        (scene.files / "hand.jsonl").unlink(missing_ok=True)
+
+
 def _counts(query: str, wanted: int = 1) -> Looks:
     return lambda scene: scene.count(query) >= wanted
 
@@ -238,7 +244,7 @@ CHANGES: Final = (
     Change("measure GROUP",
            ("measure", "hand", "--duration", "1", "--to", "{FILES}/hand.jsonl", "--timeout", "3", "BUS"),
            (*MEASURING, "provision --all"), _holds_values("hand.jsonl"), refused=6, touches=_MEMBERS_OF_HAND,
-           again=(0, 2)),
+           again=(0, 2), after=_drop_empty_recording),
     Change("set", ("set", "{GRIPPER}", "1", "0.01", "--hold", "0.3", "BUS"), (*MEASURING, "provision --all"),
            lambda scene: True),
     Change("identify --add", ("identify", "--add", "--via", "can", "--can", "{CAN}"),
