@@ -57,8 +57,9 @@ def fill(station: Station, count: int) -> None:
             station.keys.promote(uuid, identifier.hex())
             station.pins.put(WhitelistEntry(uuid, fingerprint(point)))
             name, profile = f"finger {number}", "tactile-finger-sensor"
-            record = NodeRecord(uuid, point, name, profile, 2, 3, 7, groups=("left hand",), teds_sha256="ab" * 32)
+            record = NodeRecord(uuid, point, name, profile, 2, 3, 7, teds_sha256="ab" * 32)
             station.nodes.put(record)
+        station.groups.create("left hand", [number.to_bytes(10, "big") for number in range(count)])
 
 
 def timed(work: Callable[[], object]) -> tuple[float, object]:

@@ -45,6 +45,7 @@ class Merge:
         self._decisions()
         self._facts()
         self._marks()
+        self._groups()
 
     def told(self) -> list[str]:
         """What stayed, in sentences."""
@@ -92,6 +93,18 @@ class Merge:
             self.kept["nodes whose epoch or sequence is higher now"] += (
                 known.epoch > record.epoch or known.sequence > record.sequence
             )
+
+    def _groups(self) -> None:
+        """Measurement groups: those that are missing here; their members as a newer copy has them.
+
+        What an older copy has and this store lacks was deleted since.
+        """
+        present = {group.name: set(group.uuids) for group in self.live.groups()}
+        for group in self.copy.groups():
+            missing = group.name not in present and not self.older
+            if (self.newer or missing) and present.get(group.name) != set(group.uuids):
+                self.live.put_group(group)
+                self.back["groups"] += 1
 
     def _whitelist(self) -> None:
         for entry in self.copy.whitelist():

@@ -15,6 +15,7 @@ from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
     from teds_provision.handover.life import TakeOver
+    from teds_provision.station.measurements import HandedOn
     from teds_provision.station.station import Station
     from teds_provision.steps.agree import ResetReceipt
 
@@ -108,9 +109,25 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
     )
     with station.lock("decommission", app.note):
         receipt = _reset(app, station, octets, links, force=force)
-        handover.life.retire(station, octets, receipt)
+        left = handover.life.retire(station, octets, receipt)
     state = "is out of service and signed that it is in factory state" if receipt else "is out of service, unconfirmed"
-    app.emit(_result(octets, receipt) | {"fresh": True}, f"Node {octets.hex()} {state}.")
+    told = _result(octets, receipt) | {"fresh": True, "removed": left.to_json()}
+    app.emit(told, f"Node {octets.hex()} {state}.{_handed_on(left, 'Removed from')}")
+
+
+def _handed_on(moved: HandedOn, verb: str) -> str:
+    """Return what a node was removed from, or handed on, in lines; "" if there is nothing."""
+    lines = [
+        f"{verb} {what}: {', '.join(values)}"
+        for what, values in (
+            ("groups", moved.groups),
+            ("topic names", moved.topics),
+            ("measurements", moved.measurements),
+        )
+        if values
+    ]
+    lines += [f"Measurements that had no other node were deleted: {', '.join(moved.ended)}"] if moved.ended else []
+    return "".join(f"\n{line}" for line in (*lines, *(f"Not moved: {why}" for why in moved.kept)))
 
 
 def _result(uuid: bytes, receipt: ResetReceipt | None) -> dict[str, Any]:
@@ -157,8 +174,9 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
 def replace(
     ctx: click.Context, old: str, new: str, copy_calibration: bool, yes: bool, dry_run: bool, links: LinkSettings
 ) -> None:
-    """Replace OLD with the whitelisted spare NEW, which takes over its name, groups and profile.
+    """Replace OLD with the whitelisted spare NEW.
 
+    NEW takes over its name, groups, topic names, measurements and profile; what moved, and what could not, is listed.
     A calibration belongs to one sensor, so it is copied only on request. If you name a link, OLD is reset when it can
     be reached; otherwise it goes out of service unconfirmed.
     """
@@ -170,20 +188,25 @@ def replace(
     with station.lock("replace", app.note):
         plan = handover.life.plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
         told, text = _takeover(plan)
+        told["groups"] = station.groups.of(spare if plan.done else octets)
         if dry_run:
             app.emit({**told, "plan": True}, f"Plan: {text}.")
             return
         if plan.done:
-            app.emit({**told, "fresh": False}, "Nothing to do: it has already taken over.")
+            moved = handover.life.hand_on(station, plan)
+            rest = _handed_on(moved, "Moved")
+            text = "It has already taken over." if rest else "Nothing to do: it has already taken over."
+            app.emit({**told, "moved": moved.to_json(), "fresh": False}, f"{text}{rest}")
             return
         app.confirm(f"{text}?", yes=yes)
         receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
-        warnings = handover.life.take_over(station, plan, receipt)
+        warnings, moved = handover.life.take_over(station, plan, receipt)
     for warning in warnings:
         app.warn(warning)
     confirmed = receipt is not None
     next_step = f"Next, run provision (or sign and write) for {spare.hex()}."
-    app.emit({**told, "confirmed": confirmed, "fresh": True, "warnings": list(warnings)}, f"{text}.\n{next_step}")
+    told |= {"confirmed": confirmed, "fresh": True, "warnings": list(warnings), "moved": moved.to_json()}
+    app.emit(told, f"{text}.{_handed_on(moved, 'Moved')}\n{next_step}")
 
 
 def _takeover(plan: TakeOver) -> tuple[dict[str, Any], str]:
@@ -193,7 +216,6 @@ def _takeover(plan: TakeOver) -> tuple[dict[str, Any], str]:
         "old": plan.old.uuid.hex(),
         "new": plan.new.uuid.hex(),
         "name": taken.name,
-        "groups": list(taken.groups),
         "profile": taken.profile,
         "calibration_copied": bool(plan.calibration),
     }

@@ -26,6 +26,7 @@ from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.groups import valid_name
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
@@ -82,8 +83,18 @@ class ImportedRows:
             holders=[
                 Holder(one.node.uuid, other, self.now, self.bundle.mode) for one in taken for other in self.others
             ],
+            groups=self._groups(taken),
             marks=self._marks(taken),
         )
+
+    @staticmethod
+    def _groups(taken: Sequence[PlannedNode]) -> dict[str, list[bytes]]:
+        """Return the measurement groups that the bundle puts these nodes in."""
+        groups: dict[str, list[bytes]] = {}
+        for one in taken:
+            for label in one.node.groups:
+                groups.setdefault(valid_name(label), []).append(one.node.uuid)
+        return groups
 
     def _turn_to(self, uuids: Sequence[bytes]) -> None:
         """Read what is known here of a page of nodes."""
@@ -124,7 +135,6 @@ class ImportedRows:
                 one.name,
                 node.profile,
                 state,
-                groups=node.groups,
                 teds_sha256=node.teds_sha256,
             )
         return replace(
@@ -132,7 +142,6 @@ class ImportedRows:
             point=node.node_key,
             name=known.name or one.name,
             profile=known.profile or node.profile,
-            groups=tuple(dict.fromkeys((*known.groups, *node.groups))),
             state=known.state or state,
             teds_sha256=known.teds_sha256 or node.teds_sha256,
         )

@@ -11,6 +11,7 @@ from teds_provision.handover.deny import deny
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.handover.strict_json import is_label
+from teds_provision.station.measurements import HandedOn
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.sign import known_image
@@ -72,16 +73,22 @@ def is_finished(station: Station, uuid: bytes) -> bool:
     return record is not None and is_retired(record) and not (record.retired or "").endswith(UNCONFIRMED)
 
 
-def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: str = DECOMMISSIONED) -> None:
-    """Take a node out of service. Without its receipt that is unconfirmed, and its keys stay for another try."""
+def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: str = DECOMMISSIONED) -> HandedOn:
+    """Take a node out of service, and out of its groups and measurements, which are returned.
+
+    Without its receipt that is unconfirmed, and its keys stay for another try.
+    """
     record = station.nodes.get(uuid)
     retired = as_ if receipt is not None else as_ + UNCONFIRMED
     with station.transaction():
         station.pins.remove(uuid)
         station.nodes.drop_draft(uuid)
-        station.nodes.remember(uuid, name=None, groups=(), retired=retired)
-        detail = {"proof": receipt.proof.hex()} if receipt is not None else {}
+        station.nodes.remember(uuid, name=None, retired=retired)
+        left = station.measurements.hand_on(uuid, None)
+        detail: dict[str, object] = {"proof": receipt.proof.hex()} if receipt is not None else {}
+        detail |= {name: values for name, values in left.to_json().items() if values}
         station.audit("decommission", uuid, retired, name=record.name if record else None, **detail)
+    return left
 
 
 @dataclass(frozen=True)
@@ -127,25 +134,36 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
     return blocks
 
 
-def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) -> tuple[str, ...]:
-    """Give the spare name, groups and profile, and take the old node out of service, in one transaction.
+def hand_on(station: Station, plan: TakeOver) -> HandedOn:
+    """Move what is still with the old node: groups, chosen names, measurements; for a spare in its place already."""
+    with station.transaction():
+        moved = station.measurements.hand_on(plan.old.uuid, plan.new.uuid)
+        if moved != HandedOn(kept=moved.kept):
+            station.audit("replace", plan.new.uuid, "moved", old=plan.old.uuid.hex(), **moved.to_json())
+    return moved
 
-    Returns warnings: with a calibration the spare's datasheet is built, to be signed and written.
+
+def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) -> tuple[tuple[str, ...], HandedOn]:
+    """Give the spare name, groups, measurements and profile, and take the old node out of service, in one transaction.
+
+    Returns warnings (with a calibration the spare's datasheet is built, to be signed and written), and what it moved.
     """
     old, new = plan.old, plan.new.uuid
     warnings: tuple[str, ...] = ()
     with station.transaction():
+        moved = station.measurements.hand_on(old.uuid, new)
         if not plan.done:
             retire(station, old.uuid, receipt, as_=f"{REPLACED} {new.hex()}")  # before the spare takes its name
             entry, former = station.pins.entry(new), station.pins.entry(old.uuid)
             if entry is not None and former is not None and former.name is not None:
                 station.pins.put(replace(entry, name=former.name))
             station.nodes.drop_draft(new)
-            station.nodes.remember(new, name=old.name, groups=old.groups, profile=old.profile)
+            station.nodes.remember(new, name=old.name, profile=old.profile)
             if plan.calibration:
                 order = BuildOrder(old.profile, name=old.name)
                 warnings = build(station, new, order, has=Image(new, plan.calibration)).warnings
-            station.audit("replace", new, "done", old=old.uuid.hex(), calibration=bool(plan.calibration))
+            detail = {name: values for name, values in moved.to_json().items() if values}
+            station.audit("replace", new, "done", old=old.uuid.hex(), calibration=bool(plan.calibration), **detail)
         else:
             retire(station, old.uuid, receipt, as_=f"{REPLACED} {new.hex()}")
-    return warnings
+    return warnings, moved

@@ -470,14 +470,48 @@ class Measuring:
         return one
 
     def _run(self, one: Running) -> None:
-        """Take the nodes, then measure until it is stopped; a job ends of itself only when its time is over."""
+        """Measure until it is stopped or its time is over; again from the start after its nodes were replaced."""
+        while self._run_with_members(one):
+            if not self._take_new_members(one):
+                return
+
+    def _take_new_members(self, one: Running) -> bool:
+        """Read again which nodes a measurement has; False if it is not kept any more, because none is left."""
+        try:
+            kept = self._station.measurements.get(one.kept.id)
+            uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
+        except NotFound as error:
+            self._say(one, "ended", error.message)
+            with self._guard:
+                self._running.pop(one.kept.id, None)
+            self._live.event("measurement", state="deleted", id=one.kept.id)
+            return False
+        with self._guard:
+            one.kept, one.uuids = kept, uuids
+            one.reports = {uuid: report for uuid, report in one.reports.items() if uuid in uuids}
+        return True
+
+    def _has_other_members(self, one: Running, job: MeasurementJob) -> bool:
+        """True if `replace` or `decommission` changed the nodes of a measurement in the store."""
+        if one.kept.match is not None or one.kept.frozen:
+            return False
+        kept = next((kept for kept in self._station.measurements.all() if kept.id == one.kept.id), None)
+        if kept is None:  # deleted by `decommission`, unless it came to its end
+            return job.kept.ends is None and not one.stop.is_set()
+        try:
+            return {uuid.hex() for uuid in self._station.measurements.nodes_of(kept)} != set(one.uuids)
+        except NotFound:
+            return True
+
+    def _run_with_members(self, one: Running) -> bool:
+        """Take the nodes, then measure; True if the measurement has other nodes now, and is to begin again."""
         taken: list[str] = []
         try:
             self._wait_for_members(one)
             for uuid in one.uuids:
                 self._wait_for_turn(one, uuid)
                 if one.stop.is_set():
-                    return
+                    return False
                 taken.append(uuid)
                 self._roster.note(uuid, measurement=one.kept.id)
             job = one.job = self._new_job(one)
@@ -485,6 +519,9 @@ class Measuring:
             job.start(self._buses, self._watcher(one))
             while job.alive and not one.stop.wait(0.5):
                 self._say(one, *_state_of(one, job))
+                if self._has_other_members(one, job):
+                    job.stop()
+                    return True
             job.stop()
             self._say(one, "ended")
         except TedsProvisionError as error:
@@ -493,6 +530,7 @@ class Measuring:
             for uuid in taken:
                 self._turns.give(uuid)
                 self._roster.note(uuid, "idle", measurement=None, report=None)
+        return False
 
     def _who(self, kept: KeptMeasurement) -> Match | Unsigned | Of:
         if self._unverified is not None and kept.id in (Unsigned.text, _ADOPTED):

@@ -28,6 +28,17 @@ _SHOWN: Final = 10
 _CREATE: Final = "teds-provision group create NAME UUID …"
 
 
+def is_valid_name(name: str) -> bool:
+    """True if a group may have this name."""
+    forbidden = name in (ALL, *_NO_PATHS) or _LIKE_A_UUID.match(name) is not None
+    return not forbidden and bool(name.strip()) and name.isprintable() and len(name) <= LONGEST
+
+
+def valid_name(label: str) -> str:
+    """Return the name of the group that a bundle calls ``label``: the label itself if a group may have it."""
+    return label if is_valid_name(label) else f"group {label[: LONGEST - len('group ')]}".rstrip()
+
+
 class Groups:
     """The groups of one station. A group that is measured is frozen: it cannot be changed until the measurement ends.
 
@@ -57,8 +68,7 @@ class Groups:
 
     def create(self, name: str, uuids: Sequence[bytes]) -> Group:
         """Make a group, or give the one that is there back where it has the same members; raises UsageFailure."""
-        forbidden = name in (ALL, *_NO_PATHS) or _LIKE_A_UUID.match(name)
-        if forbidden or not name.strip() or not name.isprintable() or len(name) > LONGEST:
+        if not is_valid_name(name):
             raise UsageFailure(
                 f"{name!r} is not a valid group name.",
                 hint="Use up to 64 characters, not only hex digits or dots, and not 'all', which means every node.",
@@ -99,6 +109,25 @@ class Groups:
         with self.frozen(name), self._store.together():
             self._tell(name, self.get(name).uuids, member=False)
             return self._store.remove_group(name)
+
+    def of(self, uuid: bytes) -> list[str]:
+        """Return the names of the groups that a node is in."""
+        return self._store.groups_of(uuid)
+
+    def hand_on(self, old: bytes, new: bytes | None) -> list[str]:
+        """Replace a node in all of its groups (None: remove it), and return their names.
+
+        A group that is measured changes too, because the node is out of service: `ncap` begins that measurement again.
+        """
+        names = self.of(old)
+        with self._store.together():
+            for name in names:
+                self._store.remove_from_group(name, [old])
+                self._tell(name, [old], member=False)
+                if new is not None and new not in self.get(name).uuids:
+                    self._store.add_to_group(name, [new])
+                    self._tell(name, [new], member=True)
+        return names
 
     def _tell(self, name: str, uuids: Iterable[bytes], *, member: bool) -> None:
         """Tell the plant who came into a group, or left it."""

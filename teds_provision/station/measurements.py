@@ -14,7 +14,7 @@ import secrets
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from teds_provision.errors import Frozen, NotFound, PolicyRefused, StoreFailure, UsageFailure
@@ -27,6 +27,25 @@ FOLDER = "measuring"  # of the home: who measures what now
 
 STATION = bytes(10)
 """Stands for the station in :attr:`Measurements.names`: the first part of every topic."""
+
+
+@dataclass(frozen=True)
+class HandedOn:
+    """Groups, names and measurements that a node was removed from, or that its replacement has now.
+
+    ``topics`` are chosen names, ``measurements`` those that now have other nodes, ``ended`` those that had no other
+    node. ``kept`` holds what could not be moved, a sentence each.
+    """
+
+    groups: tuple[str, ...] = ()
+    topics: tuple[str, ...] = ()
+    measurements: tuple[str, ...] = ()
+    ended: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, list[str]]:
+        """Return the members of the report."""
+        return {name: list(values) for name, values in vars(self).items()}
 
 
 class Measurements:
@@ -104,6 +123,62 @@ class Measurements:
     def forget(self, measurement_id: str) -> bool:
         """Measure it no more after the next start; False where it is not there. Ends nothing that runs."""
         return self._store.remove_measurement(measurement_id)
+
+    def hand_on(self, old: bytes, new: bytes | None) -> HandedOn:
+        """Put ``new`` in the place of ``old`` in groups, chosen names, frames and measurements; None removes ``old``.
+
+        Changes nothing if ``old`` is in none of them, so it may be repeated.
+        """
+        with self._store.together():
+            kept = [f"{word} goes on with the old node until it is started again." for word in self._commands_with(old)]
+            groups = self._groups.hand_on(old, new)
+            topics, refused = self._hand_on_names(old, new)
+            changed, ended = [], []
+            for one in self._store.measurements():
+                if one.group is None and old in one.uuids:
+                    rest = dict.fromkeys(uuid if uuid != old else new for uuid in one.uuids)
+                    uuids = tuple(uuid for uuid in rest if uuid is not None)
+                    if uuids:
+                        self._store.put_measurement(replace(one, uuids=uuids))
+                        changed.append(one.id)
+                    else:
+                        self._store.remove_measurement(one.id)
+                        ended.append(one.id)
+                elif one.group is not None and one.group in groups:
+                    if self._groups.get(one.group).uuids:
+                        changed.append(one.id)
+                    else:
+                        self._store.remove_measurement(one.id)
+                        ended.append(one.id)
+        return HandedOn(tuple(groups), tuple(topics), tuple(changed), tuple(ended), (*kept, *refused))
+
+    def _commands_with(self, uuid: bytes) -> list[str]:
+        """Return the `measure` commands that live and have a node, in words."""
+        groups = self._groups.of(uuid)
+        mine = [one for one in self.of_commands() if uuid in one.uuids or one.group in groups]
+        return [f"The running command measure {one.group or uuid.hex()} (process {one.pid})" for one in mine]
+
+    def _hand_on_names(self, old: bytes, new: bytes | None) -> tuple[list[str], list[str]]:
+        """Move chosen names and frames; returns the names, and a sentence for each that cannot be moved."""
+        moved, refused = [], []
+        names, frames = self.names, self.frames
+        for (uuid, channel), name in names.items():
+            if uuid != old:
+                continue
+            if new is not None and (new, channel) in names:
+                what = f"of channel {channel}" if channel else "of the node"
+                refused.append(f"The topic name {name!r} {what}: the new node has the name {names[new, channel]!r}.")
+                continue
+            self._store.remove_topic_name(old, channel)
+            if new is not None:
+                self._store.put_topic_name(new, channel, name)
+            moved.append(name)
+        for (uuid, channel), frame in frames.items():
+            if uuid == old:
+                self._store.remove_frame(old, channel)
+                if new is not None and (new, channel) not in frames:
+                    self._store.put_frame(new, channel, frame)
+        return moved, refused
 
     @contextmanager
     def running(self, uuids: Iterable[bytes], *, group: str | None = None, what: str = "measure") -> Iterator[None]:

@@ -74,7 +74,6 @@ def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[di
 def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any]:
     node, entry, moved, revoked = known.node or {}, known.whitelist or {}, known.moved, known.revoked
     point = node.get("point")
-    groups = list(dict.fromkeys((*json.loads(node.get("groups", "[]")), *known.groups)))
     return {
         "uuid": known.uuid.hex(),
         "name": node.get("name") or entry.get("name"),
@@ -93,8 +92,8 @@ def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any
         "charging": json.loads(node["charging"]) if node.get("charging") else None,
         "channels": node.get("channels", 0),
         "can_address": node.get("can_address", 0),
-        "group": groups[0] if groups else None,
-        "groups": groups,
+        "group": known.groups[0] if known.groups else None,
+        "groups": known.groups,
         "teds_sha256": node.get("teds_sha256"),
         "keys": known.keys,
         "rotation_due": known.rotation,

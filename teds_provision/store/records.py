@@ -75,7 +75,6 @@ class NodeRecord:
     epoch: int = 0
     sequence: int = 0
     can_address: int = 0
-    groups: tuple[str, ...] = ()
     teds_sha256: str | None = None
     retired: str | None = None
     last_seen: str | None = None
@@ -141,7 +140,7 @@ class ExportFacts(NamedTuple):
 
 
 class Handed(NamedTuple):
-    """Of one node, what a bundle says beside its link key; as in :class:`NodeRecord`."""
+    """Of one node, what a bundle says beside its link key; as in :class:`NodeRecord`, with the groups that it is in."""
 
     uuid: bytes
     point: bytes | None

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 13
+SCHEMA_VERSION: Final = 14
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
@@ -133,6 +133,14 @@ _TABLES: Final = (
         WHEN NEW.seq IS NOT (SELECT coalesce(max(seq), 0) + 1 FROM audit)
         BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END""",
 )
+
+_NODES_GROUPS: Final = (
+    "nodes, json_each(iif(json_valid(nodes.groups), nodes.groups, '[]')) AS each WHERE each.value <> ''"
+)
+_GROUP_NAME: Final = """CASE WHEN each.value IN ('all', '.', '..') OR length(each.value) > 64 OR trim(each.value) = ''
+    OR (length(each.value) >= 4 AND (each.value NOT GLOB '*[^0-9a-fA-F]*'
+        OR (each.value GLOB '0x????*' AND substr(each.value, 3) NOT GLOB '*[^0-9a-fA-F]*')))
+    THEN rtrim('group ' || substr(each.value, 1, 58)) ELSE each.value END"""
 
 _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     # what the profile said that a node's datasheet was made of
@@ -272,6 +280,15 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
         scalar_rate, sinks, CASE lasting WHEN 1 THEN 'ncap' ELSE 'command' END, ends, created, test_pattern, unsigned,
         require, match, frozen, NULL, NULL FROM measurements_before""",
         "DROP TABLE measurements_before",
+    ),
+    # groups are kept once: what a bundle or `replace` wrote into the row of a node joins the measurement groups. A name
+    # that no group may have gets a word before it, as station/groups.py `valid_name` gives it.
+    14: (
+        "INSERT OR IGNORE INTO groups"
+        f" SELECT DISTINCT {_GROUP_NAME}, strftime('%Y-%m-%dT%H:%M:%SZ', 'now') FROM {_NODES_GROUPS}",
+        f"INSERT OR IGNORE INTO group_members SELECT {_GROUP_NAME}, nodes.uuid FROM {_NODES_GROUPS}",
+        "ALTER TABLE nodes DROP COLUMN groups",
+        "CREATE INDEX groups_of_node ON group_members(uuid)",
     ),
 }
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from teds_provision.store.records import KeptMeasurement
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import Desk, Node
 from tests.handover.desk import trust
@@ -108,6 +110,42 @@ def test_a_spare_in_the_place_of_a_node(yard: Yard) -> None:
     assert yard.done("north", "replace", old.uuid, spare.uuid, "--yes")["fresh"] is False
     (node,) = yard.done("north", "nodes", "elbow")["nodes"]
     assert node["uuid"] == spare.uuid
+
+
+def test_groups_names_and_measurements_follow_the_spare_and_forget_what_is_gone(yard: Yard) -> None:
+    """Groups were stored twice: the group kept the dead node, and `measure` failed for ever."""
+    old, spare, other = "8d4d9da65281f70000aa", "8d4d9da65281f70000bb", "8d4d9da65281f70000cc"
+    for uuid in (old, spare, other):
+        yard.done("north", "whitelist", "add", uuid)
+    with closing(make_station(yard.homes["north"], "north")) as station:
+        octets = bytes.fromhex(old)
+        station.nodes.remember(octets, name="hook")
+        station.measurements.rename(octets, 1, "force")
+        station.measurements.set_frame(octets, 0, "tool")
+        for group, uuids in (("crane", [old, other]), ("single", [old])):
+            station.groups.create(group, [bytes.fromhex(uuid) for uuid in uuids])
+        for one in ("a", "b"):
+            kept = KeptMeasurement(one, group="single" if one == "a" else None, uuids=() if one == "a" else (octets,))
+            station.measurements.keep(kept)
+        station.measurements.rename(bytes.fromhex(spare), 2, "other name")
+        station.measurements.rename(octets, 2, "angle")
+
+    moved = yard.done("north", "replace", old, spare, "--yes")["moved"]
+    assert moved["groups"] == ["crane", "single"]
+    assert (moved["topics"], moved["measurements"], moved["ended"]) == (["force"], ["a", "b"], [])
+    assert "'angle' of channel 2" in moved["kept"][0]
+    again = yard.done("north", "replace", old, spare, "--yes")
+    assert (again["fresh"], again["moved"]["groups"]) == (False, [])
+    groups = {one["name"]: one["uuids"] for one in yard.done("north", "group", "list")["groups"]}
+    assert groups == {"crane": sorted([spare, other]), "single": [spare]}
+
+    gone = yard.done("north", "decommission", spare, "--force", "--yes", *yard.nowhere)["removed"]
+    assert (gone["groups"], gone["measurements"], gone["ended"]) == (["crane", "single"], [], ["a", "b"])
+    groups = {one["name"]: one["uuids"] for one in yard.done("north", "group", "list")["groups"]}
+    assert groups == {"crane": [other], "single": []}
+    with closing(make_station(yard.homes["north"], "north")) as station:
+        assert station.measurements.all() == []
+        assert station.measurements.names == {}, "the names are free again"
 
 
 def test_revoked_for_good(yard: Yard) -> None:

@@ -42,11 +42,11 @@ def known(home: Path) -> Path:
                 epoch=3,
                 sequence=7,
                 can_address=0x21,
-                groups=("hand",),
                 last_seen="2026-01-31T12:00:00Z",
                 channels=4,
             )
         )
+        store.put_group(Group("hand", (ONE,)))
         store.put_whitelist(WhitelistEntry(ONE, assurance="tap"))
         store.add_key(KeyRecord(ONE, 3, "ab" * 8, "active", 1, b"wrapped-secret"))
         store.add_key(KeyRecord(ONE, 4, "cd" * 8, "pending", 2, b"wrapped-secret"))

@@ -32,7 +32,10 @@ def key_up(station: Station, board: Board, *, name: str | None = None) -> None:
     with talk(board) as node:
         agree(station, node, identify(station, node))
     if name:
-        station.nodes.remember(board.uuid, name=name, groups=("left hand",), profile="tactile-finger-sensor")
+        station.nodes.remember(board.uuid, name=name, profile="tactile-finger-sensor")
+        if station.groups.find("left hand") is None:
+            station.groups.create("left hand", [])
+        station.groups.add("left hand", [board.uuid])
 
 
 def provisioned(station: Station, board: Board, profile: str = "temperature-sensor") -> Provisioned:

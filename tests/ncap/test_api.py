@@ -23,6 +23,7 @@ from teds_provision.teds.profile import load_profile
 from tests.e2e.desk import ANGLE
 from tests.ncap.service import Service, verdict, verified, virtual
 from tests.pace import best_of, succeeds, until
+from tests.places import free_bus
 
 pytestmark = pytest.mark.link
 
@@ -384,6 +385,27 @@ def test_groups_are_made_changed_and_deleted(asked: Client, hand: str) -> None:
     refused(asked, 404, "not-found", "PUT", "/groups/none", {"uuids": []})
     assert asked.request("DELETE", "/groups/both")["groups"] == []
     refused(asked, 404, "not-found", "DELETE", "/groups/both")
+
+
+def test_a_running_measurement_follows_its_group_to_a_spare_and_ends_with_its_last_node(
+    service: Service, asked: Client, hand: str
+) -> None:
+    """The group kept the dead node, and the service tried it for ever; so it did with one out of service."""
+    old, spare = virtual(service, name="hook"), virtual(service, name="spare")
+    asked.request("POST", "/groups", {"name": "crane", "uuids": [old]})
+    made = asked.request("POST", "/measurements", {"group": "crane", "rate": 20})
+    measured(asked, old)
+    moved = service.station.ask("replace", old, spare, "--yes")["moved"]
+    assert (moved["groups"], moved["measurements"], moved["ended"]) == (["crane"], [made["id"]], [])
+    measured(asked, spare)
+    [one] = asked.request("GET", "/measurements")["measurements"]
+    assert (one["id"], one["uuids"]) == (made["id"], [spare])
+    assert asked.node(spare)["groups"] == ["crane"]
+
+    nowhere = ("--via", "can", "--can", free_bus(), "--timeout", "1")
+    gone = service.station.ask("decommission", spare, "--force", "--yes", *nowhere)["removed"]
+    assert (gone["groups"], gone["ended"]) == (["crane"], [made["id"]])
+    until(lambda: asked.request("GET", "/measurements")["measurements"] == [])
 
 
 def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(

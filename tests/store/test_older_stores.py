@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import StoreFailure
-from teds_provision.station.groups import Groups
+from teds_provision.station.groups import Groups, is_valid_name, valid_name
 from teds_provision.station.measurements import Measurements
 from teds_provision.store import Store
 from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
@@ -81,6 +82,36 @@ def test_a_measurement_of_an_earlier_schema_gets_an_owner(tmp_path: Path) -> Non
     assert (kept["kept"].channels, kept["kept"].sinks, kept["kept"].lasting) == ((2,), ("ros2",), True)
     assert continued is not None
     assert (continued.owner, continued.id, continued.channels) == ("command", "", (2,))
+
+
+def test_groups_of_an_earlier_schema_are_kept_once(tmp_path: Path) -> None:
+    """A bundle or `replace` wrote groups into the rows of nodes, `group` into a table: the store keeps the union."""
+    home, nodes = tmp_path / "home", [bytes([number]) * 10 for number in range(1, 4)]
+    labels = [["arm", "left hand"], ["all", "beef", "0xBEEF", ".", "Bé" * 100], []]
+    home.mkdir(mode=0o700)
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection:
+        for statement in statements(0, 13):
+            connection.execute(statement)
+        connection.execute("INSERT INTO meta VALUES('id', 'ab')")
+        connection.execute("INSERT INTO groups VALUES('arm', '2026-01-01T00:00:00Z')")
+        connection.execute("INSERT INTO group_members VALUES('arm', ?)", (nodes[2],))
+        for uuid, of_node in zip(nodes, labels, strict=True):
+            row = (uuid, json.dumps(of_node))
+            connection.execute(
+                "INSERT INTO nodes(uuid, state, epoch, sequence, can_address, groups, channels)"
+                " VALUES(?, 0, 0, 0, 0, ?, 0)",
+                row,
+            )
+        connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
+        connection.execute("PRAGMA user_version=13")
+        connection.commit()
+    with closing(Store.open(home)) as store:
+        found = {group.name: group.uuids for group in store.groups()}
+        assert store.node(nodes[0]) is not None
+    assert found.pop("arm") == (nodes[0], nodes[2])
+    assert found.pop("left hand") == (nodes[0],)
+    assert found == {valid_name(label): (nodes[1],) for label in labels[1]}
+    assert all(map(is_valid_name, found))
 
 
 @pytest.mark.parametrize("version", range(OLDEST_SCHEMA, SCHEMA_VERSION))

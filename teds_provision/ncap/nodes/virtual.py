@@ -218,7 +218,8 @@ class Virtuals:
             station.keys.remove(octets)  # the node's own copy goes with its folder: nothing could be opened with it
             station.nodes.drop_draft(octets)
             if station.nodes.get(octets) is not None:  # its name is free again
-                station.nodes.remember(octets, name=None, groups=(), retired=DECOMMISSIONED)
+                station.nodes.remember(octets, name=None, retired=DECOMMISSIONED)
+            station.measurements.hand_on(octets, None)
             station.audit("virtual", octets, "removed")
         with self._guard:
             self._all.pop(uuid, None)

@@ -35,6 +35,11 @@ class MeasurementTables:
         members = self._database.execute("SELECT uuid FROM group_members WHERE name = ? ORDER BY uuid", (name,))
         return Group(name, tuple(bytes(uuid) for (uuid,) in members), str(row[0]))
 
+    def groups_of(self, uuid: bytes) -> list[str]:
+        """Return the names of the groups that a node is in."""
+        rows = self._database.execute("SELECT name FROM group_members WHERE uuid = ? ORDER BY name", (uuid,))
+        return [str(name) for (name,) in rows]
+
     def put_group(self, group: Group) -> None:
         """Add a group, or replace its members."""
         with self._database.together():

@@ -22,15 +22,20 @@ from teds_provision.store.records import (
     NodeRecord,
     Tombstone,
     WhitelistEntry,
+    utc_now,
 )
 
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
 _SHOWN_CANDIDATES = 5
 NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
-GROUPS = NODE_FIELDS.index("groups")
 _NODE_COLUMNS = ", ".join(NODE_FIELDS)
-_HANDED_COLUMNS = ", ".join(Handed._fields)
+_HANDED_COLUMNS = ", ".join(
+    "(SELECT json_group_array(name) FROM (SELECT name FROM group_members m WHERE m.uuid = nodes.uuid ORDER BY name))"
+    if name == "groups"
+    else name
+    for name in Handed._fields
+)
 REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({places(NODE_FIELDS)})"
 REPLACE_ENTRY = "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)"
 
@@ -76,7 +81,7 @@ class NodeTables:
 
     def nodes(self) -> list[NodeRecord]:
         """Return all nodes, by UUID."""
-        return self._database.read(_node, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
+        return self._database.read(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
     def each_shown(self) -> Iterator[ExportFacts]:
         """Give identity key and retirement of all nodes, by UUID, a page at a time."""
@@ -89,7 +94,7 @@ class NodeTables:
     def nodes_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
         """Return what is known of these nodes (a page of them), by UUID."""
         statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
-        return {record.uuid: record for record in self._database.read(_node, statement, uuids)}
+        return {record.uuid: record for record in self._database.read(NodeRecord, statement, uuids)}
 
     def handed_of(self, uuids: Sequence[bytes]) -> dict[bytes, Handed]:
         """Return what a bundle says of these nodes (a page of them), by UUID."""
@@ -110,7 +115,7 @@ class NodeTables:
 
     def node(self, uuid: bytes) -> NodeRecord | None:
         """Return what is known of this node."""
-        return self._database.read_one(_node, f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid = ?", (uuid,))
+        return self._database.read_one(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid = ?", (uuid,))
 
     def put_node(self, record: NodeRecord) -> None:
         """Add or replace a node. Epoch and sequence never go back; a known identity key stays.
@@ -128,7 +133,6 @@ class NodeTables:
                 hint="Do not trust this node. If its chip was really replaced, it needs a new UUID.",
             )
         values: dict[str, Any] = {name: getattr(record, name) for name in NODE_FIELDS}
-        values["groups"] = listed(record.groups)
         if known:
             if record.point is None:
                 values["point"], values["point_mac"] = known.point, known.point_mac
@@ -205,18 +209,7 @@ def _handed(*row: Any) -> Handed:
     return Handed(*values)
 
 
-def _node(*row: Any) -> NodeRecord:
-    values: tuple[Any, ...] = (*row[:GROUPS], _groups(row[GROUPS]), *row[GROUPS + 1 :])
-    return NodeRecord(*values)
-
-
 @lru_cache(maxsize=256)  # nodes may be 100,000, and groups are few
-def listed(groups: tuple[str, ...]) -> str:
-    """The groups of a node, as its row has them."""
-    return json.dumps(groups)
-
-
-@lru_cache(maxsize=256)
 def _groups(listed: str) -> tuple[str, ...]:
     return tuple(json.loads(listed))
 
@@ -277,6 +270,8 @@ class Batch:
     keys: Sequence[KeyRecord] = ()
     holders: Sequence[Holder] = ()
     tombstones: Sequence[Tombstone] = ()
+    groups: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
+    """Nodes to add to measurement groups, by the group's name; a group that does not exist is created."""
     marks: Mapping[bytes, Mapping[str, Any]] = field(default_factory=dict)
     """Changes of marks (names, values of :class:`records.Marks`), by UUID; the caller of ``put_batch`` makes them."""
 
@@ -309,6 +304,11 @@ class BulkTables:
             many(_KEYS, (_key_values(key)[:-1] for key in batch.keys))
             many("INSERT OR REPLACE INTO holders VALUES(?, ?, ?, ?)", map(_holder_values, batch.holders))
             many("INSERT OR REPLACE INTO tombstones VALUES(?, ?, ?, ?)", map(_tombstone_values, batch.tombstones))
+            many("INSERT OR IGNORE INTO groups VALUES(?, ?)", ((name, utc_now()) for name in batch.groups))
+            many(
+                "INSERT OR IGNORE INTO group_members VALUES(?, ?)",
+                ((name, uuid) for name, uuids in batch.groups.items() for uuid in uuids),
+            )
 
     def remove_tombstones(self, uuids: Iterable[bytes]) -> None:
         """Take the tombstones of these nodes away."""
@@ -317,6 +317,5 @@ class BulkTables:
 
 def _node_row(record: NodeRecord, mac: bytes | None) -> list[Any]:
     row = list(_node_values(record))
-    row[GROUPS] = listed(record.groups)
     row[_SEAL] = mac
     return row

@@ -5,7 +5,6 @@ A node is known here that was met, whitelisted, brought by a bundle, moved away 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -153,7 +152,7 @@ class OverviewTables:
 
 
 _NODE = (
-    "point", "name", "profile", "state", "epoch", "sequence", "can_address", "groups", "teds_sha256", "retired",
+    "point", "name", "profile", "state", "epoch", "sequence", "can_address", "teds_sha256", "retired",
     "last_seen", "channels", "due", "charging",
 )  # fmt: skip
 
@@ -177,8 +176,7 @@ def _terms(search: Search) -> tuple[list[str], list[Any]]:
     if search.profile is not None:
         add("n.profile = ?", search.profile)
     if search.group is not None:
-        members = "k.uuid IN (SELECT uuid FROM group_members WHERE name = ?)"
-        add(f"({members} OR (n.groups <> '[]' AND instr(n.groups, ?)))", search.group, json.dumps(search.group))
+        add("k.uuid IN (SELECT uuid FROM group_members WHERE name = ?)", search.group)
     if search.due is not None:
         add("n.due <= ?", search.due)
     if search.since is not None:
