@@ -25,7 +25,6 @@ def test_a_node_comes_back_as_it_was_put(store: Store) -> None:
         3,
         17,
         0x21,
-        ("left", "hand"),
         "ab" * 32,
         "authentic",
         "t",
