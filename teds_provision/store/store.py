@@ -161,8 +161,11 @@ class Store(
         return int(row[0]) if row is not None else 0
 
     def damage(self) -> str | None:
-        """Return what SQLite's quick check finds wrong with the file, None if nothing (for doctor)."""
+        """Return what is wrong with the file: a cut last page, or what SQLite finds; None if nothing (for doctor)."""
         try:
+            page = int(self._database.execute("PRAGMA page_size")[0][0])
+            if self._database.path.stat().st_size % page:  # SQLite reads zeros for the octets that are missing
+                return "The file ends within a page."
             found = str(self._database.execute("PRAGMA quick_check(1)")[0][0])
         except StoreFailure as failure:
             return failure.message
