@@ -361,14 +361,19 @@ def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = Non
         "sample": [{key: one[key] for key in ("channel", "value", "unit", "valid", "shown")} for one in done.samples],
         "verdict": done.verified.verdict,
         "warnings": list(done.warnings),
-        **{name: value for name, value in more.items() if value is not None},
+        **{name: value for name, value in more.items() if value is not None and name != "failure"},
     }
+    if more.get("failure") is not None:
+        result["error"] = more["failure"]
     app.conclude(result, lambda console: _summary(console, done, summary, more), error)
 
 
 def _tell_board(app: App, board: BoardResult, **line: Any) -> None:
     """One line of JSON, or what a person reads: UUID, time and row of the sheet on each; ``line``: its unit."""
     if board.done is not None:
+        failure = board.failure
+        if failure is not None:  # an authentic board can fail: its type requires a calibration, a channel read nothing
+            line["failure"] = {"code": failure.code, "message": failure.message, "hint": failure.hint}
         _tell(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3), **line)
         if board.failure is not None and not app.json:
             app.fail_line(board.failure, uuid=board.uuid.hex(), time=board.time, row=board.row)

@@ -120,3 +120,18 @@ def test_a_bus_on_which_no_node_is_ours_is_no_success(station: Station, bus: lis
     assert all(uuid in done.out for uuid in UUIDS)
     assert "whitelist add" in done.out
     assert all(node.flash["key"] is None for node in bus)
+
+
+def test_a_board_that_is_authentic_but_not_finished_has_its_error_on_its_line(
+    station: Station, bus: list[Node]
+) -> None:
+    """Its type requires a calibration: the line of JSON says why the board counts as failed, as the words do."""
+    links = station.desk.links.over("can")
+    station.ask("whitelist", "add", UUIDS[0])
+    profile = "magnetic-angular-position-sensor"
+    outcome = station.run("--json", "provision", "--all", "--profile", profile, "--yes", *links, "--timeout", "2")
+    *lines, last = (json.loads(line) for line in outcome.out.splitlines())
+    failed = [line for line in lines if line.get("error")]
+    assert last["totals"]["failed"] == len(failed) > 0
+    assert outcome.code != 0
+    assert all(line["error"]["message"] for line in failed)
