@@ -145,7 +145,7 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
         meanwhile = station.plant.line.sign_request(request.hash, "in")
         if meanwhile is not None and meanwhile.answer is not None:  # another `signer` was faster
             return meanwhile.answer
-        row = _require_room(station, job, request)
+        row = _require_room(station, job, request)  # again: another signer may have taken the last unit
         station.plant.line.put_unit(row)
         if station.pins.entry(request.uuid) is None:
             station.pins.put(WhitelistEntry(request.uuid, fingerprint(request.point), assurance="uuid"))

@@ -6,11 +6,13 @@ From evidence where it is at hand; of other stations from their pages alone, whi
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from statistics import median
 from typing import Any, Final
 
@@ -19,6 +21,8 @@ from teds_provision.protocol.plant.evidence import GOOD_RESULTS, PASSED, Evidenc
 from teds_provision.protocol.plant.job import Job
 from teds_provision.station.station import Station
 
+UNREPORTED: Final = "unreported"
+"""The code of a board that an office signed and whose line reported no result yet."""
 COLUMNS: Final = ("station", "name", "uuid", "unit", "attempt", "verdict", "code", "finished", "seconds")
 
 
@@ -47,7 +51,7 @@ class Attempt:
 
 @dataclass
 class StationYield:
-    """One station's part of a job. ``units``: boards; ``first``: those that passed at their first attempt."""
+    """One station's part of a job. ``units``: boards; ``reported``: those with a result; ``first``: passed at once."""
 
     station: str
     name: str
@@ -55,6 +59,7 @@ class StationYield:
     units: int = 0
     passed: int = 0
     first: int = 0
+    reported: int = 0
     attempts: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     steps: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -67,8 +72,8 @@ class StationYield:
 
     @property
     def first_pass(self) -> float | None:
-        """Share of the boards that passed at their first attempt, None before the first board."""
-        return round(self.first / self.units, 4) if self.units else None
+        """Share of the reported boards that passed at their first attempt, None before the first result."""
+        return round(self.first / self.reported, 4) if self.reported else None
 
     def to_json(self) -> dict[str, Any]:
         """One station of ``job status``."""
@@ -92,24 +97,35 @@ def attempts_of(station: Station, job: str, files: Iterable[bytes] = ()) -> list
     A file that is no evidence of this job raises BadData, or is passed over.
     """
     found: dict[tuple[str, bytes, int], Attempt] = {}
-    for row in station.plant.line.evidence(job=job):
-        one = Attempt.of(read(row.document))
-        found[one.station, one.uuid, one.attempt] = one
-    for octets in files:
+    known: set[str] = set()
+    for octets in chain((row.document for row in station.plant.line.evidence(job=job)), files):
         evidence = read(octets)
         if evidence.facts.job == job:
-            one = Attempt.of(evidence)
-            found[one.station, one.uuid, one.attempt] = one
-    documented = {one.station for one in found.values()}
-    said = [one for one in _of_pages(station, job) if one.station not in documented]
-    return sorted([*found.values(), *said], key=lambda one: (one.station, one.uuid, one.attempt))
+            attempt = Attempt.of(evidence)
+            found[attempt.station, attempt.uuid, attempt.attempt] = attempt
+            known.add(hashlib.sha256(octets).hexdigest())
+    for digest, attempt in _of_pages(station, job):
+        if digest not in known:
+            found.setdefault((attempt.station, attempt.uuid, attempt.attempt), attempt)
+    boards = {(attempt.station, attempt.uuid) for attempt in found.values()}
+    signed = [attempt for attempt in _of_requests(station, job) if (attempt.station, attempt.uuid) not in boards]
+    return sorted([*found.values(), *signed], key=lambda attempt: (attempt.station, attempt.uuid, attempt.attempt))
 
 
-def _of_pages(station: Station, job: str) -> Iterator[Attempt]:
-    """What pages say: one event is one attempt, in their order."""
+def _of_requests(station: Station, job: str) -> Iterator[Attempt]:
+    """Yield the boards that this office signed for a line whose pages and evidence are not here yet."""
+    tables = station.plant.line
+    for unit in tables.units(job):
+        peers = {row.peer for row in tables.sign_requests(job, unit.uuid, "in") if row.sequence is not None}
+        for peer in sorted(peers):
+            yield Attempt(peer, unit.uuid, unit.unit, 1, UNREPORTED, "")
+
+
+def _of_pages(station: Station, job: str) -> Iterator[tuple[str, Attempt]]:
+    """Yield the attempts that pages report, in their order, each with the SHA-256 of its evidence."""
     tables, counts = station.plant.tables, Counter[tuple[str, bytes]]()
-    for name, chain in tables.chains().items():
-        for page in tables.each_page(chain.chain):
+    for name, pages in tables.chains().items():
+        for page in tables.each_page(pages.chain):
             for value in json.loads(page.content).get("events", []):
                 told = event.read(value)
                 if not isinstance(told, event.Event) or told.act != "evidence" or told.uuid is None:
@@ -119,7 +135,8 @@ def _of_pages(station: Station, job: str) -> Iterator[Attempt]:
                 counts[name, told.uuid] += 1
                 verdict = told.members["verdict"]
                 code = None if verdict == PASSED else verdict.partition(": ")[2] or verdict
-                yield Attempt(name, told.uuid, told.members["unit"], counts[name, told.uuid], code, told.at)
+                attempt = Attempt(name, told.uuid, told.members["unit"], counts[name, told.uuid], code, told.at)
+                yield told.members["sha256"], attempt
 
 
 def yields(station: Station, job: Job, attempts: Iterable[Attempt]) -> list[StationYield]:
@@ -136,6 +153,9 @@ def yields(station: Station, job: Job, attempts: Iterable[Attempt]) -> list[Stat
         part = found.setdefault(key, StationYield(key, name, 0))
         tries.sort(key=lambda one: one.attempt)
         part.units += 1
+        if tries[0].code == UNREPORTED:
+            continue
+        part.reported += 1
         part.attempts += len(tries)
         part.passed += any(one.code is None for one in tries)
         part.first += tries[0].code is None and tries[0].attempt == 1

@@ -230,6 +230,21 @@ PATTERNS = (
         "True",
         "tests/steps/test_verify.py",
     ),
+    # the plant
+    Pattern(
+        "evidence names the epoch of its datasheet",
+        "_wrong_datasheet",
+        "(shown.sequence, shown.key_epoch) != (facts.sequence, facts.epoch)",
+        "shown.sequence != facts.sequence",
+        "tests/plant/test_evidence.py",
+    ),
+    Pattern(
+        "evidence names the content of each block",
+        "_wrong_datasheet",
+        "blocks_of(shown) != facts.blocks",
+        "len(blocks_of(shown)) != len(facts.blocks)",
+        "tests/plant/test_evidence.py",
+    ),
     # measuring and the service
     Pattern(
         "a node that was moved is measured no more",

@@ -105,7 +105,9 @@ def test_its_own_station_cannot_change_a_fact(
         (lambda s: s["predicate"]["node"].update(nonce="", proof=""), "the board did not sign it"),
         (lambda s: s["subject"][0].update(name="teds:8d4d9da65281f7000001"), "field 102"),
         (lambda s: s["predicate"]["facts"].update(sequence=2), "sequence or epoch"),
+        (lambda s: s["predicate"]["facts"].update(epoch=2), "sequence or epoch"),
         (lambda s: s["predicate"]["facts"]["blocks"].pop(), "field 108"),
+        (lambda s: s["predicate"]["facts"]["blocks"][0].__setitem__(2, "0" * 64), "field 108"),
         (lambda s: s["predicate"]["station"].update(certificate="AA=="), "not certified"),
     ],
 )

@@ -21,9 +21,10 @@ from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, answer
+from teds_provision.plant.yields import attempts_of, yields
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message
 from teds_provision.protocol.plant import evidence as codec
-from teds_provision.protocol.plant.job import CalibrationRule
+from teds_provision.protocol.plant.job import CalibrationRule, Job
 from teds_provision.protocol.plant.signing import (
     Answer,
     SignRequest,
@@ -153,6 +154,43 @@ def test_the_newest_request_is_that_of_the_highest_sequence_whatever_the_clock_w
     with desk.line.durable("test"):
         desk.line.plant.line.put_sign_request(replace(later, at="2000-01-01T00:00:00Z"))
     assert desk.request(run, one).hash != first.hash, "the later request does not fit the board, so a new one is made"
+
+
+def test_the_count_holds_when_another_signer_takes_the_last_unit_meanwhile(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = desk.request(desk.run(count=1, stations={desk.line.identity.fingerprint: 1}), board(1))
+    two = board(2)
+    signed = two.key.sign(node_key_message(two.uuid, two.key.point))
+    second = replace(
+        first, image=Image(two.uuid, first.image.blocks), point=two.key.point, key_signature=signed, nonce=bytes(16)
+    )
+
+    def and_another_signs(station: Station, job: Job, request: SignRequest) -> Image:
+        monkeypatch.undo()
+        assert desk.asks(first).security
+        return request.image
+
+    monkeypatch.setattr(office, "_built", and_another_signs)
+    assert desk.asks(proven(second, desk.line, two)).refused == "full"
+    assert [row.uuid for row in desk.office.plant.line.units(first.job)] == [board(1).uuid]
+
+
+def test_an_office_counts_the_boards_that_it_signed_before_their_line_reports(desk: Desk) -> None:
+    run, one = desk.run(), board(1)
+    build(run, one)
+    assert run.job is not None
+    (part,) = yields(desk.office, run.job, attempts_of(desk.office, run.job.id))
+    assert (part.station, part.units, part.passed, part.failures) == (desk.line.fingerprint, 1, 0, {})
+    desk.plant.round()
+    (part,) = yields(desk.office, run.job, attempts_of(desk.office, run.job.id))
+    assert (part.units, part.passed, part.attempts) == (1, 1, 1)
+    (row,) = desk.line.plant.line.evidence(uuid=one.uuid)
+    build(run, board(2))
+    desk.plant.round()
+    found = attempts_of(desk.office, run.job.id, [row.document])
+    (part,) = yields(desk.office, run.job, found)
+    assert (part.units, part.passed, part.attempts) == (2, 2, 2), "one by its evidence, the other by its page"
 
 
 def test_the_same_request_gets_the_same_answer_octet_for_octet(desk: Desk) -> None:
