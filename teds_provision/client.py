@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote, urlencode, urlsplit
 
-from teds_provision.errors import LinkFailure, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.errors import LinkError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.files import short_path
 
 if TYPE_CHECKING:
@@ -131,12 +131,12 @@ class Client:
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def request(self, method: str, path: str, body: Any = None) -> Any:
-        """One request below /api/v1; its JSON, or its text where it is none. Raises ApiError, LinkFailure."""
+        """One request below /api/v1; its JSON, or its text where it is none. Raises ApiError, LinkError."""
         status, kind, octets = self._ask(method, path, None if body is None else json.dumps(body))
         try:
             value = json.loads(octets) if kind.startswith("application/json") else octets.decode()
         except ValueError as error:
-            raise LinkFailure("The base station's answer is not valid JSON.") from error
+            raise LinkError("The base station's answer is not valid JSON.") from error
         if status < 400:
             return value
         told = value.get("error", {}) if isinstance(value, dict) else {}
@@ -155,7 +155,7 @@ class Client:
         except (OSError, http.client.HTTPException) as error:
             self.close()
             if not again:
-                raise LinkFailure(
+                raise LinkError(
                     f"The base station is not responding: {error}.", hint="Is it running? teds-provision ncap status"
                 ) from error
         return self._exchange(method, path, body, headers)
@@ -174,7 +174,7 @@ class Client:
             return _UnixConnection(self._home / SOCKET, self._timeout)
         parts = urlsplit(self.url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise UsageFailure(
+            raise UsageError(
                 f"{self.url!r} is not the address of a base station.",
                 hint="Use an address such as http://127.0.0.1:8351.",
             )
@@ -359,7 +359,7 @@ class Client:
             connection.request("GET", f"{API}/lend")
             answer = connection.getresponse()
             lent = answer.status == 200 and answer.readline() == b"lent\n"
-        except (LinkFailure, OSError, http.client.HTTPException):
+        except (LinkError, OSError, http.client.HTTPException):
             lent = False
         try:
             yield lent
@@ -371,7 +371,7 @@ class Client:
         """Have a node that the base station measures let go for the length of the block; then it is measured again.
 
         False where no base station runs, or it does not measure the node (``uuid``: 20 hex digits). Raises
-        PolicyRefused where it does not answer within :data:`LETTING_GO` seconds, or cannot let the node go.
+        PolicyError where it does not answer within :data:`LETTING_GO` seconds, or cannot let the node go.
         """
         connection = _UnixConnection(self._home / SOCKET, LETTING_GO)
         try:
@@ -379,17 +379,17 @@ class Client:
                 connection.request("GET", f"{API}/nodes/{uuid}/let-go?for={quote(command, safe='')}")
                 answer = connection.getresponse()
                 said = answer.readline() if answer.status == 200 else b""
-            except LinkFailure:  # nobody listens
+            except LinkError:  # nobody listens
                 yield False
                 return
             except (OSError, http.client.HTTPException) as error:
-                raise PolicyRefused(
+                raise PolicyError(
                     f"The base station measures, and did not release node {uuid} within {LETTING_GO:g} s.",
                     hint="See: teds-provision ncap status. Or end the measurement first.",
                 ) from error
             if said not in (b"let go\n", b"not measured\n"):
                 why = said.decode(errors="replace").removeprefix("refused: ").strip()
-                raise PolicyRefused(
+                raise PolicyError(
                     why or f"The base station did not release node {uuid}.",
                     hint="See: teds-provision ncap status. Or end the measurement first.",
                 )
@@ -425,7 +425,7 @@ class _UnixConnection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """Open it; raises LinkFailure (5) where nobody listens."""
+        """Open it; raises LinkError (5) where nobody listens."""
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.sock.settimeout(self.timeout)
         try:
@@ -433,6 +433,6 @@ class _UnixConnection(http.client.HTTPConnection):
                 self.sock.connect(path)
         except OSError as error:
             self.sock.close()
-            raise LinkFailure(
+            raise LinkError(
                 f"No base station is running in {self._path.parent}.", hint="Start it: teds-provision ncap run"
             ) from error

@@ -34,150 +34,150 @@ class TedsProvisionError(Exception):
         self.hint = hint
 
 
-class Bug(TedsProvisionError):
+class InternalError(TedsProvisionError):
     """A foreign exception where a thread would have ended without a word (exit 1)."""
 
     code = "bug"
 
 
-class UsageFailure(TedsProvisionError):
+class UsageError(TedsProvisionError):
     """The command line itself is wrong (exit 2)."""
 
     exit_code = 2
     code = "usage"
 
 
-class NotFound(TedsProvisionError):
+class NotFoundError(TedsProvisionError):
     """No such UUID, profile, station or file (exit 3)."""
 
     exit_code = 3
     code = "not-found"
 
 
-class NotAuthentic(TedsProvisionError):
+class NotAuthenticError(TedsProvisionError):
     """A signature, tag, digest or sender is not what it claims to be (exit 4)."""
 
     exit_code = 4
     code = "not-authentic"
 
 
-class Fork(NotAuthentic):
+class ForkError(NotAuthenticError):
     """The registry has pages under this station's key that do not go on from those here."""
 
     code = "fork"
 
 
-class BadDatasheet(NotAuthentic):
+class BadDatasheetError(NotAuthenticError):
     """A datasheet that was read is not authentic: no disturbed frame, which another try would cure."""
 
 
-class LinkFailure(TedsProvisionError):
+class LinkError(TedsProvisionError):
     """The way to the node failed: no reader, no node, unplugged, garbled, bus-off (exit 5)."""
 
     exit_code = 5
     code = "link"
 
 
-class KeyStolen(LinkFailure):
+class KeyStolenError(LinkError):
     """A session ended because a thief has its key; the next one begins with a new key."""
 
 
-class NoReader(LinkFailure):
+class NoReaderError(LinkError):
     """The reader or the CAN adapter cannot be opened."""
 
     code = "no-reader"
 
 
-class NoNode(LinkFailure):
+class NoNodeError(LinkError):
     """Nothing that answers as a node came within the time allowed."""
 
     code = "no-node"
 
 
-class NodeSilent(LinkFailure):
+class NodeSilentError(LinkError):
     """A node that was there does not answer any more (moved away, time-out, power lost)."""
 
     code = "node-silent"
 
 
-class Garbled(LinkFailure):
+class GarbledError(LinkError):
     """What came over the link is torn, corrupt or breaks the wire format."""
 
     code = "garbled"
 
 
-class TooLongForNode(Garbled):
+class MessageTooLongError(GarbledError):
     """The node refuses a message on the level of the link because of its length."""
 
 
-class AddressConflict(LinkFailure):
+class AddressConflictError(LinkError):
     """Two nodes answer under one CAN address, or one UUID at two."""
 
     code = "address-conflict"
 
 
-class RegistryFailure(LinkFailure):
+class RegistryError(LinkError):
     """The registry cannot be reached, or refuses the login."""
 
     code = "registry"
 
 
-class Unproven(LinkFailure):
+class UnprovenError(LinkError):
     """A key of the node is held here and no session came about, so nothing that was read counts."""
 
     code = "unproven"
 
 
-class PolicyRefused(TedsProvisionError):
+class PolicyError(TedsProvisionError):
     """Refused by policy: not whitelisted, other key, weak algorithm, stale, expired, replayed (exit 6)."""
 
     exit_code = 6
     code = "refused"
 
 
-class NotWhitelisted(PolicyRefused):
+class NotWhitelistedError(PolicyError):
     """The node is not on the whitelist."""
 
     code = "not-whitelisted"
 
 
-class OtherKey(PolicyRefused):
+class KeyMismatchError(PolicyError):
     """A known UUID came with another identity key than the pinned one."""
 
     code = "other-key"
 
 
-class Frozen(PolicyRefused):
+class FrozenError(PolicyError):
     """Something is being measured and stays as it is until that ends."""
 
     code = "frozen"
 
 
-class CalibrationMisfit(PolicyRefused):
+class CalibrationMisfitError(PolicyError):
     """A calibration that a node has does not fit the channel that it would be kept for."""
 
     code = "calibration-misfit"
 
 
-class NoRoom(PolicyRefused):
+class NoRoomError(PolicyError):
     """The bus, or the budget of messages, has no room for a node's data."""
 
     code = "no-room"
 
 
-class NotMember(PolicyRefused):
+class NotMemberError(PolicyError):
     """The station is no member of the registry, or none any more."""
 
     code = "not-member"
 
 
-class RosterExpired(PolicyRefused):
+class RosterExpiredError(PolicyError):
     """The roster is older than the owner's CA said that it may become."""
 
     code = "roster-expired"
 
 
-class NodeRefused(PolicyRefused):
+class NodeRefusedError(PolicyError):
     """The node refused a command; ``reason`` is the u8 of profile.md, "Reasons"."""
 
     code = "node-refused"
@@ -187,72 +187,72 @@ class NodeRefused(PolicyRefused):
         self.reason = reason
 
 
-class StoreFailure(TedsProvisionError):
+class StoreError(TedsProvisionError):
     """Store or vault: locked, corrupt, missing (exit 7)."""
 
     exit_code = 7
     code = "store"
 
 
-class StoreChanged(StoreFailure):
+class StoreChangedError(StoreError):
     """Another program changed a row that decides whom the station believes."""
 
     code = "store-changed"
 
 
-class StoreLocked(StoreFailure):
+class StoreLockedError(StoreError):
     """Another process holds the store."""
 
     code = "store-locked"
 
 
-class NodeBusy(StoreLocked):
+class NodeBusyError(StoreLockedError):
     """Another command or request of this station works on the node."""
 
     code = "node-busy"
 
 
-class VaultFailure(StoreFailure):
+class VaultError(StoreError):
     """The keyring, token or passphrase file cannot give what it should."""
 
     code = "vault"
 
 
-class NoKeyring(VaultFailure):
+class KeyringUnavailableError(VaultError):
     """No keyring of the machine may hold a secret."""
 
     code = "no-keyring"
 
 
-class UnknownMaster(VaultFailure):
+class UnknownMasterKeyError(VaultError):
     """A key is wrapped under a master key that an open vault does not have (any more, or yet)."""
 
 
-class VaultChanged(VaultFailure):
+class VaultChangedError(VaultError):
     """What a person was asked about is not true any more: another command changed the vault meanwhile."""
 
     code = "vault-changed"
 
 
-class VaultLocked(VaultChanged):
+class VaultLockedError(VaultChangedError):
     """Another command changed passphrase and master key, and this process cannot open the vault again by itself."""
 
     code = "vault-locked"
 
 
-class NoPassphrase(VaultFailure):
+class NoPassphraseError(VaultError):
     """A passphrase or PIN is needed, and nobody can be asked for it."""
 
     code = "no-passphrase"
 
 
-class WrongPassphrase(VaultFailure):
+class WrongPassphraseError(VaultError):
     """The passphrase or PIN does not open the vault."""
 
     code = "wrong-passphrase"
 
 
-class BadData(TedsProvisionError):
+class BadDataError(TedsProvisionError):
     """TEDS, profile, calibration, image or bundle that does not parse or does not add up (exit 8)."""
 
     exit_code = 8

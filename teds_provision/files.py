@@ -21,7 +21,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
-from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, TedsProvisionError, UsageError
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
@@ -83,12 +83,12 @@ def write_whole(
     octets: bytes | Iterable[bytes],
     *,
     mode: int = PRIVATE,
-    failure: type[TedsProvisionError] = StoreFailure,
+    failure: type[TedsProvisionError] = StoreError,
 ) -> None:
     """Put a file in the place of ``path``, whole and durable.
 
-    Raises UsageFailure where a folder lies there, NotFound where its own is missing (and ``failure`` is no other one),
-    else ``failure``; the old file is then as it was.
+    Raises UsageError where a folder lies there, NotFoundError where its own is missing (and ``failure`` is no other
+    one), else ``failure``; the old file is then as it was.
     """
     try:
         with whole_file(path, replace=True, mode=mode) as file:
@@ -100,16 +100,16 @@ def write_whole(
 def open_lock(path: Path) -> int:
     """Open the file that is locked while another one is changed, made where it is missing; returns its descriptor.
 
-    Raises StoreFailure where it cannot be made: the first thing that a read-only or full disk refuses.
+    Raises StoreError where it cannot be made: the first thing that a read-only or full disk refuses.
     """
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
     except OSError as error:
-        raise _cannot_write(path, error, StoreFailure) from error
+        raise _cannot_write(path, error, StoreError) from error
 
 
 def write_new(
-    path: Path, octets: bytes, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
+    path: Path, octets: bytes, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreError
 ) -> None:
     """Write a new file, whole and durable, never over another; raises as :func:`new_file` does."""
     with new_file(path, mode=mode, failure=failure) as file:
@@ -117,12 +117,10 @@ def write_new(
 
 
 @contextmanager
-def new_file(
-    path: Path, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
-) -> Iterator[BinaryIO]:
+def new_file(path: Path, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreError) -> Iterator[BinaryIO]:
     """Give a new file to write; when the block ends well it becomes ``path``, whole and durable, never over another.
 
-    Raises UsageFailure where something lies at ``path``, NotFound where its folder is missing, else ``failure``.
+    Raises UsageError where something lies at ``path``, NotFoundError where its folder is missing, else ``failure``.
     """
     require_new(path)
     try:
@@ -135,11 +133,11 @@ def new_file(
 
 
 def require_new(path: Path) -> None:
-    """Raise UsageFailure where something lies at ``path``, NotFound where there is no folder for it."""
+    """Raise UsageError where something lies at ``path``, NotFoundError where there is no folder for it."""
     if path.exists() or path.is_symlink():
         raise _taken(path)
     if not path.parent.is_dir():
-        raise NotFound(f"There is no folder {path.parent}.", hint="Create it, or choose another path.")
+        raise NotFoundError(f"There is no folder {path.parent}.", hint="Create it, or choose another path.")
 
 
 def read_limited(
@@ -147,39 +145,42 @@ def read_limited(
     max_octets: int,
     what: str,
     *,
-    failure: type[TedsProvisionError] = NotFound,
+    failure: type[TedsProvisionError] = NotFoundError,
     follow: bool = True,
 ) -> bytes:
     """Return the octets of a file, reading no more than ``max_octets`` of it.
 
-    ``follow`` False refuses a symbolic link. Raises NotFound (no such file), ``failure`` (it cannot be read), and
-    BadData (larger than any ``what``).
+    ``follow`` False refuses a symbolic link. Raises NotFoundError (no such file), ``failure`` (it cannot be read), and
+    BadDataError (larger than any ``what``).
     """
     with _failing_as(path, failure):
         octets = _read(_opened(path, 0 if follow else os.O_NOFOLLOW), max_octets + 1)
     if len(octets) > max_octets:
-        raise BadData(f"{path} is larger than {max_octets} octets, which is too large for a {what}.")
+        raise BadDataError(f"{path} is larger than {max_octets} octets, which is too large for a {what}.")
     return octets
 
 
-def read_text(path: Path, max_octets: int, what: str, *, failure: type[TedsProvisionError] = NotFound) -> str:
-    """Return the text of a UTF-8 file without a mark in front of it; raises as :func:`read_limited`, and BadData."""
+def read_text(path: Path, max_octets: int, what: str, *, failure: type[TedsProvisionError] = NotFoundError) -> str:
+    """Return the text of a UTF-8 file without a mark in front of it.
+
+    Raises as :func:`read_limited`, and BadDataError.
+    """
     octets = read_limited(path, max_octets, what, failure=failure)
     try:
         return octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = octets[: error.start].count(b"\n") + 1
-        raise BadData(f"{path}:{line}: the text is not UTF-8.", hint="Save the file as UTF-8.") from error
+        raise BadDataError(f"{path}:{line}: the text is not UTF-8.", hint="Save the file as UTF-8.") from error
 
 
 def open_to_read(path: Path) -> BinaryIO:
-    """Open a file to read from; raises NotFound where it is not there or cannot be read."""
-    with _failing_as(path, NotFound):
+    """Open a file to read from; raises NotFoundError where it is not there or cannot be read."""
+    with _failing_as(path, NotFoundError):
         return open(_opened(path), "rb")
 
 
 def _opened(path: Path, flags: int = 0) -> int:
-    """Open what is read to its end; raises OSError, NotFound for a named pipe.
+    """Open what is read to its end; raises OSError, NotFoundError for a named pipe.
 
     Whoever opens a pipe that nobody writes to waits for ever. The pipe of a shell's ``<(command)`` has no name but that
     of its descriptor, and somebody writes to it.
@@ -190,16 +191,16 @@ def _opened(path: Path, flags: int = 0) -> int:
         return descriptor
     if stat.S_ISFIFO(mode) and _is_named(path):
         os.close(descriptor)
-        raise NotFound(f"{path} is a pipe, not a file.")
+        raise NotFoundError(f"{path} is a pipe, not a file.")
     os.set_blocking(descriptor, True)
     return descriptor
 
 
 def require_no_pipe(path: Path) -> None:
-    """Raise NotFound where a named pipe lies, before somebody else's code opens it and waits."""
+    """Raise NotFoundError where a named pipe lies, before somebody else's code opens it and waits."""
     with suppress(OSError, ValueError):
         if stat.S_ISFIFO(path.stat().st_mode) and _is_named(path):
-            raise NotFound(f"{path} is a pipe, not a file.")
+            raise NotFoundError(f"{path} is a pipe, not a file.")
 
 
 def _is_named(path: Path) -> bool:
@@ -212,11 +213,11 @@ def _failing_as(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]
     try:
         yield
     except FileNotFoundError:
-        raise NotFound(f"There is no file {path}.") from None
+        raise NotFoundError(f"There is no file {path}.") from None
     except IsADirectoryError:
-        raise NotFound(f"{path} is a folder, not a file.") from None
+        raise NotFoundError(f"{path} is a folder, not a file.") from None
     except ValueError as error:  # a zero octet in the name
-        raise NotFound(f"{str(path)!r} is not a valid file name.") from error
+        raise NotFoundError(f"{str(path)!r} is not a valid file name.") from error
     except OSError as error:
         raise failure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
 
@@ -236,15 +237,15 @@ def _read(descriptor: int, most: int) -> bytes:
 def json_files(paths: Sequence[Path], what: str) -> list[str]:
     """Files that are named, and every ``*.json`` below folders that are named, by name; each once.
 
-    As text: paths are made of them where they are read, by several processes. Raises NotFound, which says ``what`` is
-    missing, for a folder without one; a file that is not there is left to whoever reads it.
+    As text: paths are made of them where they are read, by several processes. Raises NotFoundError, which says ``what``
+    is missing, for a folder without one; a file that is not there is left to whoever reads it.
     """
     found: list[str] = []
     for path in paths:
         if path.is_dir():
             inside = list(_below(str(path)))
             if not inside:
-                raise NotFound(f"There is no {what} (*{_JSON}) in the folder {path}.")
+                raise NotFoundError(f"There is no {what} (*{_JSON}) in the folder {path}.")
             found += inside
         else:
             found.append(str(path))
@@ -326,7 +327,7 @@ def short_path(path: Path) -> Iterator[str]:
 
 
 def listen_alone(path: Path, waiting: int) -> socket.socket:
-    """A Unix socket that only this user can reach; what a killed process left is replaced. Raises StoreFailure."""
+    """A Unix socket that only this user can reach; what a killed process left is replaced. Raises StoreError."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     before = os.umask(0o177)  # its mode is set when it is bound: there is no moment in which others may connect
     try:
@@ -337,7 +338,7 @@ def listen_alone(path: Path, waiting: int) -> socket.socket:
         listener.listen(waiting)
     except OSError as error:
         listener.close()
-        raise _cannot_write(path, error, StoreFailure) from error
+        raise _cannot_write(path, error, StoreError) from error
     finally:
         os.umask(before)
     return listener
@@ -376,13 +377,13 @@ def _remove_if_left(left: Path) -> None:
             left.unlink()
 
 
-def _taken(path: Path) -> UsageFailure:
-    return UsageFailure(f"{path} already exists and is not overwritten.", hint="Choose another name.")
+def _taken(path: Path) -> UsageError:
+    return UsageError(f"{path} already exists and is not overwritten.", hint="Choose another name.")
 
 
 def _cannot_write(path: Path, error: OSError, failure: type[TedsProvisionError]) -> TedsProvisionError:
-    if failure is StoreFailure and isinstance(error, FileNotFoundError | NotADirectoryError):  # of a name from a user
-        return NotFound(f"There is no folder {path.parent}.", hint="Create it, or choose another path.")
+    if failure is StoreError and isinstance(error, FileNotFoundError | NotADirectoryError):  # of a name from a user
+        return NotFoundError(f"There is no folder {path.parent}.", hint="Create it, or choose another path.")
     if isinstance(error, IsADirectoryError):
-        return UsageFailure(f"{path} is a folder, not a file.", hint="Name a file in it.")
+        return UsageError(f"{path} is a folder, not a file.", hint="Name a file in it.")
     return failure(f"{path} cannot be written: {error.strerror}.", hint="Fix that and run the same command again.")

@@ -1,8 +1,8 @@
 """How much of a file is read: the limits of every reader in one place, stated in docs/formats.md.
 
 What comes from outside is looked at cheaply (octets, tags, brackets, depth) before anything is built from it, so that
-no file costs more than 10 s and 300 MB. Every check raises BadData that says what is too much and where the limit is.
-This module stands below every room and imports nothing of ours but the errors.
+no file costs more than 10 s and 300 MB. Every check raises BadDataError that says what is too much and where the limit
+is. This module stands below every room and imports nothing of ours but the errors.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 
 
 @dataclass(frozen=True)
@@ -54,25 +54,26 @@ _STRINGS: Final = re.compile(r"""\"(?:[^"\\]|\\.)*+\"|'[^'\n]*+'|\#[^\n]*+""")
 
 
 def check_size(octets: int, limit: int, what: str) -> None:
-    """Raise BadData where something has more octets (or characters) than are read."""
+    """Raise BadDataError where something has more octets (or characters) than are read."""
     if octets > limit:
-        raise BadData(f"{_upper(what)} has {octets} octets; at most {limit} are read.")
+        raise BadDataError(f"{_upper(what)} has {octets} octets; at most {limit} are read.")
 
 
 def check_count(count: int, limit: int, what: str) -> None:
-    """Raise BadData where there are more of something than are read."""
+    """Raise BadDataError where there are more of something than are read."""
     if count > limit:
-        raise BadData(f"There are {count} {what} here; at most {limit} are read.")
+        raise BadDataError(f"There are {count} {what} here; at most {limit} are read.")
 
 
 def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, file: str = "") -> Any:
     """JSON that a stranger wrote: bounded in size, values, depth and digits, each name once in its object.
 
-    ``what`` names it in errors, with its article: "the image"; with ``file`` they name file and line. Raises BadData.
+    ``what`` names it in errors, with its article: "the image"; with ``file`` they name file and line. Raises
+    BadDataError.
     """
     check_size(len(text), octets, what)
     if not text.strip():
-        raise BadData(f"{f'{file}:1: ' * bool(file)}{_upper(what)} is empty.")
+        raise BadDataError(f"{f'{file}:1: ' * bool(file)}{_upper(what)} is empty.")
     if isinstance(text, str):
         opened, values = text.count("[") + text.count("{"), text.count(",")
     else:
@@ -81,22 +82,22 @@ def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, f
     try:
         value = _parsed(text)
     except RecursionError as error:
-        raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} is nested too deeply.") from error
+        raise BadDataError(f"{file}:1: " * bool(file) + f"{_upper(what)} is nested too deeply.") from error
     except json.JSONDecodeError as error:
         if file:
-            raise BadData(f"{file}:{error.lineno}: this is not JSON: {error.msg}.") from error
-        raise BadData(f"{_upper(what)} is not JSON: line {error.lineno}: {error.msg}.") from error
+            raise BadDataError(f"{file}:{error.lineno}: this is not JSON: {error.msg}.") from error
+        raise BadDataError(f"{_upper(what)} is not JSON: line {error.lineno}: {error.msg}.") from error
     except UnicodeDecodeError as error:
-        raise BadData(f"{_upper(what)} is not text: it is binary, or not UTF-8.") from error
+        raise BadDataError(f"{_upper(what)} is not text: it is binary, or not UTF-8.") from error
     except ValueError as error:
-        raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} cannot be read: {error}.") from error
+        raise BadDataError(f"{file}:1: " * bool(file) + f"{_upper(what)} cannot be read: {error}.") from error
     if opened > LIMITS.json_depth:  # fewer brackets than levels nest no deeper
         check_depth(value, LIMITS.json_depth, what)
     return value
 
 
 def check_depth(value: object, limit: int, what: str) -> None:
-    """Raise BadData where lists and tables nest deeper than ``limit``; walks level by level, never deeper."""
+    """Raise BadDataError where lists and tables nest deeper than ``limit``; walks level by level, never deeper."""
     level: list[object] = [value]
     for _ in range(limit + 1):
         inside: list[object] = []
@@ -107,11 +108,11 @@ def check_depth(value: object, limit: int, what: str) -> None:
         if not inside:
             return
         level = inside
-    raise BadData(f"{_upper(what)} nests deeper than {limit} levels.")
+    raise BadDataError(f"{_upper(what)} nests deeper than {limit} levels.")
 
 
 def check_toml(text: str, file: str) -> None:
-    """Raise BadData, with the line, for TOML whose keys or integers would take long to read."""
+    """Raise BadDataError, with the line, for TOML whose keys or integers would take long to read."""
     check_size(len(text.encode("utf-8", "surrogatepass")), LIMITS.text_file, file)
     keys = text.count("=")
     plain = _STRINGS.sub(lambda found: "''" + "\n" * found[0].count("\n"), text)
@@ -121,24 +122,24 @@ def check_toml(text: str, file: str) -> None:
     ):
         found = pattern.search(plain)
         if found is not None:
-            raise BadData(f"{file}:{plain.count(chr(10), 0, found.start()) + 1}: {why}.")
+            raise BadDataError(f"{file}:{plain.count(chr(10), 0, found.start()) + 1}: {why}.")
     if keys > LIMITS.toml_keys:
-        raise BadData(f"{file}: there are {keys} keys; at most {LIMITS.toml_keys} are read.")
+        raise BadDataError(f"{file}: there are {keys} keys; at most {LIMITS.toml_keys} are read.")
 
 
 def load_toml(text: str, file: str) -> dict[str, Any]:
-    """TOML that a stranger wrote, bounded in size, keys, depth and digits; raises BadData, ``file`` before it."""
+    """TOML that a stranger wrote, bounded in size, keys, depth and digits; raises BadDataError, ``file`` before it."""
     check_toml(text, file)
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a ValueError that is no TOMLDecodeError: an integer of 4,301 digits
-        raise BadData(f"{file} is not valid TOML: {error}.") from error
+        raise BadDataError(f"{file} is not valid TOML: {error}.") from error
     check_depth(data, LIMITS.toml_depth, file)
     return data
 
 
 def check_xml(text: bytes, what: str) -> None:
-    """Raise BadData for XML with more elements or attributes than are read.
+    """Raise BadDataError for XML with more elements or attributes than are read.
 
     Counted in the octets: expat takes no encoding in which ``<`` and ``=`` are other octets than in ASCII.
     """
@@ -147,11 +148,11 @@ def check_xml(text: bytes, what: str) -> None:
 
 
 def whole_number(text: str, what: str) -> int:
-    """Integer of a text of decimal digits; raises BadData for another text and for more digits than are read."""
+    """Integer of a text of decimal digits; raises BadDataError for another text and for more digits than are read."""
     digits = text.strip()
     if len(digits) > LIMITS.integer_digits or not re.fullmatch(r"[+-]?[0-9]+", digits):
         shown = digits if len(digits) <= 40 else f"{digits[:12]}… ({len(digits)} characters)"
-        raise BadData(f"{_upper(what)} is no whole number: {shown!r}.")
+        raise BadDataError(f"{_upper(what)} is no whole number: {shown!r}.")
     return int(digits)
 
 
@@ -169,7 +170,7 @@ def _decoder() -> json.JSONDecoder:
     return json.JSONDecoder(object_pairs_hook=_unique, parse_int=_integer)
 
 
-class _TwiceNamed(ValueError):
+class _DuplicateNameError(ValueError):
     """Two members of one object have the same name."""
 
 
@@ -178,7 +179,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) != len(pairs):
         seen: set[str] = set()
         again = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
-        raise _TwiceNamed(f'an object names "{again[:40]}" twice')
+        raise _DuplicateNameError(f'an object names "{again[:40]}" twice')
     return members
 
 

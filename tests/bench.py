@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from teds_provision.errors import NodeSilent
+from teds_provision.errors import NodeSilentError
 from teds_provision.links import LINKS, Capabilities, Contact
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.announce import default_can_address
@@ -76,7 +76,7 @@ class MemoryLink:
         self.count += 1
         self.frames.append(frame)
         if self.count == self.lose_request:
-            raise NodeSilent("The request was lost.")
+            raise NodeSilentError("The request was lost.")
         try:
             reply = self.board.repetition.answer(
                 self.count,
@@ -86,9 +86,9 @@ class MemoryLink:
             )
         except PowerCut:
             self.board.power_on()
-            raise NodeSilent("The node lost power.") from None
+            raise NodeSilentError("The node lost power.") from None
         if self.count == self.lose_reply:
-            raise NodeSilent("The reply was lost.")
+            raise NodeSilentError("The reply was lost.")
         return self.tamper(self.count, reply) if self.tamper is not None else reply
 
     @property

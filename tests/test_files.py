@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import files
-from teds_provision.errors import BadData, NotFound, StoreFailure, UsageFailure, VaultFailure
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, UsageError, VaultError
 from teds_provision.files import SHARED, holds, private_folder, read_limited, whole_file, write_new, write_whole
 
 
@@ -47,7 +47,7 @@ def test_a_new_file_never_takes_the_place_of_another(tmp_path: Path, there: str)
         if there == "link":
             other.write_bytes(b"old")
     before = names(tmp_path)
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         write_new(path, b"new")
     with pytest.raises(FileExistsError), whole_file(path, replace=False) as file:
         file.write(b"new")
@@ -83,8 +83,8 @@ def test_a_device_is_never_replaced(tmp_path: Path, link: bool) -> None:
     os.mkfifo(pipe)
     named = tmp_path / "named"
     named.symlink_to(pipe)
-    with pytest.raises(UsageFailure, match="is a device, pipe or socket"):
-        write_whole(named if link else pipe, b"new", failure=UsageFailure)
+    with pytest.raises(UsageError, match="is a device, pipe or socket"):
+        write_whole(named if link else pipe, b"new", failure=UsageError)
     assert pipe.is_fifo()
     assert named.is_symlink()
     assert sorted(tmp_path.iterdir()) == [named, pipe]
@@ -94,8 +94,8 @@ def test_nothing_is_left_when_writing_fails(tmp_path: Path) -> None:
     write_whole(tmp_path / "a", b"old")
     with pytest.raises(TypeError), whole_file(tmp_path / "a", replace=True) as file:
         file.write("no octets")  # type: ignore[arg-type]
-    with pytest.raises(VaultFailure, match="cannot be written"):
-        write_whole(tmp_path / "none" / "a", b"", failure=VaultFailure)
+    with pytest.raises(VaultError, match="cannot be written"):
+        write_whole(tmp_path / "none" / "a", b"", failure=VaultError)
     assert (names(tmp_path), (tmp_path / "a").read_bytes()) == (["a"], b"old")
 
 
@@ -145,19 +145,19 @@ def test_what_a_killed_writer_left_goes_and_nothing_else_does(tmp_path: Path) ->
 def test_what_is_not_there_or_too_large_or_a_folder(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"12345")
     assert read_limited(tmp_path / "a", 5, "key") == b"12345"
-    with pytest.raises(BadData, match="larger than 4 octets, which is too large for a key"):
+    with pytest.raises(BadDataError, match="larger than 4 octets, which is too large for a key"):
         read_limited(tmp_path / "a", 4, "key")
     for name in ("none", "nu\0l", "."):
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundError):
             read_limited(tmp_path / name, 5, "key")
     (tmp_path / "link").symlink_to("a")
     assert read_limited(tmp_path / "link", 5, "key") == b"12345"
-    with pytest.raises(StoreFailure):
-        read_limited(tmp_path / "link", 5, "key", failure=StoreFailure, follow=False)
+    with pytest.raises(StoreError):
+        read_limited(tmp_path / "link", 5, "key", failure=StoreError, follow=False)
 
 
 def test_an_endless_file_is_not_read_to_its_end() -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         read_limited(Path("/dev/zero"), 1000, "key")
 
 
@@ -182,7 +182,7 @@ def test_a_folder_that_cannot_be_brought_to_the_disk_is_told(tmp_path: Path, mon
         real(descriptor)
 
     monkeypatch.setattr(files.os, "fsync", broken)
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         write_whole(tmp_path / "a", b"")
 
 

@@ -38,7 +38,7 @@ class Meta:
         self.facts = facts
 
 
-class BadRequest(ValueError):
+class BadRequestError(ValueError):
     """A body that the description forbids: what is wrong, and what to do."""
 
     def __init__(self, message: str, hint: str = "See /api/v1/openapi.json.") -> None:
@@ -95,20 +95,20 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
 def read(shape: type[Shape], octets: bytes) -> Shape:
     """A body of that shape; nothing at all counts as ``{}``. A member that is null is as one that is not there.
 
-    Raises BadRequest for what is not JSON (RFC 8259: UTF-8 alone, no byte order mark, no NaN, no half of a surrogate
-    pair), for two members of one name (section 4: each reader takes another of them, so what was checked in front of us
-    is not what we would do), and for what the schema forbids.
+    Raises BadRequestError for what is not JSON (RFC 8259: UTF-8 alone, no byte order mark, no NaN, no half of a
+    surrogate pair), for two members of one name (section 4: each reader takes another of them, so what was checked in
+    front of us is not what we would do), and for what the schema forbids.
     """
     try:
         text = octets.decode()
         value = json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant) if text else {}
         json.dumps(value, ensure_ascii=False).encode()
-    except BadRequest:
+    except BadRequestError:
         raise
     except (ValueError, RecursionError) as error:
-        raise BadRequest("The request body is not valid JSON.", "") from error
+        raise BadRequestError("The request body is not valid JSON.", "") from error
     if not isinstance(value, dict):
-        raise BadRequest("The request body must be a JSON object.", "")
+        raise BadRequestError("The request body must be a JSON object.", "")
     found = fit(schema_of(shape, {}), value)
     return shape(**{name: member for name, member in found.items() if member is not None})
 
@@ -118,7 +118,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
-        raise BadRequest(f"Member {twice[:64]!r} appears twice.", "Send each member once.")
+        raise BadRequestError(f"Member {twice[:64]!r} appears twice.", "Send each member once.")
     return members
 
 
@@ -127,7 +127,7 @@ def _no_constant(name: str) -> Any:
 
 
 def fit(schema: Schema, value: Any, where: str = "") -> Any:
-    """The value as its schema has it (1.0 is the integer 1, 1 the number 1.0); raises BadRequest where it forbids it.
+    """The value as its schema has it (1.0 is the integer 1, 1 the number 1.0); raises BadRequestError if it forbids it.
 
     ``where`` names the value in what is said: ``uuids[2]``.
     """
@@ -135,26 +135,26 @@ def fit(schema: Schema, value: Any, where: str = "") -> Any:
     kind = _kind_of(value, kinds if isinstance(kinds, list) else [kinds])
     if "enum" in schema and value not in schema["enum"]:
         known = ", ".join(str(one) for one in schema["enum"] if one is not None)
-        raise BadRequest(f"{where!r} must be one of {known}, not {_shown(value)}.")
+        raise BadRequestError(f"{where!r} must be one of {known}, not {_shown(value)}.")
     if kind == "object":
         return _object(schema, value, where)
     if kind == "array":
         if len(value) < schema.get("minItems", 0):
-            raise BadRequest(f"{where!r} must have at least {schema['minItems']} items.")
+            raise BadRequestError(f"{where!r} must have at least {schema['minItems']} items.")
         return [fit(schema.get("items", {}), one, f"{where}[{number}]") for number, one in enumerate(value)]
     if kind in ("integer", "number"):
         least, most = schema.get("minimum", -math.inf), schema.get("maximum", math.inf)
         if not least <= value <= most:
-            raise BadRequest(f"{where!r} must be between {least:g} and {most:g}, not {_shown(value)}.")
+            raise BadRequestError(f"{where!r} must be between {least:g} and {most:g}, not {_shown(value)}.")
         return int(value) if kind == "integer" else float(value)
     if kind == "string" and not schema.get("minLength", 0) <= len(value) <= schema.get("maxLength", math.inf):
         least, most = schema.get("minLength", 0), schema.get("maxLength", math.inf)
-        raise BadRequest(f"{where!r} must have {least} to {most} characters, not {len(value)}.")
+        raise BadRequestError(f"{where!r} must have {least} to {most} characters, not {len(value)}.")
     if kind == "string" and not re.search(schema.get("pattern", "").replace("$", r"\Z"), value):
-        raise BadRequest(f"{where!r} must match {schema['pattern']}, unlike {_shown(value)}.")
+        raise BadRequestError(f"{where!r} must match {schema['pattern']}, unlike {_shown(value)}.")
     if kind is None and kinds:
         wanted = " or ".join(kinds) if isinstance(kinds, list) else kinds
-        raise BadRequest(f"{where!r} must be of type {wanted}, not {_shown(value)}.")
+        raise BadRequestError(f"{where!r} must be of type {wanted}, not {_shown(value)}.")
     return value
 
 
@@ -178,22 +178,22 @@ def _object(schema: Schema, value: dict[str, Any], where: str) -> dict[str, Any]
     if schema.get("additionalProperties") is False:
         for name in value:
             if name not in properties:
-                raise BadRequest(f"Unknown member {name[:64]!r}.")
+                raise BadRequestError(f"Unknown member {name[:64]!r}.")
     for name in schema.get("required", ()):
         if name not in value:
-            raise BadRequest(f"Member {name!r} is missing.")
+            raise BadRequestError(f"Member {name!r} is missing.")
     found = {name: fit(properties.get(name, {}), member, name) for name, member in value.items()}
     for choice in ("anyOf", "oneOf"):
         fitting = sum(_fits(one, value) for one in schema.get(choice, ()))
         if choice in schema and (not fitting or (choice == "oneOf" and fitting > 1)):
-            raise BadRequest(schema["description"])
+            raise BadRequestError(schema["description"])
     return found
 
 
 def _fits(schema: Schema, value: Any) -> bool:
     try:
         fit({"type": "object", **schema}, value)
-    except BadRequest:
+    except BadRequestError:
         return False
     return True
 

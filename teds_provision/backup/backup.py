@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 from teds_provision.backup.content import BackupHead
 from teds_provision.backup.sealed_file import MAX_OCTETS, SealedFile, Sealer, write
-from teds_provision.errors import StoreFailure, StoreLocked, TedsProvisionError, VaultFailure
+from teds_provision.errors import StoreError, StoreLockedError, TedsProvisionError, VaultError
 from teds_provision.files import whole_draft
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
@@ -46,8 +46,8 @@ def backup(
     ``recovery`` is the point of a recovery key, else ``ask`` gives a new passphrase. The store may be in use meanwhile;
     ``notice`` is told whom the entry in the audit log waits for. The file gets its name only after it was read back as
     ``restore`` would, and after that entry: where another process keeps it from being made, the command fails
-    (StoreLocked). On a disk that takes no entry at all the backup is made, with a warning.
-    Raises StoreFailure, VaultFailure and its leaves.
+    (StoreLockedError). On a disk that takes no entry at all the backup is made, with a warning.
+    Raises StoreError, VaultError and its leaves.
     """
     vault = station.vault
     sealer = Sealer(
@@ -67,7 +67,7 @@ def backup(
             warnings = _warnings(station, recovery, useless)
             warnings += _note(station, notice, sha256=digest, to=to, nodes=nodes, keys=keys)
     except OSError as error:
-        raise VaultFailure(
+        raise VaultError(
             f"{path} cannot be written: {error.strerror}.", hint="Fix that and run the same command again."
         ) from error
     return BackedUp(octets, digest, nodes, keys, to, tuple(warnings))
@@ -99,7 +99,7 @@ def _read_back(station: Station, draft: Path, key: bytes) -> tuple[int, int, int
             found = totals(content.copy)
             return found["nodes"], found["keys"], sum(1 for _ in content.unopened(station.vault))
     except TedsProvisionError as error:
-        raise StoreFailure(
+        raise StoreError(
             f"The backup was written but cannot be opened: {error.message}",
             hint=f"It was deleted. Check the disk (at most {MAX_OCTETS >> 30} GiB are read), then run it again.",
         ) from error
@@ -110,9 +110,9 @@ def _note(station: Station, notice: Callable[[str], object] | None, **detail: ob
     try:
         with station.lock("backup", notice):
             station.audit("backup", None, "done", **detail)
-    except StoreLocked:
+    except StoreLockedError:
         raise
-    except StoreFailure as failure:  # a full or read-only disk is a reason for a backup, and must not make it fail
+    except StoreError as failure:  # a full or read-only disk is a reason for a backup, and must not make it fail
         return [f"The audit log has no entry of this backup: {failure.message}"]
     return []
 

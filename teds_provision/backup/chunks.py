@@ -14,7 +14,7 @@ from typing import BinaryIO, Final, Protocol
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.errors import BadDataError, NotAuthenticError
 
 CHUNK_OCTETS: Final = 1 << 20
 KEY_OCTETS: Final = 32
@@ -64,7 +64,7 @@ class ChunkWriter:
 class ChunkReader:
     """Opens what :class:`ChunkWriter` wrote, a chunk at a time.
 
-    Raises NotAuthentic (changed), BadData (cut off, or something follows the end).
+    Raises NotAuthenticError (changed), BadDataError (cut off, or something follows the end).
     """
 
     def __init__(self, source: OctetSource, key: bytes, context: bytes) -> None:
@@ -76,11 +76,11 @@ class ChunkReader:
         """Over everything given out so far."""
 
     def read(self, size: int) -> bytes:
-        """Return exactly ``size`` octets; fewer raise BadData."""
+        """Return exactly ``size`` octets; fewer raise BadDataError."""
         parts = []
         while size > 0:
             if self._place == len(self._plain) and not self._next():
-                raise BadData("The content of the backup is incomplete.")
+                raise BadDataError("The content of the backup is incomplete.")
             part = self._plain[self._place : self._place + size]
             self._place += len(part)
             size -= len(part)
@@ -90,18 +90,18 @@ class ChunkReader:
         return octets
 
     def read_line(self, limit: int) -> bytes:
-        """Return the octets up to a line feed, which goes too; more than ``limit`` raise BadData."""
+        """Return the octets up to a line feed, which goes too; more than ``limit`` raise BadDataError."""
         line = bytearray()
         while (octet := self.read(1)) != b"\n":
             line += octet
             if len(line) > limit:
-                raise BadData("The content of the backup has no header.")
+                raise BadDataError("The content of the backup has no header.")
         return bytes(line)
 
     def require_end(self) -> None:
-        """Raise BadData unless everything was given out."""
+        """Raise BadDataError unless everything was given out."""
         if self._place != len(self._plain) or self._next():
-            raise BadData("The backup has data after its end.")
+            raise BadDataError("The backup has data after its end.")
 
     def _next(self) -> bool:
         """Open the next chunk; False after the last."""
@@ -110,13 +110,13 @@ class ChunkReader:
         self._ahead += self._source.read(_FULL + len(END) + 1 - len(self._ahead))
         last = len(self._ahead) <= _FULL + len(END)
         if last and not self._ahead.endswith(END):
-            raise BadData("The backup was cut off: its end is missing.", hint="Use another copy.")
+            raise BadDataError("The backup was cut off: its end is missing.", hint="Use another copy.")
         sealed = self._ahead[: -len(END)] if last else self._ahead[:_FULL]
         self._ahead = b"" if last else self._ahead[_FULL:]
         try:
             self._plain = self._cipher.decrypt(_nonce(self._index, last=last), sealed, self._context)
         except (InvalidTag, ValueError):
-            raise NotAuthentic("The backup was damaged or changed.", hint="Use another copy.") from None
+            raise NotAuthenticError("The backup was damaged or changed.", hint="Use another copy.") from None
         self._place, self._done = 0, last
         self._index += 1
         return bool(self._plain)

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, Final
 
 from teds_provision import __version__
-from teds_provision.errors import BadData, NotAuthentic, VaultFailure
+from teds_provision.errors import BadDataError, NotAuthenticError, VaultError
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import fingerprint, is_point
 from teds_provision.store import KeyRecord, Store
@@ -26,10 +26,12 @@ def digest_of(document: dict[str, Any]) -> str:
 
 
 def check_digest(document: dict[str, Any]) -> None:
-    """Raise NotAuthentic where a file's ``sha256`` is not over the rest of it: so damage is told from a wrong key."""
+    """Raise NotAuthenticError if a file's ``sha256`` is not over the rest of it: so damage is told from a wrong key."""
     rest = {name: value for name, value in document.items() if name != "sha256"}
     if document.get("sha256") != digest_of(rest):
-        raise NotAuthentic("The backup was damaged or changed: its digest does not match.", hint="Use another copy.")
+        raise NotAuthenticError(
+            "The backup was damaged or changed: its digest does not match.", hint="Use another copy."
+        )
 
 
 def context_of(clear: dict[str, Any], form: str) -> bytes:
@@ -68,16 +70,16 @@ class BackupHead:
 
     @staticmethod
     def read(line: bytes, form: str) -> BackupHead:
-        """The head that a line says; raises BadData: another format, a text that is missing, no point of P-256."""
+        """The head that a line says; raises BadDataError: another format, a text that is missing, no point of P-256."""
         members = load_object(line, "The head of the backup")
         if members.get("format") != form or not all(isinstance(members.get(name), str) for name in _TEXTS):
-            raise BadData("The header of the backup is from another version.")
+            raise BadDataError("The header of the backup is from another version.")
         try:
             point = bytes.fromhex(members["point"])
         except ValueError:
             point = b""
         if not is_point(point):
-            raise BadData("The backup names no valid station key.")
+            raise BadDataError("The backup names no valid station key.")
         values = (members[name] for name in ("name", "created", "keystore", "material"))
         return BackupHead(members["store"], point, *values)
 
@@ -103,7 +105,7 @@ class Content(BackupHead):
             context = node_key_context(self.copy.id, record.uuid, record.epoch, record.slot)
             try:
                 vault.unwrap(record.wrapped, context=context)
-            except VaultFailure:
+            except VaultError:
                 yield record
 
     def close(self) -> None:

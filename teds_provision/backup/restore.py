@@ -13,13 +13,13 @@ from pathlib import Path
 from teds_provision.backup.content import Content
 from teds_provision.backup.merge import Merge
 from teds_provision.errors import (
-    NotAuthentic,
-    PolicyRefused,
-    StoreFailure,
-    UsageFailure,
-    VaultChanged,
-    VaultFailure,
-    WrongPassphrase,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
+    UsageError,
+    VaultChangedError,
+    VaultError,
+    WrongPassphraseError,
 )
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
@@ -48,20 +48,20 @@ class Restored:
     rotations_due: int = 0
 
 
-class _OnlyAPlan(Exception):
+class _DryRunRollbackError(Exception):
     """Rolls a transaction back that was tried out."""
 
 
 def open_present(home: Path, content: Content) -> Store | None:
     """Open the store of ``home`` if there is one that can be used, None if there is none or it is damaged.
 
-    Raises PolicyRefused where it is the store of another station, StoreFailure where it cannot be used otherwise.
+    Raises PolicyError where it is the store of another station, StoreError where it cannot be used otherwise.
     """
     if not has_store(home):
         return None
     try:
         store = Store.open(home)
-    except StoreFailure as failure:
+    except StoreError as failure:
         if is_damage(failure):
             return None
         raise
@@ -73,7 +73,7 @@ def open_present(home: Path, content: Content) -> Store | None:
     if store.id != content.store or (point is not None and point != content.point):
         store.close()
         here = "of an unfinished init" if point is None else f"of station {fingerprint(point)[:32]}"
-        raise PolicyRefused(
+        raise PolicyError(
             f"The backup is of station {content.station[:32]}; the store in {home} is {here}.",
             hint="Restore into another --home: backups never mix stations.",
         )
@@ -86,7 +86,7 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
     ``keystore`` as for init; None takes the kind that the station had, or a passphrase file where the keyring does not
     work. The vault comes first, the store last and in one piece: killed in between, the same command carries on.
     Every node that a key is held for is due for rotation afterwards, by tap or a person's word: nobody here knows what
-    became of it since the backup. Raises NotAuthentic, VaultFailure and its leaves, StoreFailure.
+    became of it since the backup. Raises NotAuthenticError, VaultError and its leaves, StoreError.
     """
     copy = content.copy
     _check_inside(copy, content)
@@ -94,13 +94,13 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
     try:
         home.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise StoreFailure(f"{home} cannot be made: {error.strerror}.", hint="Choose another --home.") from error
+        raise StoreError(f"{home} cannot be made: {error.strerror}.", hint="Choose another --home.") from error
 
     def make(known: Ask) -> Restored:
         with StoreLock(home, command="restore"):
             if (present := open_present(home, content)) is not None:  # the person was told of a home without one
                 present.close()
-                raise VaultChanged(
+                raise VaultChangedError(
                     f"Another command has created the station in {home} in the meantime; this one changed nothing.",
                     hint="Run it again: it restores what is missing.",
                 )
@@ -140,27 +140,27 @@ def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
 def keystore_for(content: Content, asked: str | None) -> str | None:
     """Which keystore a restored station gets: None means the keyring, or a passphrase file where it does not work.
 
-    No path of a module ever comes from a backup: for keys in a token the URI has to be given (UsageFailure). Raises
-    PolicyRefused where the keys cannot be put there.
+    No path of a module ever comes from a backup: for keys in a token the URI has to be given (UsageError). Raises
+    PolicyError where the keys cannot be put there.
     """
     # The backup's own keystore where any machine can have it; None for what this machine has.
     kept = None if content.in_token or content.keystore in ("keyring", "pkcs11") else content.keystore
     wanted = asked or kept
     into_token = wanted is not None and wanted.startswith("pkcs11:")
     if wanted not in (None, "keyring", "file") and not into_token:
-        raise UsageFailure("There is no such keystore.", hint="Give --keystore keyring, file or pkcs11:URI.")
+        raise UsageError("There is no such keystore.", hint="Give --keystore keyring, file or pkcs11:URI.")
     if content.in_token and asked is None:
-        raise UsageFailure(
+        raise UsageError(
             "The station's key is in a token, and a backup does not say by which module it is reached.",
             hint="Add --keystore 'pkcs11:token=LABEL?module-path=/path/of/the/module.so'.",
         )
     if content.in_token and not into_token:
-        raise PolicyRefused(
+        raise PolicyError(
             "The station's key is in a token and cannot be stored elsewhere.",
             hint="Restore with --keystore pkcs11:URI of that token.",
         )
     if into_token and not content.in_token:
-        raise PolicyRefused(
+        raise PolicyError(
             "The keys of this backup cannot be put into a token.", hint="Restore with --keystore keyring or file."
         )
     return wanted
@@ -172,36 +172,36 @@ def bring_vault(
     """Make or complete the vault with what the backup holds, and have it show the station's key."""
     vault, why = create_vault(home, content.store, keystore, ask, costs=costs, restored=content.material)
     if vault.identity().point != content.point:
-        raise NotAuthentic("The keys in the backup are not those of the station that signed it.")
+        raise NotAuthenticError("The keys in the backup are not those of the station that signed it.")
     return vault, why
 
 
 def open_vault_of(store: Store, ask: Ask) -> None:
     """Open the vault of a living station, before anything is held; one that is lost is no failure yet.
 
-    Raises WrongPassphrase, VaultChanged.
+    Raises WrongPassphraseError, VaultChangedError.
     """
     facts = store.facts()
     try:
         open_vault(store.home, store.id, facts.keystore if facts is not None else "keyring", ask)
-    except (WrongPassphrase, VaultChanged):
+    except (WrongPassphraseError, VaultChangedError):
         raise
-    except VaultFailure:
+    except VaultError:
         pass
 
 
 def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | None = None) -> Vault:
     """Open the vault of a living station; make it again where it is lost, and join master keys that it lacks.
 
-    A CA key that was taken out of the vault since the backup stays out. Raises VaultFailure and its leaves.
+    A CA key that was taken out of the vault since the backup stays out. Raises VaultError and its leaves.
     """
     facts = store.facts()
     wanted = facts.keystore if facts is not None else keystore_for(content, keystore)
     try:
         vault = open_vault(store.home, store.id, wanted or "keyring", ask)
-    except (WrongPassphrase, VaultChanged):
+    except (WrongPassphraseError, VaultChangedError):
         raise
-    except VaultFailure:  # lost, or locked: then making it fails as well and says so
+    except VaultError:  # lost, or locked: then making it fails as well and says so
         return bring_vault(store.home, content, ask, wanted)[0]
     if not any(True for _ in content.unopened(vault)):
         return vault
@@ -213,7 +213,10 @@ def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | 
 
 
 def merge_checked(store: Store, content: Content, vault: Vault, ask: Ask) -> Restored:
-    """Merge into a store whose own key and CA are as this station sealed them; raises StoreChanged, and as merge()."""
+    """Merge into a store whose own key and CA are as this station sealed them.
+
+    Raises StoreChangedError, and as merge().
+    """
     with store.transaction():
         Station(store, ask).adopt(vault)
         return merge(store, content, dry_run=False)
@@ -222,7 +225,7 @@ def merge_checked(store: Store, content: Content, vault: Vault, ask: Ask) -> Res
 def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
     """Bring back into a living store what it lacks, in one transaction; ``dry_run`` tries it out and changes nothing.
 
-    Raises NotAuthentic, BadData, StoreFailure.
+    Raises NotAuthenticError, BadDataError, StoreError.
     """
     copy = content.copy
     _check_inside(copy, content)
@@ -236,8 +239,8 @@ def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
                 detail = {"created": content.created, "relation": how.name.lower(), "back": back}
                 store.audit.append("restore", None, "merged", detail)
             if dry_run:
-                raise _OnlyAPlan
-    except _OnlyAPlan:
+                raise _DryRunRollbackError
+    except _DryRunRollbackError:
         pass
     action = "merged" if back else "nothing"
     facts = store.facts()
@@ -247,4 +250,4 @@ def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
 def _check_inside(copy: Store, content: Content) -> None:
     facts = copy.facts()
     if copy.id != content.store or facts is None or facts.point != content.point:
-        raise NotAuthentic("The store in the backup is not that of the station that signed it.")
+        raise NotAuthenticError("The store in the backup is not that of the station that signed it.")

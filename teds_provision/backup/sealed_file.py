@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Final
 
 from teds_provision.backup.chunks import KEY_OCTETS, ChunkReader, ChunkWriter
 from teds_provision.backup.content import MAX_HEAD_OCTETS, BackupHead, Content, check_digest, context_of, digest_of
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.files import open_to_read
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
@@ -75,7 +75,10 @@ def write(out: BinaryIO, head: BackupHead, rows: Iterable[bytes], signer: Privat
 
 
 class SealedFile:
-    """A backup that lies in a file, still sealed. Opening it reads its first line; raises NotFound, BadData."""
+    """A backup that lies in a file, still sealed. Opening it reads its first line.
+
+    Raises NotFoundError, BadDataError.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -84,51 +87,51 @@ class SealedFile:
             with open_to_read(path) as file:
                 line = file.readline(_MAX_LINE_OCTETS)
         except OSError as error:
-            raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
+            raise NotFoundError(f"{path} cannot be read: {error.strerror}.") from error
         if line.lstrip()[:1] != b"{":
-            raise BadData("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
+            raise BadDataError("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
         if self.octets > MAX_OCTETS:
-            raise BadData(f"The file is larger than {MAX_OCTETS} octets; backups are smaller.")
+            raise BadDataError(f"The file is larger than {MAX_OCTETS} octets; backups are smaller.")
         self._line = line
         if not line.startswith(b'{"format":"teds-backup/2"'):
             if b"teds-backup/1" in line or b'"protected"' in line:
                 raise too_old("The store in the backup", 1)
-            raise BadData("This is not a backup of this version of teds-provision.")
+            raise BadDataError("This is not a backup of this version of teds-provision.")
         if not line.endswith(b"\n") or not isinstance(
             (head := load_object(line, "The head of the backup")).get("key"), dict
         ):
-            raise BadData("The backup is truncated in its header, or damaged.", hint="Use another copy.")
+            raise BadDataError("The backup is truncated in its header, or damaged.", hint="Use another copy.")
         self._head = head
         self.is_for_key = "protected" in head["key"]
 
     def open_with_passphrase(self, passphrase: str) -> Content:
-        """Open it; raises BadData, NotAuthentic (damaged or changed), WrongPassphrase, VaultFailure."""
+        """Open it; raises BadDataError, NotAuthenticError (damaged or changed), WrongPassphraseError, VaultError."""
         clear = self._checked_head()
         key, _ = sealing.unseal(passphrase, self._head["key"], context=context_of(clear, FORMAT))
         return self.open_with_content_key(key)
 
     def open_with_key(self, key: PrivateKey) -> Content:
-        """Open it with the recovery key; raises PolicyRefused (another key), NotAuthentic, BadData."""
+        """Open it with the recovery key; raises PolicyError (another key), NotAuthenticError, BadDataError."""
         self._checked_head()
         sealed = dump(self._head["key"])
         recipients = jose.read_header(sealed, max_octets=_MAX_LINE_OCTETS).recipients
         if fingerprint(key.point) not in recipients:
             shown = ", ".join(kid[:32] for kid in recipients)
-            raise PolicyRefused(f"The backup is sealed to the recovery key {shown}, not to this one.")
+            raise PolicyError(f"The backup is sealed to the recovery key {shown}, not to this one.")
         return self.open_with_content_key(jose.decrypt(sealed, key, cty=KEY_TYPE, max_octets=_MAX_LINE_OCTETS))
 
     def open_with_content_key(self, key: bytes) -> Content:
-        """Open it with the file's own key; raises BadData, NotAuthentic, StoreFailure."""
+        """Open it with the file's own key; raises BadDataError, NotAuthenticError, StoreError."""
         clear = self._checked_head()
         bound = hashlib.sha256(self._line).digest()
         if len(key) != KEY_OCTETS:
-            raise BadData("The backup's own key has another length than 32 octets.")
+            raise BadDataError("The backup's own key has another length than 32 octets.")
         try:
             with open_to_read(self.path) as file:
                 file.seek(len(self._line))
                 return _content(ChunkReader(file, key, bound), bound, clear)
         except OSError as error:
-            raise NotFound(f"{self.path} cannot be read: {error.strerror}.") from error
+            raise NotFoundError(f"{self.path} cannot be read: {error.strerror}.") from error
 
     def _checked_head(self) -> dict[str, Any]:
         """The members in the clear, held against their digest."""
@@ -139,12 +142,12 @@ class SealedFile:
 def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Content:
     head = BackupHead.read(chunks.read_line(MAX_HEAD_OCTETS), FORMAT)
     if (head.store, head.station, head.created) != (clear["store"], clear["station"], clear["created"]):
-        raise NotAuthentic("The backup's header names a different station than its content.")
+        raise NotAuthenticError("The backup's header names a different station than its content.")
     copy = load_rows(chunks)
     try:
         signed = _LABEL + bound + chunks.digest.digest()
         if not verify(head.point, signed, chunks.read(SIGNATURE_OCTETS)):
-            raise NotAuthentic("The backup is not signed by the station that it names.")
+            raise NotAuthenticError("The backup is not signed by the station that it names.")
         chunks.require_end()
         return Content(**vars(head), copy=copy)
     except BaseException:

@@ -9,9 +9,9 @@ from typing import Final
 
 from teds_provision.check import slips
 from teds_provision.check.plain import low_s, security_state
-from teds_provision.check.probe import NotApplicable, Probe, RuleBroken, demand, holds
+from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError, demand, holds
 from teds_provision.check.rule import Stage, rule
-from teds_provision.errors import BadData, Garbled, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadDataError, GarbledError, NotAuthenticError, PolicyError
 from teds_provision.links.ports import OnABus
 from teds_provision.protocol.agreement import REPLY_OCTETS, AgreedKey, Credentials, RequestPayload, StationAgreement
 from teds_provision.protocol.keys import (
@@ -78,7 +78,7 @@ def tapped_or_bus(probe: Probe) -> None:
     if probe.tapped:
         return
     if probe.plain(request(b"")).reason == Reason.NOT_PERMITTED:
-        raise NotApplicable("Request is not permitted on this link: the node is to be tapped.")
+        raise NotApplicableError("Request is not permitted on this link: the node is to be tapped.")
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Tried:
 
     agreement: slips.Agreement
     agreed: AgreedKey | None
-    broken: RuleBroken | None
+    broken: RuleBrokenError | None
     script: bytes
     okm: bytes = field(repr=False)
 
@@ -95,8 +95,8 @@ class Tried:
 def try_agreement(probe: Probe, credentials: Credentials, *, sealed: bool = False) -> Tried:
     """Send a good Request and check its reply; nothing is kept on either side yet.
 
-    Raises RuleBroken where no reply of the right length with a point came; what is wrong with its tag, signature or
-    epoch stands in ``broken``.
+    Raises RuleBrokenError where no reply of the right length with a point came; what is wrong with its tag, signature
+    or epoch stands in ``broken``.
     """
     one_time = SoftwareKey.generate()
     agreement = StationAgreement(credentials, probe.uuid, one_time=one_time)
@@ -104,7 +104,7 @@ def try_agreement(probe: Probe, credentials: Credentials, *, sealed: bool = Fals
     reply = probe.sealed(command) if sealed else probe.plain(command)
     if not reply.ok:
         slip = _slip_of_request(probe) if reply.reason == Reason.BAD_SIGNATURE else None
-        raise RuleBroken(f"{describe_command(command)}: success is due, {describe_reply(reply)} came.", slip)
+        raise RuleBrokenError(f"{describe_command(command)}: success is due, {describe_reply(reply)} came.", slip)
     holds(
         len(reply.payload) == REPLY_OCTETS,
         f"Request (128.1): {REPLY_OCTETS} octets are due, {len(reply.payload)} came.",
@@ -114,29 +114,29 @@ def try_agreement(probe: Probe, credentials: Credentials, *, sealed: bool = Fals
     agreed, broken = None, None
     try:
         agreed = agreement.accept(reply.payload, teds, pinned=fingerprint(shown.node_key), epoch=0)
-    except Garbled as torn:
-        raise RuleBroken(f"Request (128.1): {torn.message}") from None
-    except (NotAuthentic, PolicyRefused, BadData) as wrong:
+    except GarbledError as torn:
+        raise RuleBrokenError(f"Request (128.1): {torn.message}") from None
+    except (NotAuthenticError, PolicyError, BadDataError) as wrong:
         if not is_point(made.en):
-            raise RuleBroken(f"Request (128.1): {wrong.message}") from None
+            raise RuleBrokenError(f"Request (128.1): {wrong.message}") from None
         broken = _explained(made, wrong.message)
     script = made.transcripts()[0][1]
     okm = made.material(made.shared, script)[0][1][:48]
     return Tried(made, agreed, broken, script, okm)
 
 
-def _explained(made: slips.Agreement, otherwise: str) -> RuleBroken:
+def _explained(made: slips.Agreement, otherwise: str) -> RuleBrokenError:
     """What is wrong with a reply whose octets this station did not accept, and which slip would explain it."""
     script = made.transcripts()[0][1]
     okm = made.material(made.shared, script)[0][1]
     if made.tag != next(made.tags(okm, script))[1]:
-        return RuleBroken("Request (128.1): tagN is wrong.", made.slip_of_tag())
+        return RuleBrokenError("Request (128.1): tagN is wrong.", made.slip_of_tag())
     if not verify(made.node, agreement_message(script), normalise_signature(made.signature)):
         slip = made.slip_of_signature()
-        return RuleBroken("Request (128.1): tagN is right, sigN does not verify under field 101.", slip)
+        return RuleBrokenError("Request (128.1): tagN is right, sigN does not verify under field 101.", slip)
     if slips.high_s(made.signature):
-        return RuleBroken(f"Request (128.1): {_HIGH_S}")
-    return RuleBroken(f"Request (128.1): {otherwise}")
+        return RuleBrokenError(f"Request (128.1): {_HIGH_S}")
+    return RuleBrokenError(f"Request (128.1): {otherwise}")
 
 
 def _slip_of_request(probe: Probe) -> slips.Slip | None:
@@ -151,25 +151,25 @@ def _slip_of_request(probe: Probe) -> slips.Slip | None:
 
 
 def stranger_asks(probe: Probe) -> bytes:
-    """The payload of a reply to a good Request of a stranger, which nobody confirms; raises NotApplicable."""
+    """The payload of a reply to a good Request of a stranger, which nobody confirms; raises NotApplicableError."""
     tapped_or_bus(probe)
     if probe.no_agreement:
-        raise NotApplicable(f"Needs a good reply to Request, and none came: {probe.no_agreement}")
+        raise NotApplicableError(f"Needs a good reply to Request, and none came: {probe.no_agreement}")
     return probe.good(request(Strangers.make().request()))
 
 
 def agree(probe: Probe, credentials: Credentials | None = None, *, sealed: bool = False) -> tuple[AgreedKey, Tried]:
-    """As :func:`try_agreement`, by this station unless told otherwise; raises RuleBroken for whatever is wrong.
+    """As :func:`try_agreement`, by this station unless told otherwise; raises RuleBrokenError for whatever is wrong.
 
-    The next time it raises NotApplicable.
+    The next time it raises NotApplicableError.
     """
     if probe.no_agreement:
-        raise NotApplicable(f"Needs a good reply to Request, and none came: {probe.no_agreement}")
+        raise NotApplicableError(f"Needs a good reply to Request, and none came: {probe.no_agreement}")
     try:
         tried = try_agreement(probe, credentials or probe.station, sealed=sealed)
         if tried.broken is not None:
             raise tried.broken
-    except RuleBroken as broken:
+    except RuleBrokenError as broken:
         probe.no_agreement = str(broken)
         raise
     assert tried.agreed is not None
@@ -188,11 +188,11 @@ def factory_open(probe: Probe) -> str:
 
 
 def require_reset_proof(probe: Probe, epoch: int, challenge: bytes, proof: bytes) -> None:
-    """Raise RuleBroken unless the reply to Reset is signed by the node's key, over this challenge."""
+    """Raise RuleBrokenError unless the reply to Reset is signed by the node's key, over this challenge."""
     message, node = reset_message(probe.uuid, epoch, challenge), probe.node_key
     if len(proof) != SIGNATURE_OCTETS or not verify(node, message, normalise_signature(proof)):
         slip = slips.of_reset(probe.uuid, node, epoch, challenge, proof)
-        raise RuleBroken("Reset (128.9): the proof does not verify under field 101 at this epoch.", slip)
+        raise RuleBrokenError("Reset (128.9): the proof does not verify under field 101 at this epoch.", slip)
 
 
 @rule("factory-reset", "Reset", Stage.FACTORY)
@@ -265,7 +265,7 @@ def request_answered(probe: Probe) -> str:
     slip = _slip_of_request(probe) if reply.reason == Reason.BAD_SIGNATURE else None
     what = f"{describe_command(command)}: success with {REPLY_OCTETS} octets is due, {describe_reply(reply)} came."
     probe.no_agreement = what
-    raise RuleBroken(what, slip)
+    raise RuleBrokenError(what, slip)
 
 
 @rule("agreement-epoch", "Key agreement", Stage.FACTORY)
@@ -279,7 +279,7 @@ def agreement_epoch(probe: Probe) -> str:
         little: slips.Slip("epoch-little-endian", "the epoch in the reply is little-endian"),
     }.get(offered)
     if offered != before.epoch + 1:
-        raise RuleBroken(f"Request offers epoch {offered}; {before.epoch + 1} is due.", slip)
+        raise RuleBrokenError(f"Request offers epoch {offered}; {before.epoch + 1} is due.", slip)
     holds(probe.identity() == before, "Request changed what Identify says before its Confirm.")
     return f"epoch {offered} offered"
 
@@ -375,14 +375,16 @@ def agreement(probe: Probe) -> str:
 
 
 def confirm(probe: Probe, *, sealed: bool) -> None:
-    """Agree on a key, which is durable here before the Confirm leaves, and go on with it; raises RuleBroken."""
+    """Agree on a key, which is durable here before the Confirm leaves, and go on with it; raises RuleBrokenError."""
     agreed, tried = agree(probe, sealed=sealed)
     assert probe.keep is not None
     probe.keep(agreed)
     reply = probe.sealed(agreed.confirm) if sealed else probe.plain(agreed.confirm)
     if not reply.ok:
         slip = _slip_of_confirm(probe) if reply.reason == Reason.BAD_TAG and not sealed else None
-        raise RuleBroken(f"{describe_command(agreed.confirm)}: success is due, {describe_reply(reply)} came.", slip)
+        raise RuleBrokenError(
+            f"{describe_command(agreed.confirm)}: success is due, {describe_reply(reply)} came.", slip
+        )
     probe.key, probe.okm = agreed.key, tried.okm
 
 
@@ -415,7 +417,7 @@ def open_a_session(probe: Probe) -> str:
 def keyed_untapped(probe: Probe) -> str:
     """Untapped Request, Confirm and Set CAN address get 3 once the node has a key."""
     if probe.tapped:
-        raise NotApplicable("This link counts as tapped; try it over CAN.")
+        raise NotApplicableError("This link counts as tapped; try it over CAN.")
     # what is refused here would change nothing even where it is let through: its SIG104, length and state are wrong
     probe.refused(request(Strangers.make().request(certified=False)), Reason.NOT_PERMITTED)
     probe.refused(security_command(Function.CONFIRM, bytes(16)), Reason.NOT_PERMITTED)
@@ -432,7 +434,7 @@ def keyed_security(probe: Probe) -> str:
 def confirm_elsewhere(probe: Probe) -> str:
     """A Confirm that is not by the same session as its Request gets 2, looked at before its tag."""
     if not probe.tapped:
-        raise NotApplicable("Needs a tap: try it over NFC.")
+        raise NotApplicableError("Needs a tap: try it over NFC.")
     probe.sealed_good(StationAgreement(probe.station, probe.uuid).request())
     seen = probe.refused(_WRONG_CONFIRM, Reason.WRONG_STATE, "plain, of a Request in a session")
     probe.close()
@@ -546,7 +548,7 @@ def explain(probe: Probe) -> Explained:
     """Make a Request that is never confirmed, end it on the node, and give what it comes to.
 
     A node in factory state is asked by a station and CA made for this one question; a node of ours, which answers its
-    owner alone, by this station, with a one-time key on both sides. Raises RuleBroken, NotApplicable.
+    owner alone, by this station, with a one-time key on both sides. Raises RuleBrokenError, NotApplicableError.
     """
     factory = probe.identity().state == NodeState.FACTORY
     sealed = not factory and not probe.tapped
@@ -555,7 +557,7 @@ def explain(probe: Probe) -> Explained:
     tried = try_agreement(probe, Strangers.make().credentials if factory else probe.station, sealed=sealed)
     ended = (probe.sealed if sealed else probe.plain)(_WRONG_CONFIRM)
     if ended.ok or ended.reason != Reason.BAD_TAG:
-        raise RuleBroken(
+        raise RuleBrokenError(
             f"Confirm (128.2) with a wrong tagS, to end the test: refusal 12 is due, {describe_reply(ended)} came."
         )
     probe.close()

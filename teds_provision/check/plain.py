@@ -7,9 +7,9 @@ from itertools import product
 from typing import Final
 
 from teds_provision.check import slips
-from teds_provision.check.probe import Probe, RuleBroken, demand, holds
+from teds_provision.check.probe import Probe, RuleBrokenError, demand, holds
 from teds_provision.check.rule import Stage, rule
-from teds_provision.errors import BadData, Garbled
+from teds_provision.errors import BadDataError, GarbledError
 from teds_provision.protocol.datasheet import can_be_stored, own_values
 from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
@@ -79,7 +79,7 @@ def prove(probe: Probe) -> str:
     node = probe.security().node_key
     if not verify(node, prove_message(probe.uuid, challenge), normalise_signature(proof)):
         slip = slips.of_prove(probe.uuid, node, challenge, proof)
-        raise RuleBroken("Prove (128.8): the signature does not verify under field 101.", slip)
+        raise RuleBrokenError("Prove (128.8): the signature does not verify under field 101.", slip)
     return "64 octets, good under field 101"
 
 
@@ -179,8 +179,8 @@ def state_before_length(probe: Probe) -> str:
 def _status(probe: Probe, block: BlockId) -> TedsStatus:
     try:
         return TedsStatus.decode(probe.good(query_teds(*block)))
-    except Garbled as error:
-        raise RuleBroken(f"Query (1.1) of {block}: {error.message}") from None
+    except GarbledError as error:
+        raise RuleBrokenError(f"Query (1.1) of {block}: {error.message}") from None
 
 
 def absent(probe: Probe) -> BlockId:
@@ -207,8 +207,8 @@ def teds_checksum(probe: Probe) -> str:
     for channel, code in listed:
         try:
             unframe(probe.teds((channel, code)))
-        except BadData as error:
-            raise RuleBroken(f"TEDS {code} of channel {channel}: {error.message}") from None
+        except BadDataError as error:
+            raise RuleBrokenError(f"TEDS {code} of channel {channel}: {error.message}") from None
     return f"Length and Checksum of {len(listed)} TEDS"
 
 
@@ -296,7 +296,7 @@ def node_key(probe: Probe) -> str:
     message = node_key_message(probe.uuid, shown.node_key)
     if not verify(shown.node_key, message, normalise_signature(shown.node_key_signature)):
         slip = slips.of_node_key(probe.uuid, shown.node_key, shown.node_key_signature)
-        raise RuleBroken("Field 102 does not verify under 101 over this UUID.", slip)
+        raise RuleBrokenError("Field 102 does not verify under 101 over this UUID.", slip)
     low = shown.node_key_signature == normalise_signature(shown.node_key_signature)
     holds(low, "Field 102: s is in the upper half of the group order.")
     return "102 good under 101 for this UUID"

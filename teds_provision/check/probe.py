@@ -9,7 +9,7 @@ from typing import Final
 
 from teds_provision.check import slips
 from teds_provision.check.slips import Slip
-from teds_provision.errors import BadData, Garbled, NodeSilent, NotAuthentic, TooLongForNode
+from teds_provision.errors import BadDataError, GarbledError, MessageTooLongError, NodeSilentError, NotAuthenticError
 from teds_provision.links import Contact
 from teds_provision.links.ports import Direction, Link, OnABus, Trace
 from teds_provision.protocol.agreement import AgreedKey, Credentials
@@ -40,7 +40,7 @@ _STATIONS: Final = range(0xF7, 0xF0, -1)
 """Addresses of base stations, those first that a real one has least often."""
 
 
-class RuleBroken(Exception):
+class RuleBrokenError(Exception):
     """The node did not keep to the rule; the text says what was sent, what was due and what came.
 
     ``slip`` is the known slip that would explain it, where one does.
@@ -51,7 +51,7 @@ class RuleBroken(Exception):
         self.slip = slip
 
 
-class NotApplicable(Exception):
+class NotApplicableError(Exception):
     """The rule cannot be tried on this node, link or state, by no fault of the node; the text says why."""
 
 
@@ -136,9 +136,9 @@ class Probe:
     # -- frames ----------------------------------------------------------------------------------------------------
 
     def octets(self, frame: bytes, what: str, *, inside: Command | None = None) -> Reply:
-        """Send these octets as a whole command frame. Raises RuleBroken where no whole reply frame comes back.
+        """Send these octets as a whole command frame. Raises RuleBrokenError where no whole reply frame comes back.
 
-        ``inside`` is the command that is sealed in them. Raises NodeSilent where not even Identify is answered.
+        ``inside`` is the command that is sealed in them. Raises NodeSilentError where not even Identify is answered.
         """
         opened = None if inside is None else inside.encode()
         self.asked = what
@@ -147,32 +147,34 @@ class Probe:
             self.contact.note("out", frame, what, sealed=inside is not None, opened=opened)
             try:
                 raw = self.line.exchange(frame)
-            except NodeSilent:
+            except NodeSilentError:
                 self.listen()
-                raise RuleBroken(f"{what}: no reply, and every command gets one.") from None
-            except TooLongForNode as refused:
+                raise RuleBrokenError(f"{what}: no reply, and every command gets one.") from None
+            except MessageTooLongError as refused:
                 if len(frame) > self.max_message:
                     raise
-                raise RuleBroken(
+                raise RuleBrokenError(
                     f"{what}: {len(frame)} octets are refused on the link; maxMessage is {self.max_message}."
                     f" {refused.message}"
                 ) from None
             try:
                 reply = decode_reply(raw)
-            except Garbled as error:
-                raise RuleBroken(f"{what}: {error.message}") from None
+            except GarbledError as error:
+                raise RuleBrokenError(f"{what}: {error.message}") from None
             if len(raw) > self.max_message:
-                raise RuleBroken(f"{what}: {len(raw)} octets came; maxMessage is {self.max_message}.")
+                raise RuleBrokenError(f"{what}: {len(raw)} octets came; maxMessage is {self.max_message}.")
             if inside is None or not reply.ok:  # what is sealed is told when it is opened
                 self.contact.note("in", raw, f"reply to {what}: {describe_reply(reply)}")
             if reply.reason != Reason.BUSY:
                 return reply
             if self.now() >= until:
-                raise RuleBroken(f"{what}: busy (17) for {BUSY_SECONDS:g} s, and nothing here keeps the node busy.")
+                raise RuleBrokenError(
+                    f"{what}: busy (17) for {BUSY_SECONDS:g} s, and nothing here keeps the node busy."
+                )
             self.pause(BUSY_PAUSE)
 
     def listen(self) -> None:
-        """Ask Identify, whatever it says; raises LinkFailure where nothing comes."""
+        """Ask Identify, whatever it says; raises LinkError where nothing comes."""
         self.line.exchange(IDENTIFY.encode())
 
     def pause(self, seconds: float) -> None:
@@ -181,10 +183,10 @@ class Probe:
 
     @property
     def bus(self) -> OnABus:
-        """The node's line where it is one of a bus; raises NotApplicable elsewhere."""
+        """The node's line where it is one of a bus; raises NotApplicableError elsewhere."""
         link = self.contact.link
         if not isinstance(link, OnABus):
-            raise NotApplicable("Needs a bus, where a second station can ask: try it over CAN.")
+            raise NotApplicableError("Needs a bus, where a second station can ask: try it over CAN.")
         return link
 
     def beside(self, number: int) -> Probe:
@@ -195,7 +197,7 @@ class Probe:
         taken = {one.identifier & 0xFF for one in frames if one.identifier is not None and one.direction == "in"}
         free = [source for source in _STATIONS if source not in taken | set(out[:1])]
         if number > len(free):
-            raise NotApplicable("All addresses of base stations are in use on this bus.")
+            raise NotApplicableError("All addresses of base stations are in use on this bus.")
         other = Probe(self.contact, self.heard)
         other.line, other.key, other.okm = bus.beside(free[number - 1]), self.key, self.okm
         other.credentials = self.credentials
@@ -220,7 +222,7 @@ class Probe:
         """Send a plain command that must succeed; its payload."""
         reply = self.plain(command)
         if not reply.ok:
-            raise RuleBroken(f"{describe_command(command)}: success is due, {describe_reply(reply)} came.")
+            raise RuleBrokenError(f"{describe_command(command)}: success is due, {describe_reply(reply)} came.")
         return reply.payload
 
     def refused(self, command: Command, reason: int, why: str = "") -> str:
@@ -231,25 +233,28 @@ class Probe:
 
     @property
     def link_key(self) -> bytes:
-        """The link key; raises NotApplicable where none is held."""
+        """The link key; raises NotApplicableError where none is held."""
         if self.key is None:
-            raise NotApplicable("This station holds no key of the node.")
+            raise NotApplicableError("This station holds no key of the node.")
         return self.key
 
     @property
     def station(self) -> Credentials:
-        """What this station shows; raises NotApplicable where the vault was not opened."""
+        """What this station shows; raises NotApplicableError where the vault was not opened."""
         if self.credentials is None:
-            raise NotApplicable("Needs this station's keys.")
+            raise NotApplicableError("Needs this station's keys.")
         return self.credentials
 
     def open(self) -> StationSession:
-        """Open a session; raises RuleBroken where the node's reply or tag is wrong, NotApplicable the next time."""
+        """Open a session.
+
+        Raises RuleBrokenError if the node's reply or tag is wrong, NotApplicableError the next time.
+        """
         if self.no_session:
-            raise NotApplicable(f"Needs a session, and none opens: {self.no_session}")
+            raise NotApplicableError(f"Needs a session, and none opens: {self.no_session}")
         try:
             self.session = self._opened()
-        except RuleBroken as broken:
+        except RuleBrokenError as broken:
             self.no_session = str(broken)
             raise
         return self.session
@@ -263,19 +268,19 @@ class Probe:
             command = session.open(self.opening_counter())
             reply = self.plain(command)
         if not reply.ok:
-            raise RuleBroken(
+            raise RuleBrokenError(
                 f"{describe_command(command)}: success is due, {describe_reply(reply)} came.",
                 self._slip_of_open(reply, one_time),
             )
         try:
             session.accept(reply.payload)
-        except (Garbled, NotAuthentic) as error:
+        except (GarbledError, NotAuthenticError) as error:
             slip = slips.of_session(key, self.uuid, one_time, reply.payload)
-            raise RuleBroken(f"Open (128.3): {error.message}", slip) from None
+            raise RuleBrokenError(f"Open (128.3): {error.message}", slip) from None
         return session
 
     def opening_counter(self) -> bytes:
-        """C of Open, 8 octets; raises RuleBroken."""
+        """C of Open, 8 octets; raises RuleBrokenError."""
         counter = self.good(security_command(Function.OPEN))
         holds(len(counter) == 8, f"Open (128.3) without payload: c has {len(counter)} octets, 8 are due.")
         return counter
@@ -296,7 +301,7 @@ class Probe:
         session = self.session or self.open()
         try:
             reply = self._sealed(session, command)
-        except RuleBroken as broken:
+        except RuleBrokenError as broken:
             if not self._sealed_once:
                 self.no_session = str(broken)
             raise
@@ -309,16 +314,16 @@ class Probe:
         if not outer.ok:
             self.session = None
             slip = self._slip_of_sealed(session) if outer.reason == Reason.BAD_TAG else None
-            raise RuleBroken(
+            raise RuleBrokenError(
                 f"{describe_command(command)}, sealed: a sealed reply is due, {describe_reply(outer)} came.", slip
             )
         try:
             inner = session.unseal(outer.payload)
-        except (Garbled, NotAuthentic) as error:
+        except (GarbledError, NotAuthenticError) as error:
             self.contact.note("in", outer.encode(), describe_answer(command, outer), sealed=True)
             self.session = None
             slip = slips.of_sealed_reply(session.keys, outer.payload, int.from_bytes(sealed.payload[:4], "big"))
-            raise RuleBroken(f"{describe_command(command)}, sealed: {error.message}", slip) from None
+            raise RuleBrokenError(f"{describe_command(command)}, sealed: {error.message}", slip) from None
         self.contact.note("in", outer.encode(), describe_answer(command, inner), sealed=True, opened=inner.encode())
         return inner
 
@@ -334,7 +339,7 @@ class Probe:
         """A sealed command that must succeed; the inner payload."""
         reply = self.sealed(command)
         if not reply.ok:
-            raise RuleBroken(f"{describe_command(command)}, sealed: success is due, {describe_reply(reply)} came.")
+            raise RuleBrokenError(f"{describe_command(command)}, sealed: success is due, {describe_reply(reply)} came.")
         return reply.payload
 
     def sealed_refused(self, command: Command, reason: int, why: str = "") -> str:
@@ -365,24 +370,24 @@ class Probe:
         """Identify, asked now."""
         try:
             return Identity.decode(self.good(IDENTIFY))
-        except BadData as error:
-            raise RuleBroken(f"Identify (128.7): {error.message}") from None
+        except BadDataError as error:
+            raise RuleBrokenError(f"Identify (128.7): {error.message}") from None
 
     def require(self, *states: NodeState) -> Identity:
-        """Identify; raises NotApplicable in another state than these."""
+        """Identify; raises NotApplicableError in another state than these."""
         identity = self.identity()
         if identity.state not in states:
-            raise NotApplicable(f"The node is {identity.state.name.lower()}.")
+            raise NotApplicableError(f"The node is {identity.state.name.lower()}.")
         return identity
 
     def listed(self) -> list[BlockId]:
         """List, in whatever order the node gives it."""
         payload = self.good(security_command(Function.LIST))
         if len(payload) % 3:
-            raise RuleBroken(f"List (128.11): {len(payload)} octets are no multiple of 3.")
+            raise RuleBrokenError(f"List (128.11): {len(payload)} octets are no multiple of 3.")
         try:
             return decode_list(payload)
-        except Garbled:
+        except GarbledError:
             cut = range(0, len(payload), 3)
             return [(int.from_bytes(payload[at : at + 2], "big"), payload[at + 2]) for at in cut]
 
@@ -392,18 +397,20 @@ class Probe:
         while len(octets) < _LARGEST_TEDS:
             payload = self.good(read_teds(*block, len(octets)))
             if payload[:4] != len(octets).to_bytes(4, "big"):
-                raise RuleBroken(f"Read (1.2) of {block}: offset {len(octets)} was asked, {payload[:4].hex()} came.")
+                raise RuleBrokenError(
+                    f"Read (1.2) of {block}: offset {len(octets)} was asked, {payload[:4].hex()} came."
+                )
             if len(payload) == 4:
                 return octets
             octets += payload[4:]
-        raise RuleBroken(f"Read (1.2) of {block}: no end after {len(octets)} octets.")
+        raise RuleBrokenError(f"Read (1.2) of {block}: no end after {len(octets)} octets.")
 
     def security(self) -> SecurityTeds:
-        """The Security TEDS as it is now, decoded; raises RuleBroken where it is not canonical."""
+        """The Security TEDS as it is now, decoded; raises RuleBrokenError where it is not canonical."""
         try:
             shown = security.decode(self.teds(SECURITY_TEDS))
-        except BadData as error:
-            raise RuleBroken(f"Security TEDS: {error.message}") from None
+        except BadDataError as error:
+            raise RuleBrokenError(f"Security TEDS: {error.message}") from None
         self._shown = self._shown or shown
         return shown
 
@@ -420,13 +427,13 @@ class Probe:
 
 
 def demand(reply: Reply, reason: int, what: str) -> str:
-    """Hold a reply against the refusal that is due; raises RuleBroken."""
+    """Hold a reply against the refusal that is due; raises RuleBrokenError."""
     if reply.ok or reply.payload != bytes([reason]):
-        raise RuleBroken(f"{what}: refusal {reason} is due, {describe_reply(reply)} came.")
+        raise RuleBrokenError(f"{what}: refusal {reason} is due, {describe_reply(reply)} came.")
     return f"{what}: {describe_reply(reply)}"
 
 
 def holds(what: bool, text: str) -> None:
-    """Raise RuleBroken with this text where it does not hold."""
+    """Raise RuleBrokenError with this text where it does not hold."""
     if not what:
-        raise RuleBroken(text)
+        raise RuleBrokenError(text)

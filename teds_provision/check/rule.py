@@ -29,7 +29,7 @@ class Stage(Enum):
 class Rule:
     """One rule: its name, the section of docs/profile.md that makes it, and how it is tried.
 
-    ``run`` returns what was seen, in few words; raises RuleBroken, NotApplicable or a LinkFailure.
+    ``run`` returns what was seen, in few words; raises RuleBrokenError, NotApplicableError or a LinkError.
     """
 
     name: str

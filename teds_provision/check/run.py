@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 from teds_provision.check import agreement, link_rules, plain, sessions, writing
 from teds_provision.check.agreement import Explained, explain
-from teds_provision.check.probe import NotApplicable, Probe, RuleBroken, TraceRecorder
+from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError, TraceRecorder
 from teds_provision.check.rule import RULES, Checked, Rule, Stage
-from teds_provision.errors import BadData, Garbled, LinkFailure, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadDataError, GarbledError, LinkError, NotAuthenticError, PolicyError
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.agreement import AgreedKey, key_id
 from teds_provision.protocol.keys import SoftwareKey
@@ -43,7 +43,7 @@ class CheckReport:
 
     uuid: bytes
     checks: tuple[Checked, ...]
-    lost: LinkFailure | None = None
+    lost: LinkError | None = None
     explained: Explained | str | None = None
 
     def count(self, result: str) -> int:
@@ -54,7 +54,10 @@ class CheckReport:
 def check_at(
     station: Station, links: LinkSettings, reporter: Reporter, *, factory: bool, explained: bool = False
 ) -> CheckReport:
-    """Run the rules against the node that is met first; see :func:`check_node`. Raises NoNode, NoReader as well."""
+    """Run the rules against the node that is met first; see :func:`check_node`.
+
+    Raises NoNodeError, NoReaderError as well.
+    """
     heard = TraceRecorder(links.trace)
     with meet(station, replace(links, trace=heard), None, reporter, before=station.unlock) as node:
         return check_node(station, node, factory=factory, heard=heard, explained=explained)
@@ -73,8 +76,8 @@ def check_node(
     Without ``factory`` no key changes: a factory node is tried in factory state, one of ours in sessions too. With it a
     node of ours is reset, then keyed, written and reset again, so that it ends in factory state.
     ``explained``: make a test agreement that is never confirmed, and say what it comes to.
-    A node that falls silent ends it, with what was found until then. Raises PolicyRefused for a node with another
-    owner, before anything but Identify was asked; LinkFailure before the first rule.
+    A node that falls silent ends it, with what was found until then. Raises PolicyError for a node with another
+    owner, before anything but Identify was asked; LinkError before the first rule.
     """
     return _Run(station, node, factory, heard, explained=explained).all()
 
@@ -87,12 +90,12 @@ class _Run:
         self._probe = Probe(node.contact, heard)
         self._checks: dict[str, Checked] = {}
         self._explaining, self._explained = explained, None  # type: bool, Explained | str | None
-        self._lost: LinkFailure | None = None
+        self._lost: LinkError | None = None
 
     def all(self) -> CheckReport:
         try:
             ours = self._probe.identity().state != NodeState.FACTORY
-        except RuleBroken:  # the rules say what is wrong with it
+        except RuleBrokenError:  # the rules say what is wrong with it
             ours = self._node.identity.state != NodeState.FACTORY
         if ours:
             self._take_up()
@@ -107,7 +110,7 @@ class _Run:
                 self._stage(Stage.KEYED)
                 self._stage(Stage.SESSION)
             self._in_factory_state(ours)
-        except LinkFailure as lost:
+        except LinkError as lost:
             self._lost = lost
             for stage in Stage:
                 self._skip(stage, _GONE)
@@ -125,7 +128,7 @@ class _Run:
             return
         try:
             self._explained = explain(self._probe)
-        except (RuleBroken, NotApplicable) as no:
+        except (RuleBrokenError, NotApplicableError) as no:
             self._explained = str(no)
 
     def _in_factory_state(self, ours: bool) -> None:
@@ -155,7 +158,7 @@ class _Run:
         for left in reversed(range(_TORN_TRIES)):
             try:
                 return self._tried(each)
-            except Garbled as torn:  # of the link, after its own repetitions
+            except GarbledError as torn:  # of the link, after its own repetitions
                 why, self._probe.session = torn.message, None
                 if left:
                     self._probe.listen()  # a node that answers nothing else either is lost, not wrong in this
@@ -167,18 +170,18 @@ class _Run:
         slip = None
         try:
             return Checked(each.name, each.clause, "passed", each.run(self._probe))
-        except NotApplicable as skip:
+        except NotApplicableError as skip:
             self._probe.session = None
             return Checked(each.name, each.clause, "skipped", str(skip))
-        except RuleBroken as broken:
+        except RuleBrokenError as broken:
             detail, slip = str(broken), broken.slip
-        except Garbled:
+        except GarbledError:
             raise
-        except LinkFailure as lost:
+        except LinkError as lost:
             detail = f"{self._probe.asked}: {lost.message}"
             self._checks[each.name] = Checked(each.name, each.clause, "skipped", detail)
             raise type(lost)(f"The node fell silent in the rule {each.name}: {detail}", hint=lost.hint) from lost
-        except (BadData, NotAuthentic, PolicyRefused) as wrong:
+        except (BadDataError, NotAuthenticError, PolicyError) as wrong:
             detail = wrong.message
         self._probe.session = None
         return Checked(each.name, each.clause, "failed", detail, slip.name if slip is not None else None)
@@ -186,7 +189,7 @@ class _Run:
     # -- keys ------------------------------------------------------------------------------------------------------
 
     def _take_up(self) -> None:
-        """The link key of a node of ours; raises PolicyRefused where another owner, or nobody here, has it.
+        """The link key of a node of ours; raises PolicyError where another owner, or nobody here, has it.
 
         A node that knows the key and opens no session all the same has its rules tried: they say why.
         """
@@ -194,7 +197,7 @@ class _Run:
         if self._station.keys.held(node.uuid):
             held = open_session(self._station, node) or self._known_there()
         if held is None:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"Node {node.uuid.hex()} has a key that this station does not hold: nothing was tried.",
                 hint="Check it from its owner's station, or reset it by hand (button held 5 s).",
             )
@@ -213,7 +216,7 @@ class _Run:
         """Reset a node of ours as ``reset`` does: its keys go here when the proof was good. Why not, "" where it is."""
         try:
             reset_node(self._station, self._node, examine(self._station, self._node))
-        except (BadData, NotAuthentic, PolicyRefused) as no:
+        except (BadDataError, NotAuthenticError, PolicyError) as no:
             (rule,) = [each for each in RULES if each.name == "reset"]
             self._checks["reset"] = Checked("reset", rule.clause, "failed", no.message)
             return f"The node could not be reset. {no.message}"

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Final
 
 from teds_provision.check.plain import absent
-from teds_provision.check.probe import NotApplicable, Probe, RuleBroken, demand, holds
+from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError, demand, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.check.slips import Slip
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.ports import OnABus, Repeats
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.announce import LAST_ADDRESS
@@ -81,13 +81,13 @@ def open_checks(probe: Probe) -> str:
 
 
 def _opens(probe: Probe) -> None:
-    """Raise NotApplicable where no good Open is taken."""
+    """Raise NotApplicableError where no good Open is taken."""
     if probe.no_session:
-        raise NotApplicable(f"Needs a session, and none opens: {probe.no_session}")
+        raise NotApplicableError(f"Needs a session, and none opens: {probe.no_session}")
 
 
 def _half_open(probe: Probe) -> Command:
-    """A good Open, made; raises NotApplicable where none is taken."""
+    """A good Open, made; raises NotApplicableError where none is taken."""
     _opens(probe)
     return StationSession(probe.link_key, probe.uuid).open(probe.opening_counter())
 
@@ -103,7 +103,7 @@ def open_once(probe: Probe) -> str:
     if now != grown.to_bytes(8, "big"):
         slip = Slip("counter-little-endian", "c is counted as a little-endian number")
         fits = now == little.to_bytes(8, "little")
-        raise RuleBroken(
+        raise RuleBrokenError(
             f"c went from {counter.hex()} to {now.hex()} with a good mac; + 1 is due.", slip if fits else None
         )
     return demand(probe.plain(command), Reason.BAD_TAG, "Open (128.3) a second time")
@@ -268,7 +268,7 @@ class _Repeated:
 
     def __init__(self, probe: Probe) -> None:
         if not isinstance(probe.line, Repeats):
-            raise NotApplicable("This link cannot send a request again.")
+            raise NotApplicableError("This link cannot send a request again.")
         self._probe, self._line = probe, probe.line
         self._frame = probe.open().seal(IDENTIFY).encode()
         self._words = f"{describe_command(IDENTIFY)}, for repeating"
@@ -282,7 +282,7 @@ class _Repeated:
         return reply
 
     def again(self, after: str = "") -> None:
-        """Raise RuleBroken unless the stored reply comes."""
+        """Raise RuleBrokenError unless the stored reply comes."""
         second = self._noted(self._line.again, ", again")
         came = describe_reply(decode_reply(second))
         text = f"Sealed (128.4) repeated{after}: the stored reply is due, {came} came."
@@ -336,7 +336,7 @@ def address_moves(probe: Probe) -> str:
     """
     home = probe.identity().can_address
     if not home:
-        raise NotApplicable("The node has no CAN address.")
+        raise NotApplicableError("The node has no CAN address.")
     probe.sealed_good(_set_address(home))
     target = _free_address(probe, home)
     probe.home_address = home
@@ -366,7 +366,7 @@ def _free_address(probe: Probe, home: int) -> int:
         address = (home - 1 + 53 * step) % LAST_ADDRESS + 1
         if not isinstance(link, OnABus) or link.there(address) is None:
             return address
-    raise NotApplicable("No CAN address is free here.")
+    raise NotApplicableError("No CAN address is free here.")
 
 
 def _moved(probe: Probe, home: int, target: int) -> StationSession:
@@ -377,7 +377,7 @@ def _moved(probe: Probe, home: int, target: int) -> StationSession:
         if reply.reason == Reason.BUSY:  # somebody set it a moment before this run
             probe.pause(_ADDRESS_SECONDS)
             reply = probe.sealed(_set_address(target))
-    except (RuleBroken, LinkFailure):
+    except (RuleBrokenError, LinkError):
         if not isinstance(probe.contact.link, OnABus):
             raise
         there = probe.contact.link.there(target)
@@ -391,7 +391,7 @@ def _moved(probe: Probe, home: int, target: int) -> StationSession:
             " reply needs at the old one",
         )
         text = f"Set CAN address (128.10) {target}: the node is there now, and its reply never came from {home}."
-        raise RuleBroken(text, slip) from None
+        raise RuleBrokenError(text, slip) from None
     holds(reply.ok, f"Set CAN address (128.10) {target}, sealed: success is due, {describe_reply(reply)} came.")
     probe.move(target)
     return session
@@ -427,9 +427,11 @@ def operate_lease(probe: Probe) -> str:
     probe.close()
     reasons = {reply.reason for reply in answers.values()}
     if reasons == {Reason.UNKNOWN_COMMAND}:
-        raise NotApplicable("The node does not measure: Operate gets 1.")
+        raise NotApplicableError("The node does not measure: Operate gets 1.")
     if reasons == {Reason.DIGEST_MISMATCH}:
-        raise NotApplicable("No channel has a Channel TEDS that fits it: Operate gets 6 before the lease is looked at.")
+        raise NotApplicableError(
+            "No channel has a Channel TEDS that fits it: Operate gets 6 before the lease is looked at."
+        )
     for lease, reply in answers.items():
         demand(reply, Reason.OUT_OF_RANGE, f"Operate (4.1) of all sensors, sealed, lease {lease}")
     return "19 for a lease of 0 and of 61 s"
@@ -440,7 +442,7 @@ def address_back(probe: Probe) -> str:
     """10 s after a write of the address another one is taken."""
     home = probe.home_address
     if not home or probe.identity().can_address == home:
-        raise NotApplicable("The address was not moved.")
+        raise NotApplicableError("The address was not moved.")
     probe.pause(max(0.0, probe.moved_at + _ADDRESS_SECONDS + 0.5 - probe.now()))
     _moved(probe, probe.identity().can_address, home)
     now = probe.identity().can_address

@@ -11,7 +11,7 @@ from dataclasses import replace
 from teds_provision.check import slips
 from teds_provision.check.agreement import Strangers, request, require_reset_proof, tapped_or_bus
 from teds_provision.check.plain import absent, security_state
-from teds_provision.check.probe import NotApplicable, Probe, RuleBroken, holds
+from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.check.slips import Slip
 from teds_provision.protocol.datasheet import digests, sign_datasheet, unsigned_datasheet
@@ -196,7 +196,7 @@ def _refused_over(probe: Probe, reason: Reason, why: str, octets: bytes) -> str:
     _write(probe, SECURITY, octets)
     try:
         seen = probe.sealed_refused(update_teds(*SECURITY), reason, why)
-    except RuleBroken:
+    except RuleBrokenError:
         if probe.teds(SECURITY) == octets:  # it took what is wrong: a good one in its place, so that the rest can go on
             _write(probe, SECURITY, _signed(probe, _sheet(probe, _stored(probe))))
             probe.sealed(update_teds(*SECURITY))
@@ -314,9 +314,9 @@ def _place(block: bytes, field: int) -> int:
 
 
 def security_of_the_node(probe: Probe) -> bytes:
-    """The initial Security TEDS of the node; raises NotApplicable where it has a signed one."""
+    """The initial Security TEDS of the node; raises NotApplicableError where it has a signed one."""
     if probe.security().signed:
-        raise NotApplicable("The node has a signed Security TEDS already.")
+        raise NotApplicableError("The node has a signed Security TEDS already.")
     return probe.teds(SECURITY)
 
 
@@ -371,7 +371,7 @@ def commit_uuid(probe: Probe) -> str:
     """A Meta-TEDS of the 2007 form that names another UUID gets 9."""
     meta = (0, 1)
     if TedsStatus.decode(probe.good(query_teds(*meta))).attributes & Attribute.READ_ONLY:
-        raise NotApplicable("The Meta-TEDS of this node is read-only.")
+        raise NotApplicableError("The Meta-TEDS of this node is read-only.")
     other = bytes(each ^ 0x55 for each in probe.uuid)
     octets = frame(bytes([3, 4, 0, 1, 1, 1, 4, 10]) + other)
     _write(probe, meta, octets)
@@ -406,7 +406,7 @@ def commit(probe: Probe) -> str:
         reply = probe.sealed(update_teds(*SECURITY))
         if not reply.ok:
             slip = _slip_of_commit(probe, reply.reason, blocks)
-            raise RuleBroken(
+            raise RuleBrokenError(
                 f"{describe_command(update_teds(*SECURITY))}, sealed: success is due, {describe_reply(reply)} came.",
                 slip,
             )
@@ -478,7 +478,7 @@ def reset_forgets(probe: Probe) -> str:
     """After a reset the first owner wins again: a Request that shows another CA is answered, and nothing is sealed."""
     tapped_or_bus(probe)
     if probe.identity().state != NodeState.FACTORY:
-        raise NotApplicable("The node was not reset.")
+        raise NotApplicableError("The node was not reset.")
     probe.refused(security_command(Function.SEALED, bytes(36)), Reason.WRONG_STATE)
     probe.good(request(Strangers.make().request()))
     return "a Request of another owner is answered"

@@ -15,7 +15,7 @@ from teds_provision import vault as vault_room
 from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
-from teds_provision.errors import NotFound, UsageFailure, VaultChanged, VaultFailure, WrongPassphrase
+from teds_provision.errors import NotFoundError, UsageError, VaultChangedError, VaultError, WrongPassphraseError
 
 if TYPE_CHECKING:
     from teds_provision.backup.content import Content
@@ -157,10 +157,10 @@ def _require_place(home: Path, file: Path) -> None:
     """Refuse a folder that is not there, and the station's own files, before anyone is asked for a passphrase."""
     folder = file.absolute().parent
     if not folder.is_dir():
-        raise NotFound(f"There is no folder {folder}.")
+        raise NotFoundError(f"There is no folder {folder}.")
     own = file.name.startswith(("store.", "vault", "config.toml")) and folder.resolve() == home.resolve()
     if own:
-        raise UsageFailure(
+        raise UsageError(
             f"{file} is one of the station's own files.", hint="Choose another name or place for the backup."
         )
 
@@ -181,7 +181,7 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     def work(known: Callable[[str, bool], str]) -> Restored:
         with store_room.StoreLock(app.home, command="restore", notice=app.note):
             if not yes and backup_room.restore.merge(store, content, dry_run=True).back not in (plan.back, {}):
-                raise VaultChanged(
+                raise VaultChangedError(
                     "Another command changed the station while you were being asked, so the list is out of date. "
                     "Nothing was changed.",
                     hint="Run it again and check the new list.",
@@ -216,14 +216,14 @@ def _open(file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]
     if not sealed.is_for_key:
         return sealed.open_with_passphrase(ask("Passphrase of the backup", False))
     if recovery_key is None:
-        raise UsageFailure("This backup is sealed to a recovery key.", hint="Pass it with --recovery-key PEM.")
+        raise UsageError("This backup is sealed to a recovery key.", hint="Pass it with --recovery-key PEM.")
     passphrase = ask(f"Passphrase of {recovery_key}", False)
     try:
         key = protocol.keys.SoftwareKey.from_secret(vault_room.ca_file.read_ca(recovery_key, passphrase))
-    except WrongPassphrase:
+    except WrongPassphraseError:
         raise
-    except VaultFailure as failure:
-        raise VaultFailure(failure.message, hint=_KEY_HINT) from failure
+    except VaultError as failure:
+        raise VaultError(failure.message, hint=_KEY_HINT) from failure
     return sealed.open_with_key(key)
 
 

@@ -25,7 +25,7 @@ from teds_provision.cli.options import (
     yes_option,
 )
 from teds_provision.cli.rendering import local_time, reporter_for
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.links import LinkSettings
 
@@ -127,7 +127,7 @@ def write_file(path: Path, text: str | Iterable[str]) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """Read an input file; raises NotFound, BadData (too large)."""
+    """Read an input file; raises NotFoundError, BadDataError (too large)."""
     return read_limited(path, MAX_INPUT_OCTETS, "image")
 
 
@@ -218,7 +218,7 @@ def _sign_by(app: App, station: Station, order: SignBy, links: LinkSettings) -> 
     """Have an office sign; with an output the request is written, and signed when its answer comes as a file."""
     try:
         signed = plant.asking.sign_by_office(station, links, order, reporter_for(app))
-    except plant.asking.NotAnswered as waits:
+    except plant.asking.OfficeSilentError as waits:
         if order.output is None:
             raise
         app.emit({"request": str(order.output)}, f"Wrote the request to {order.output}. {waits.hint}")
@@ -271,7 +271,7 @@ def write(
     """
     if sequence is not None:
         if image is not None:
-            raise UsageFailure("--from and --image cannot be combined.", hint="Use one of them.")
+            raise UsageError("--from and --image cannot be combined.", hint="Use one of them.")
         _bring_back(app, uuid, sequence, links, dry_run=dry_run)
         return
     confirm = partial(app.confirm, yes=yes)

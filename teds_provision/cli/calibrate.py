@@ -24,7 +24,7 @@ from teds_provision.cli.options import (
 )
 from teds_provision.cli.rendering import print_table, reporter_for, shown
 from teds_provision.cli.sample import over_the_bus
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
@@ -84,7 +84,7 @@ def zero(
     guard refuses the result (exit 6). A running ncap releases the node in the meantime.
     """
     if value is not None and not math.isfinite(value):
-        raise UsageFailure("--value is not a finite number.")
+        raise UsageError("--value is not a finite number.")
     order = measure.zeroing.ZeroOrder(channel, value, unit, app.interactive, accept_calibration)
     done = measure.zeroing.zero_at(
         app.station(),
@@ -170,7 +170,7 @@ def capture(
     file to --calibration; calibrate fit shows how good the fit is. The sensor may be in use while you capture.
     """
     if not math.isfinite(reference):
-        raise UsageFailure("--reference is not a finite number.")
+        raise UsageError("--reference is not a finite number.")
     done = measure.capturing.capture_at(
         app.station(),
         over_the_bus(links),
@@ -219,7 +219,7 @@ def fit(app: App, file: Path, method: str | None, degree: int | None, profile: s
     warnings: tuple[str, ...] = ()
     if profile is not None:
         if method is not None or degree is not None:
-            raise UsageFailure(
+            raise UsageError(
                 "The profile already sets the method.",
                 hint="Omit --method and --degree, or write them into the file.",
             )
@@ -237,7 +237,7 @@ def fit(app: App, file: Path, method: str | None, degree: int | None, profile: s
 def _fit_json(one: Calibration) -> dict[str, Any]:
     found, without = teds.calibration.residuals(one), teds.calibration.left_out(one)
     if found is None:
-        raise UsageFailure("There are no points to fit.", hint="calibrate fit takes a CSV of points: raw, value.")
+        raise UsageError("There are no points to fit.", hint="calibrate fit takes a CSV of points: raw, value.")
     rows = zip(found.inputs, found.references, found.curve, found.differences, strict=True)
     return {
         "channel": one.channel,

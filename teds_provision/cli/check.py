@@ -10,7 +10,7 @@ from teds_provision import check as check_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
-from teds_provision.errors import NotAuthentic, TedsProvisionError
+from teds_provision.errors import NotAuthenticError, TedsProvisionError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
     error: TedsProvisionError | None = report.lost
     if broken:
         count = "a rule" if len(broken) == 1 else f"{len(broken)} rules"
-        error = NotAuthentic(
+        error = NotAuthenticError(
             f"The node breaks {count}: {', '.join(broken)}.",
             hint="" if report.lost is None else f"{report.lost.message} The remaining rules were not tried.",
         )

@@ -24,7 +24,7 @@ from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.main import COMPLETE
 from teds_provision.cli.option_names import OPTIONS
 from teds_provision.cli.options import COMMAND_SETTINGS, command, examples
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.limits import load_toml
 from teds_provision.store import StoreLock
@@ -82,7 +82,10 @@ def show(app: App, ctx: click.Context) -> None:
 
 
 def check_values(root: click.Context, values: Mapping[str, Any], place: Path) -> None:
-    """Have click read every value of config.toml as its command would; raises BadData for the first that is bad."""
+    """Have click read every value of config.toml as its command would.
+
+    Raises BadDataError for the first that is bad.
+    """
     for name, value in _flat(anchored(dict(values), place.parent)):
         _check_value(root, name, value, place)
 
@@ -103,7 +106,7 @@ def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any
 
 
 def _check_value(root: click.Context, name: str, value: Any, place: Path) -> None:
-    """Have click read a value as the command would; raises BadData."""
+    """Have click read a value as the command would; raises BadDataError."""
     found = _parameter(root, name)
     if found is None:
         return
@@ -114,7 +117,7 @@ def _check_value(root: click.Context, name: str, value: Any, place: Path) -> Non
         option.process_value(click.Context(command, parent=root, info_name=path), value)
     except click.BadParameter as error:
         said = error.message.rstrip(".")
-        raise BadData(f"{place}: {name} = {value!r}: {said}.", hint="Fix that line.") from error
+        raise BadDataError(f"{place}: {name} = {value!r}: {said}.", hint="Fix that line.") from error
 
 
 def _parameter(root: click.Context, name: str) -> tuple[str, click.Command, click.Parameter] | None:
@@ -184,17 +187,17 @@ def unset(app: App, name: str) -> None:
 
 
 def _typed(root: click.Context, name: str, value: str) -> Any:
-    """The value as the option reads it, typed as TOML has it; raises UsageFailure for a name or value that is none."""
+    """The value as the option reads it, typed as TOML has it; raises UsageError for a name or value that is none."""
     *words, option = name.replace("_", "-").split(".")
     listed: Any = None
     if value.startswith("["):
-        with suppress(BadData):
+        with suppress(BadDataError):
             listed = load_toml(f"x = {value}", name)["x"]
     nested: dict[str, Any] = {option: value if listed is None else listed}
     for word in reversed(words):
         nested = {word: nested}
     for problem in problems(nested, ""):
-        raise UsageFailure(f"{name}: {problem.partition(': ')[2]}", hint="See docs/configuration.md.")
+        raise UsageError(f"{name}: {problem.partition(': ')[2]}", hint="See docs/configuration.md.")
     parameter = _parameter(root, name)
     if listed is not None or parameter is None:  # a list, or the URL of a broker
         return value if listed is None else listed
@@ -203,7 +206,7 @@ def _typed(root: click.Context, name: str, value: str) -> Any:
         given = [value] if option_.multiple else value
         read = option_.process_value(click.Context(command, parent=root, info_name=path), given)
     except click.BadParameter as error:
-        raise UsageFailure(f"{name}: {error.message.rstrip('.')}.") from error
+        raise UsageError(f"{name}: {error.message.rstrip('.')}.") from error
     return read if isinstance(read, bool | int | float) else value
 
 
@@ -225,7 +228,7 @@ def _edit(app: App, command: str, name: str, value: Any) -> bool:
     """Set or (None) remove one setting under the store's lock; False where nothing had to change.
 
     TOML has more ways to say a thing than this edit knows (inline tables, dotted keys): what it made is read again, and
-    written only if it says exactly what was meant. Raises BadData where it does not, with nothing changed.
+    written only if it says exactly what was meant. Raises BadDataError where it does not, with nothing changed.
     """
     place = config_path(app.home)
     *table, key = name.replace("_", "-").split(".")
@@ -241,11 +244,13 @@ def _edit(app: App, command: str, name: str, value: Any) -> bool:
         if value is not None:
             inner[key] = value
         edited = _edited(text, table, key, value)
-        with suppress(BadData):
+        with suppress(BadDataError):
             if _pruned(_plain(load_toml(edited, str(place)))) == _pruned(wanted):
                 write_whole(place, edited.encode())
                 return True
-    raise BadData(f"{place} writes {name} in a way that this command cannot edit.", hint=f"Edit it by hand: {place}")
+    raise BadDataError(
+        f"{place} writes {name} in a way that this command cannot edit.", hint=f"Edit it by hand: {place}"
+    )
 
 
 def _edited(text: str, table: list[str], key: str, value: Any) -> str:
@@ -289,7 +294,7 @@ def _lines_of(lines: list[str], table: list[str]) -> tuple[int, int] | None:
 def _comment(rest: str) -> str:
     """What stands behind the value of a line, with the blanks before it: "" where there is no comment."""
     for at in (n for n, character in enumerate(rest) if character == "#"):
-        with suppress(BadData):
+        with suppress(BadDataError):
             load_toml(f"x = {rest[:at]}", "")
             return rest[len(rest[:at].rstrip()) :]
     return ""

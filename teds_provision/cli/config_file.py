@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.cli.option_names import FILES, OPTIONS, PARAMETERS, SEVERAL
 from teds_provision.cli.table import COMMANDS, GROUPS
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Defaults(dict[str, Any]):
             listed = isinstance(value, list)
             repeats = name in SEVERAL.get(path, ())
             if listed and not repeats and name in own:
-                raise BadData(f"config.toml: {path} takes one --{name}, and {len(value)} are named.", hint=_MEND)
+                raise BadDataError(f"config.toml: {path} takes one --{name}, and {len(value)} are named.", hint=_MEND)
             if listed and not repeats:
                 continue  # several buses are for the commands that work with several
             found[parameter_of(path, name)] = [value] if repeats and not listed else value
@@ -132,26 +132,26 @@ def config_path(home: Path | None) -> Path:
 
 
 def read_config_text(path: Path) -> str | None:
-    """Return the text of the file, None where there is none; raises BadData."""
+    """Return the text of the file, None where there is none; raises BadDataError."""
     if not os.path.lexists(path):  # or a home that cannot be one: whoever opens it says so
         return None
     try:
-        return files.read_text(path, limits.LIMITS.text_file, "config.toml", failure=BadData)
-    except (BadData, NotFound) as error:
-        raise BadData(error.message, hint=error.hint or _MEND) from error
+        return files.read_text(path, limits.LIMITS.text_file, "config.toml", failure=BadDataError)
+    except (BadDataError, NotFoundError) as error:
+        raise BadDataError(error.message, hint=error.hint or _MEND) from error
 
 
 def read_config(path: Path) -> dict[str, Any] | None:
-    """Return what the file says, None where there is none; raises BadData with the line of what is wrong."""
+    """Return what the file says, None where there is none; raises BadDataError with the line of what is wrong."""
     text = read_config_text(path)
     if text is None:
         return None
     try:
         values = limits.load_toml(text, str(path))
-    except BadData as error:
-        raise BadData(error.message, hint=_MEND) from error
+    except BadDataError as error:
+        raise BadDataError(error.message, hint=_MEND) from error
     for problem in problems(values, text):
-        raise BadData(f"{path}, {problem}", hint="To list all settings: teds-provision config show")
+        raise BadDataError(f"{path}, {problem}", hint="To list all settings: teds-provision config show")
     return values
 
 
@@ -192,7 +192,7 @@ def _problems_of_brokers(values: dict[str, Any], text: str) -> Iterator[str]:
 
 
 def brokers_of(path: Path) -> dict[str, str]:
-    """The brokers that requests may name, ``[ncap.brokers]``; raises BadData as :func:`read_config`."""
+    """The brokers that requests may name, ``[ncap.brokers]``; raises BadDataError as :func:`read_config`."""
     ncap = anchored(read_config(path) or {}, path.parent).get("ncap", {})
     return dict(ncap.get("brokers", {})) if isinstance(ncap, dict) else {}
 

@@ -15,12 +15,12 @@ from teds_provision import protocol, vault
 from teds_provision import station as station_room
 from teds_provision.cli.config_file import home_of
 from teds_provision.errors import (
-    NoPassphrase,
-    PolicyRefused,
-    StoreFailure,
+    NoPassphraseError,
+    PolicyError,
+    StoreError,
     TedsProvisionError,
-    UsageFailure,
-    WrongPassphrase,
+    UsageError,
+    WrongPassphraseError,
 )
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize, sanitize_json
@@ -104,9 +104,7 @@ class App:
             nowhere(sys.stdout)
             told = f"Cannot write the result to stdout: {error.strerror}."
             if self.json:
-                raise StoreFailure(
-                    told, hint="The work itself is done. Free some space before the next run."
-                ) from error
+                raise StoreError(told, hint="The work itself is done. Free some space before the next run.") from error
             self.note(told)
 
     def _print(self, human: Callable[[Console], None] | RenderableType) -> None:
@@ -177,20 +175,20 @@ class App:
     def confirm(self, question: str, *, yes: bool, named: str = "") -> None:
         """Ask before something that cannot be undone; ``yes`` is the command's --yes.
 
-        ``named`` is the option that must stand beside it. Raises PolicyRefused where the answer is no, or nobody can be
+        ``named`` is the option that must stand beside it. Raises PolicyError where the answer is no, or nobody can be
         asked.
         """
         if yes:
             return
         if not self.interactive:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"This needs confirmation, but there is no terminal to ask on. {question}"
                 if named
                 else "This needs confirmation, but there is no terminal to ask on.",
                 hint=f"Add {named} --yes." if named else "Add --yes, or --dry-run to see the plan.",
             )
         if not self.ask(question):
-            raise PolicyRefused("Cancelled. Nothing was changed.")
+            raise PolicyError("Cancelled. Nothing was changed.")
 
     def ask(self, question: str) -> bool:
         """Ask a person, yes or no; nothing that a node or a file brought steers the terminal."""
@@ -205,7 +203,7 @@ class App:
             for text in differences:
                 self.note(f"  {text}")
             if not self.ask("Change it to the new type?"):
-                raise PolicyRefused(f"Cancelled. Board {uuid.hex()} keeps its type; nothing was written.")
+                raise PolicyError(f"Cancelled. Board {uuid.hex()} keeps its type; nothing was written.")
 
         return ask if self.interactive and not yes else None
 
@@ -246,7 +244,7 @@ class App:
 
     def _typed(self, prompt: str, *, confirm: bool, instead: str) -> str:
         if self.no_input or not sys.stdin.isatty():
-            raise NoPassphrase(
+            raise NoPassphraseError(
                 f"{prompt.rstrip(': ')} is needed, but there is no terminal to ask on.",
                 hint=f"Pass it through a file descriptor: {instead}.",
             )
@@ -257,7 +255,7 @@ class App:
     # -- the station -----------------------------------------------------------------------------------------------
 
     def station(self) -> Station:
-        """Open this base station (store now, vault when a key is first needed); NotFound says to run init."""
+        """Open this base station (store now, vault when a key is first needed); NotFoundError says to run init."""
         station = station_room.station.Station.open(self.home, ask=self.ask_secret, tell=self.warn)
         station.notice = self.note
         station.use_agent = not self.has_passphrase
@@ -309,15 +307,15 @@ def to_json(value: object, *, indent: int | None = None) -> str:
 
 
 def read_line(descriptor: int) -> str:
-    """Read a secret: one line of a file descriptor; raises UsageFailure (not readable), WrongPassphrase (empty)."""
+    """Read a secret: one line of a file descriptor; raises UsageError (not readable), WrongPassphraseError (empty)."""
     try:
         with os.fdopen(os.dup(descriptor), "rb") as stream:
             line = stream.readline(4096)
     except OSError as error:
-        raise UsageFailure(f"Cannot read --passphrase-fd {descriptor}: {error.strerror}.") from error
+        raise UsageError(f"Cannot read --passphrase-fd {descriptor}: {error.strerror}.") from error
     text = line.decode(errors="surrogateescape").rstrip("\r\n")
     if not text:
-        raise WrongPassphrase(f"--passphrase-fd {descriptor} returned an empty line.")
+        raise WrongPassphraseError(f"--passphrase-fd {descriptor} returned an empty line.")
     return text
 
 

@@ -12,7 +12,7 @@ from teds_provision import talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.rendering import reporter_for
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 
 NEXT = """
 Next, with your own node (or a virtual one: node create, node run):
@@ -39,12 +39,12 @@ def demo(app: App, *, page: bool, plant: bool, line: bool, http: str | None) -> 
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: a folder and a process are to be taken away
     if page + plant + line > 1:
-        raise UsageFailure("Give one of --page, --plant and --line.")
+        raise UsageError("Give one of --page, --plant and --line.")
     if page:
         _page(app, http)
         return
     if http is not None:
-        raise UsageFailure("--http requires --page.", hint="Run: teds-provision demo --page --http 127.0.0.1:8351")
+        raise UsageError("--http requires --page.", hint="Run: teds-provision demo --page --http 127.0.0.1:8351")
     if plant:
         _plant(app)
         return

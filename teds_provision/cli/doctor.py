@@ -16,7 +16,7 @@ from teds_provision.cli.config_file import config_path
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.table import COMMANDS
-from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.files import SHARED, require_new, write_new
 from teds_provision.limits import load_toml
 
@@ -55,7 +55,7 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None, report: 
     this user or names of this machine; UUIDs only with --with-uuids.
     """
     if with_uuids and report is None:
-        raise UsageFailure("--with-uuids needs --report.", hint="teds-provision doctor --report FILE --with-uuids")
+        raise UsageError("--with-uuids needs --report.", hint="teds-provision doctor --report FILE --with-uuids")
     if report is not None and str(report) != "-":
         require_new(report)
     root = click.get_current_context().find_root()
@@ -108,7 +108,7 @@ def _give_report(app: App, document: Mapping[str, Any], path: Path, result: Mapp
 def _bad_value(app: App, root: click.Context, values: Mapping[str, Any]) -> str:
     try:
         check_values(root, values, config_path(app.home))
-    except BadData as error:
+    except BadDataError as error:
         return error.message
     return ""
 

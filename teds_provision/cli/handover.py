@@ -28,7 +28,7 @@ from teds_provision.cli.options import (
     yes_option,
 )
 from teds_provision.cli.rendering import count_of, first_lines, local_time, reporter_for
-from teds_provision.errors import BadData, LinkFailure, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, LinkError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.files import holds, open_to_read, read_limited, require_new, write_new
 from teds_provision.links import LinkSettings
 
@@ -203,7 +203,7 @@ def _node_lines(chosen: Sequence[Leaving], station: Station) -> list[str]:
 def require_same(same: bool) -> None:
     """What a person was shown must still be so under the lock."""
     if not same:
-        raise PolicyRefused("Another command changed the plan while this one was waiting.", hint="Run it again.")
+        raise PolicyError("Another command changed the plan while this one was waiting.", hint="Run it again.")
 
 
 # -- import-keys -------------------------------------------------------------------------------------------------------
@@ -284,7 +284,7 @@ def import_keys(
         outcomes = _prove(app, station, done, links)
     _tell_import(app, station, done, receipt, _import_plan(shown), outcomes)
     if prove and any(outcome["why"] for outcome in outcomes):
-        raise click.exceptions.Exit(LinkFailure.exit_code)
+        raise click.exceptions.Exit(LinkError.exit_code)
 
 
 def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
@@ -324,9 +324,9 @@ def _bundle_file(path: Path) -> Iterator[BinaryIO]:
     with open_to_read(path) as file:
         whole = file if file.seekable() else BytesIO(file.read(most + 1))
         if whole.seek(0, os.SEEK_END) > most:
-            raise BadData(f"{path} is larger than {most} octets and cannot be a bundle.")
+            raise BadDataError(f"{path} is larger than {most} octets and cannot be a bundle.")
         if not _is_sealed(whole):
-            raise BadData(f"{path} is not a handover bundle.", hint="Use the file that export-keys wrote.")
+            raise BadDataError(f"{path} is not a handover bundle.", hint="Use the file that export-keys wrote.")
         yield whole
 
 
@@ -342,7 +342,7 @@ def _is_sealed(file: BinaryIO) -> bool:
 
 
 def _require_as_shown(plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> None:
-    """Raise PolicyRefused where another command changed what becomes of a node; taken in meanwhile is fine."""
+    """Raise PolicyError where another command changed what becomes of a node; taken in meanwhile is fine."""
     if not isinstance(plan, handover_room.incoming.Imported):
         require_same(not isinstance(shown, handover_room.incoming.Imported) and plan.nodes == shown.nodes)
 
@@ -509,7 +509,7 @@ def receipt(app: App, file: Path) -> None:
     station = app.station()
     files = sorted(file.glob("*.receipt")) if file.is_dir() else [file]
     if not files:
-        raise NotFound(f"There is no receipt (*.receipt) in {file}.")
+        raise NotFoundError(f"There is no receipt (*.receipt) in {file}.")
     with station.lock("handover receipt", app.note):
         closed, failed = _close_all(app, station, files, go_on=file.is_dir())
     told = [_closed(one) for one in closed]
@@ -529,7 +529,7 @@ def _close_all(
             closed.append(handover_room.pending.close(station, octets))
         except TedsProvisionError as error:
             if not go_on and error.message == protocol.handover.jose.NO_COMPACT_JWS:
-                raise BadData(f"{path} is not a receipt.", hint="Use the file that import-keys wrote.") from error
+                raise BadDataError(f"{path} is not a receipt.", hint="Use the file that import-keys wrote.") from error
             if not go_on:
                 raise
             app.warn(f"{path.name}: {error.message}")

@@ -12,7 +12,7 @@ from teds_provision import handover, protocol
 from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, yes_option
-from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.files import read_limited, require_new, write_new
 from teds_provision.vault import agent
 
@@ -87,10 +87,10 @@ def _open_for(app: App) -> str:
 
 
 def _require_same(station: Station, name: str | None, keystore: str | None) -> None:
-    """Raise UsageFailure where there is a station already, and the command line asks for another one."""
+    """Raise UsageError where there is a station already, and the command line asks for another one."""
     for what, asked, has in (("name", name, station.name), ("keystore", keystore, station.identity.keystore)):
         if asked is not None and asked != has:
-            raise UsageFailure(
+            raise UsageError(
                 f"{station.home} already holds a station whose {what} is {has!r}. Nothing was changed.",
                 hint=f"Omit --{what} to show it, or choose another --home.",
             )

@@ -10,7 +10,7 @@ from teds_provision import handover, plant, steps, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
-from teds_provision.errors import LinkFailure, PolicyRefused
+from teds_provision.errors import LinkError, PolicyError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
             station.released(uuid, "reset"),
         ):
             return steps.agree.reset_node(station, node, steps.identify.identify(station, node))
-    except (LinkFailure, PolicyRefused) as error:
+    except (LinkError, PolicyError) as error:
         if not force and not app.interactive:
             error.hint = "Bring the node within reach, or add --force to record it as unconfirmed."
             raise

@@ -25,7 +25,7 @@ from teds_provision.cli.options import (
     examples,
 )
 from teds_provision.cli.rendering import local_time, moment, print_table
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import json_files
 from teds_provision.sanitize import printable
 
@@ -106,7 +106,7 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
     station = app.station()
     roster = plant.jobs.roster_of(station)
     if not roster.has(station.identity.fingerprint, "keeper"):
-        raise PolicyRefused("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
+        raise PolicyError("This station is not a keeper, so no station would accept its job.", hint="Ask a keeper.")
     drafted = _drafted(station, roster, told)
     if dry_run:  # what nobody would take is refused in a plan too
         protocol.plant.job.seal_job(drafted, protocol.keys.SoftwareKey.generate())
@@ -123,7 +123,7 @@ def new(app: App, /, output: Path | None, dry_run: bool, **told: Any) -> None:
 
 def _drafted(station: Station, roster: Roster, told: dict[str, Any]) -> Job:
     if (told["count"] is None) == (told["listed"] is None):
-        raise UsageFailure("A job needs a number of boards or a list of boards.", hint="Use one of --count and --list.")
+        raise UsageError("A job needs a number of boards or a list of boards.", hint="Use one of --count and --list.")
     path = teds.profile.load.find_profile(told["profile"], teds.profile.load.default_folders(station.home))
     teds.profile.load.load_profile(path, teds.profile.load.default_folders(station.home)).build(
         bytes(10)
@@ -161,7 +161,7 @@ def _boards(path: Path) -> dict[bytes, str]:
     listed = steps.whitelist.read_whitelist(path)
     for one in listed:
         if one.fingerprint is None or len(one.fingerprint) != 64:
-            raise BadData(f"{path}:{one.line}: a job needs the full fingerprint (64 digits) of each board.")
+            raise BadDataError(f"{path}:{one.line}: a job needs the full fingerprint (64 digits) of each board.")
     return {one.uuid: one.fingerprint or "" for one in listed}
 
 
@@ -169,7 +169,7 @@ def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
     given = [name for name in ("calibration", "calibrations", "calibration_age") if told[name] is not None]
     if len(given) > 1:
         named = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise UsageFailure("A job takes one calibration option.", hint=f"Use one of {named}.")
+        raise UsageError("A job takes one calibration option.", hint=f"Use one of {named}.")
     rule = protocol.plant.job.CalibrationRule
     if told["calibration"] is not None:
         return rule("one", plant.jobs.digest_of_file(told["calibration"]))
@@ -183,7 +183,7 @@ def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
             by_uuid[bytes.fromhex(path.stem)] = plant.jobs.digest_of_file(path)
     if not by_uuid or boards.keys() - by_uuid.keys():
         lacking = next(iter(boards.keys() - by_uuid.keys()), b"").hex() or "UUID"
-        raise NotFound(f"There is no calibration {lacking}.* in {told['calibrations']}.")
+        raise NotFoundError(f"There is no calibration {lacking}.* in {told['calibrations']}.")
     return rule("list", by_uuid=by_uuid)
 
 
@@ -192,7 +192,7 @@ def _allotments(roster: Roster, texts: Sequence[str], total: int) -> dict[str, i
     for text in texts:
         station, number = _allotment(roster, text, total)
         if station in allotted:
-            raise UsageFailure(
+            raise UsageError(
                 f"Station {roster.name_of(station)} is named twice.", hint="Give each station one allotment."
             )
         allotted[station] = number
@@ -203,23 +203,23 @@ def _allotment(roster: Roster, text: str, total: int) -> tuple[str, int]:
     name, _, number = text.rpartition("=") if "=" in text else (text, "", str(total))
     found = roster.named(name)
     if found is None or roster.member(found.fingerprint) is None:
-        raise NotFound(f"The roster has no member {name!r}.", hint="See: teds-provision registry status")
+        raise NotFoundError(f"The roster has no member {name!r}.", hint="See: teds-provision registry status")
     if not number.isdecimal() or not int(number) >= 1:
-        raise UsageFailure(f"{text!r}: an allotment must be 1 or more.")
+        raise UsageError(f"{text!r}: an allotment must be 1 or more.")
     return found.fingerprint, int(number)
 
 
 def _office(roster: Roster, name: str) -> str:
     found = roster.named(name)
     if found is None or not roster.has(found.fingerprint, "sign"):
-        raise NotFound(f"The roster has no member {name!r} with the role sign.", hint="See: registry status")
+        raise NotFoundError(f"The roster has no member {name!r} with the role sign.", hint="See: registry status")
     return found.fingerprint
 
 
 def _block(text: str) -> tuple[int, int]:
     channel, _, code = text.partition(":")
     if not (channel.isdecimal() and code.isdecimal() and int(channel) <= 255 and int(code) <= 255):
-        raise UsageFailure(f"{text!r} is not CHANNEL:CODE, like 1:5.")
+        raise UsageError(f"{text!r} is not CHANNEL:CODE, like 1:5.")
     return int(channel), int(code)
 
 
@@ -480,7 +480,7 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
     octets = read_file(file).strip()
     sealed = plant.office.answer(station, octets, jump=jump)
     if sealed is None:
-        raise NotAuthentic(
+        raise NotAuthenticError(
             f"{file} is not a request from a member of this plant to this office.",
             hint="To create one: teds-provision sign UUID --by OFFICE --output FILE",
         )
@@ -502,7 +502,7 @@ def _tell(app: App, station: Station, one: Answered, *, end: bool = False) -> No
         app.emit({**told, "sequence": answered.sequence}, f"signed   {request.uuid.hex()}  {answered.sequence}  {name}")
         return
     if end:
-        raise plant.asking.OfficeRefused(f"Not signed ({answered.refused}): {answered.why}.")
+        raise plant.asking.OfficeRefusedError(f"Not signed ({answered.refused}): {answered.why}.")
     refused = {**told, "refused": answered.refused, "why": answered.why}
     app.emit(refused, f"refused  {request.uuid.hex()}  {answered.refused}  {name}: {answered.why}")
 

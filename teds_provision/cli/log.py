@@ -19,7 +19,7 @@ from teds_provision import store, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, examples
 from teds_provision.cli.rendering import local_time, moment, print_json_list, shown
-from teds_provision.errors import StoreFailure, UsageFailure
+from teds_provision.errors import StoreError, UsageError
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize
 
@@ -63,7 +63,7 @@ def log(
     if an entry was changed, removed or added by hand.
     """
     if today and since is not None:
-        raise UsageFailure("--today and --since cannot be combined.", hint="Use one of them.")
+        raise UsageError("--today and --since cannot be combined.", hint="Use one of them.")
     station = app.station()
     audit_log = station.audit_log
     wanted = "today" if today else since
@@ -146,7 +146,7 @@ def _follow(app: App, station: Station, choice: Choice, verdict: AuditVerdict, a
 
 def _require_intact(verdict: AuditVerdict) -> None:
     if not verdict.intact:
-        raise StoreFailure(
+        raise StoreError(
             f"The audit log is not intact: {verdict.why}.",
             hint=f"Entries before {verdict.first_bad} are intact. Keep a copy, and find out who changed the file.",
         )

@@ -17,7 +17,7 @@ from teds_provision.cli.config_file import Defaults, anchored, config_path, read
 from teds_provision.cli.context import App, nowhere, say
 from teds_provision.cli.option_names import PARAMETERS
 from teds_provision.cli.table import COMMANDS, SECTIONS
-from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, TedsProvisionError
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
     try:
         place = config_path(home)
         values = read_config(place)
-    except BadData as error:
+    except BadDataError as error:
         ctx.meta[_BROKEN] = error
         return home
     if values is not None:
@@ -239,13 +239,13 @@ def _untold(arguments: list[str], error: OSError) -> int:
         name = str(error.filename)
         name = name if len(name) <= 100 else f"{name[:64]}…"
         told = f"{name!r} is not a valid file name: {error.strerror}."
-        return _fail(arguments, NotFound.exit_code, NotFound.code, told, "")
+        return _fail(arguments, NotFoundError.exit_code, NotFoundError.code, told, "")
     if error.errno not in _FULL:
         return _bug(arguments, error)
     nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
     told = f"Cannot write the result to stdout: {error.strerror}."
     if _wants(arguments, "--json"):
-        return _fail(arguments, StoreFailure.exit_code, StoreFailure.code, told, "")
+        return _fail(arguments, StoreError.exit_code, StoreError.code, told, "")
     _say(told)
     return 0
 

@@ -19,7 +19,7 @@ from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import ChannelNumber, FileToRead, Number, WholeNumber, command, link_options
 from teds_provision.cli.sample import ending, over_the_bus, where_met
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings, ble, can
 from teds_provision.store import KeptMeasurement
@@ -102,12 +102,12 @@ def measure(
         _recover(app, what[1:], output)
         return
     if click.get_current_context().get_parameter_source("output") is ParameterSource.COMMANDLINE:
-        raise UsageFailure("--output only works with `measure recover`.", hint="To record, use --to FILE.")
+        raise UsageError("--output only works with `measure recover`.", hint="To record, use --to FILE.")
     if wide:
         files = _wide(files)
     links = over_the_bus(links, streams=True)
     if mqtt is not None and not mqtt.startswith(("mqtt://", "mqtts://")):
-        raise UsageFailure(f"--mqtt {mqtt!r} is not a broker URL.", hint="Use mqtt://HOST or mqtts://USER@HOST.")
+        raise UsageError(f"--mqtt {mqtt!r} is not a broker URL.", hint="Use mqtt://HOST or mqtts://USER@HOST.")
     station = app.station()
     group, uuids = _who(station, what)
     links = where_met(station, links, uuids)
@@ -126,12 +126,12 @@ def measure(
 
 def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
     if not LINKS[links.via].capabilities.streams:
-        raise UsageFailure(
+        raise UsageError(
             "Streaming needs CAN or Bluetooth.",
             hint="Add --can or --ble. For one reading over NFC: teds-provision sample UUID",
         )
     if trigger and links.via == "ble":
-        raise UsageFailure("--trigger needs a CAN bus.", hint="Omit --trigger over Bluetooth.")
+        raise UsageError("--trigger needs a CAN bus.", hint="Omit --trigger over Bluetooth.")
 
 
 def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Mapping[str, Any]) -> KeptMeasurement:
@@ -159,12 +159,12 @@ def _wide(files: Sequence[str]) -> list[str]:
     """The words for files of text whose rows are one grid."""
     text = [Path(name).suffix.lower() in measure_room.sinks.TEXT for name in files]
     if not any(text):
-        raise UsageFailure("--wide only works with text files.", hint="Add --to FILE.csv")
+        raise UsageError("--wide only works with text files.", hint="Add --to FILE.csv")
     return [f"wide:{name}" if is_text else name for name, is_text in zip(files, text, strict=True)]
 
 
 def _requirements(file: Path | None) -> str:
-    """What the task needs of the datasheets, "" where no file says so; raises BadData where it says nothing useful."""
+    """What the task needs of the datasheets, "" if no file says so; raises BadDataError if it says nothing useful."""
     if file is None:
         return ""
     text = read_file(file).decode(errors="replace")
@@ -176,9 +176,7 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
     """The group's name ("" where nodes are named) and the UUIDs."""
     if len(what) == 1 and (group := station.groups.find(what[0])) is not None:
         if not group.uuids:
-            raise UsageFailure(
-                f"Group {group.name!r} has no nodes.", hint=f"Add one: group add {quote(group.name)} UUID"
-            )
+            raise UsageError(f"Group {group.name!r} has no nodes.", hint=f"Add one: group add {quote(group.name)} UUID")
         return group.name, list(group.uuids)
     return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
 
@@ -253,7 +251,7 @@ def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
 
 def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
     if len(files) != 1:
-        raise UsageFailure("Name exactly one recording.", hint="teds-provision measure recover FILE.mcap")
+        raise UsageError("Name exactly one recording.", hint="teds-provision measure recover FILE.mcap")
     done = measure_room.sinks.mcap.recover.recover(Path(files[0]), output)
     until = measure_room.sinks.lines.iso(done.until) if done.until is not None else None
     result: dict[str, Any] = {
@@ -271,10 +269,10 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
     app.conclude(result, text, error)
 
 
-def _damage(file: str, done: Recovered) -> BadData:
+def _damage(file: str, done: Recovered) -> BadDataError:
     named = [f"{one.what} at octet {one.offset} ({one.octets} octets)" for one in done.damaged[:MOST_NAMED]]
     more = len(done.damaged) - len(named)
-    return BadData(
+    return BadDataError(
         f"{file} is damaged inside: {', '.join(named)}{f' and {more} more' if more else ''}.",
         hint=f"The file is unchanged; everything else is in {done.output}. Check the disk.",
     )

@@ -10,7 +10,7 @@ import click
 from teds_provision import measure, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, dry_run_option, examples
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.station.measurements import STATION
 from teds_provision.station.shown_units import channel_profiles
 
@@ -55,7 +55,7 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
     uuid = _who(station, node)
     chosen = name.strip("/")
     if not measure.sinks.names.is_topic(chosen) or (not channel and "/" in chosen):
-        raise UsageFailure(
+        raise UsageError(
             f"{name!r} is not a valid topic name.",
             hint="Use letters, digits and single _, starting with a letter; / separates the parts of a channel's name.",
         )
@@ -106,7 +106,7 @@ def set_frame(app: App, node: str, channel: int, frame: str, *, dry_run: bool) -
     station = app.station()
     uuid = station.nodes.resolve(node)
     if frame and not measure.sinks.names.is_frame(frame):
-        raise UsageFailure(
+        raise UsageError(
             f"{frame!r} is not a valid frame.", hint="Use letters, digits, _ and /, starting with a letter."
         )
     _require_channel(station, uuid, channel)
@@ -125,7 +125,7 @@ def _require_channel(station: Station, uuid: bytes, channel: int) -> None:
     known = [number for key, number, _ in _channels(station) if key == uuid]
     if channel and (uuid == STATION or (known and channel not in known)):
         has = ", ".join(map(str, known)) or "none"
-        raise NotFound(f"{uuid.hex()} has no channel {channel}.", hint=f"Channels in its datasheet: {has}.")
+        raise NotFoundError(f"{uuid.hex()} has no channel {channel}.", hint=f"Channels in its datasheet: {has}.")
 
 
 def _change(app: App, station: Station, uuid: bytes, channel: int, name: str | None) -> None:

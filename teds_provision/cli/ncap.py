@@ -31,7 +31,7 @@ from teds_provision.cli.options import (
     tracing,
 )
 from teds_provision.cli.rendering import shown
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.lazy import how_to_install, late
 from teds_provision.store.records import iso
 
@@ -127,14 +127,14 @@ def run(
     """
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install("ncap"))
+        raise UsageError(f"ncap run needs {', '.join(missing)}.", hint=how_to_install("ncap"))
     if said_here("yes") and not wished["adopt"]:
-        raise UsageFailure("--yes requires --adopt.", hint="Add --adopt --detection transparent.")
+        raise UsageError("--yes requires --adopt.", hint="Add --adopt --detection transparent.")
     if said_here("unverified") and not wished["adopt"]:
-        raise UsageFailure("--unverified requires --adopt.", hint="Add --adopt --detection transparent.")
+        raise UsageError("--unverified requires --adopt.", hint="Add --adopt --detection transparent.")
     wished["unverified"] = wished["unverified"] and wished["adopt"]
     if wished["measure"] is None and not wished["unverified"] and (wished["rate"] is not None or wished["frozen"]):
-        raise UsageFailure("--rate and --frozen require --measure.", hint="Add --measure all.")
+        raise UsageError("--rate and --frozen require --measure.", hint="Add --measure all.")
     places = [f"{link}:{one}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for one in named]
     sinks = [name for name, asked in (("ros1", ros1), ("ros2", ros2), (mqtt or "", mqtt)) if asked]
     wanted = settings.Settings(

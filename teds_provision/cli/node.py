@@ -18,7 +18,7 @@ from teds_provision import teds as teds_room
 from teds_provision.cli.check import check
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.node import ble as ble_room
 from teds_provision.node import can as can_room
 from teds_provision.node import hardware as hardware_room
@@ -108,9 +108,7 @@ def create(
     With --teds or --profile, it has the channels of that datasheet and carries its TEDS unsigned.
     """
     if teds is not None and profile is not None:
-        raise UsageFailure(
-            "--teds and --profile cannot be combined.", hint="A node has one datasheet: use one of them."
-        )
+        raise UsageError("--teds and --profile cannot be combined.", hint="A node has one datasheet: use one of them.")
     made = node_room.described.create(
         folder,
         uuid=uuid,
@@ -251,16 +249,16 @@ def run(
 
 
 def _check_options(count: int, source: str, *, nfc: str | None, can: str | None, ble: str | None, **_: Any) -> None:
-    """Raise UsageFailure where the options do not go together."""
+    """Raise UsageError where the options do not go together."""
     if not nfc and not can and not ble:
-        raise UsageFailure(
+        raise UsageError(
             "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
         )
     alone = "--nfc" if nfc else "--ble" if ble else ""
     if not alone and node_room.sources.kind_of(source) in node_room.sources.ONE_NODE_ONLY:
         alone = f"--source {source}"
     if count > 1 and alone:
-        raise UsageFailure(f"{alone} supports one node only.", hint="Run the others in separate processes.")
+        raise UsageError(f"{alone} supports one node only.", hint="Run the others in separate processes.")
 
 
 def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:

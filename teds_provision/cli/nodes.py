@@ -17,7 +17,7 @@ from teds_provision import plant, steps, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import local_time, moment, print_json_list, print_table, shown
-from teds_provision.errors import BadData, NotFound, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.station.label import label_of, write_label
 from teds_provision.steps.inventory import PAGE, STATES, inventory, search
 
@@ -74,7 +74,7 @@ def nodes(
     seen = moment(since) if since is not None else None
     try:
         found = search(station, text, state=state, profile=profile, group=group, due=day, since=seen)
-    except NotFound:
+    except NotFoundError:
         found = _named_in_plant(station, text) if not any((state, profile, group, due, since)) else []
         if not found:
             raise
@@ -106,7 +106,7 @@ def _named_in_plant(station: Station, text: str | None) -> list[bytes]:
         return []
     uuid = plant.status.resolve(station, text)
     if not station.nodes.is_known(uuid):
-        raise NotFound(f"This station has not met node {uuid.hex()}.", hint=f"See: nodes --plant {uuid.hex()}")
+        raise NotFoundError(f"This station has not met node {uuid.hex()}.", hint=f"See: nodes --plant {uuid.hex()}")
     return [uuid]
 
 
@@ -309,8 +309,8 @@ def show_fits(app: App, station: Station, expression: str, uuids: list[bytes]) -
     """Tell for every channel of these nodes whether it meets ``expression``, and why not."""
     try:
         requirement = teds.fits.parse_fits(expression)
-    except BadData as error:
-        raise UsageFailure(f"--fits: {error.message}", hint=error.hint) from error
+    except BadDataError as error:
+        raise UsageError(f"--fits: {error.message}", hint=error.hint) from error
     found = [fit.to_json() for fit in steps.inventory.fits_of(station, [requirement], uuids, datetime.now(UTC))]
     app.emit({"fits": found}, lambda console: _fits_table(console, found))
 

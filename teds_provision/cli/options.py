@@ -13,7 +13,7 @@ import click
 from click.core import ParameterSource
 
 from teds_provision.cli.context import SOCKET, App
-from teds_provision.errors import NotFound, StoreFailure
+from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.files import require_no_pipe
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
@@ -81,12 +81,12 @@ class FileToRead(click.Path):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> str | bytes | os.PathLike[str]:
-        """Read a path; raises NotFound."""
+        """Read a path; raises NotFoundError."""
         path = super().convert(value, param, ctx)
         if os.path.isdir(path):
-            raise NotFound(f"{os.fsdecode(path)} is a folder, not a file.")
+            raise NotFoundError(f"{os.fsdecode(path)} is a folder, not a file.")
         if self._must_exist and not os.path.exists(path):
-            raise NotFound(f"There is no file {os.fsdecode(path)}.")
+            raise NotFoundError(f"There is no file {os.fsdecode(path)}.")
         require_no_pipe(Path(os.fsdecode(path)))
         return path
 
@@ -240,7 +240,7 @@ def dry_run_option(function: Function) -> Function:
 def tracing(path: Path | None) -> Iterator[Trace | None]:
     """Give the trace that ``path`` names, None for none. A command whose trace is not whole, and all else well, is 7.
 
-    Raises UsageFailure where the file is there already, NotFound without its folder, StoreFailure.
+    Raises UsageError where the file is there already, NotFoundError without its folder, StoreError.
     """
     if path is None:
         yield None
@@ -254,4 +254,4 @@ def tracing(path: Path | None) -> Iterator[Trace | None]:
         raise
     trace.close()
     if trace.failure:  # it was told when it happened, and the result stands on stdout already
-        raise click.exceptions.Exit(StoreFailure.exit_code)
+        raise click.exceptions.Exit(StoreError.exit_code)

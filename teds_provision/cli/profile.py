@@ -13,7 +13,7 @@ from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, command, dry_run_option, examples
 from teds_provision.cli.rendering import print_table
-from teds_provision.errors import BadData, StoreFailure, UsageFailure
+from teds_provision.errors import BadDataError, StoreError, UsageError
 from teds_provision.files import SHARED, holds, write_new
 from teds_provision.teds.formats.mapped import profile_from_xml
 from teds_provision.teds.profile import check as check_profile
@@ -160,7 +160,7 @@ def check(app: App, names: tuple[str, ...]) -> None:
             app.note(f"{problem.severity}: {problem}")  # not with --json, where they stand in the object
     if errors:
         more = f" ({len(errors) - 1} more, listed above)" if len(errors) > 1 and not app.json else ""
-        raise BadData(f"{errors[0]}{more}")
+        raise BadDataError(f"{errors[0]}{more}")
     good = ", ".join(entry["name"] for entry in told)
     app.emit({"profiles": told}, _plain(f"{good}: no mistakes found."))
 
@@ -210,12 +210,12 @@ def new(
     import re
 
     if not re.fullmatch(r"[a-z0-9][a-z0-9._-]{0,63}", name):
-        raise UsageFailure(
+        raise UsageError(
             f'"{name}" is not a valid profile name.',
             hint="Use lower-case letters, digits and dashes, like wrist-torque.",
         )
     if (source is None) != (mapping is None) or (source is not None and extends is not None):
-        raise UsageFailure("--from needs --map, and no --extends.", hint="The mapping may say extends under [values].")
+        raise UsageError("--from needs --map, and no --extends.", hint="The mapping may say extends under [values].")
     text = template(name)
     if source is not None and mapping is not None:
         rules = read_file(mapping).decode(errors="replace")
@@ -232,9 +232,7 @@ def new(
     path = output or folder / f"{name}.toml"
     done = holds(path, text.encode())
     if path.exists() and not done:
-        raise UsageFailure(
-            f"{path} already exists with different content.", hint="Choose another name, or use --output."
-        )
+        raise UsageError(f"{path} already exists with different content.", hint="Choose another name, or use --output.")
     if dry_run:
         app.emit({"profiles": [{"name": name, "file": str(path)}], "text": text}, _plain(text.rstrip("\n")))
         return
@@ -243,7 +241,7 @@ def new(
             try:
                 path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             except OSError as error:
-                raise StoreFailure(f"Cannot create {path.parent}: {error.strerror}.") from error
+                raise StoreError(f"Cannot create {path.parent}: {error.strerror}.") from error
         write_new(path, text.encode("utf-8"), mode=SHARED)
     said = _plain(f"{path} {'already exists' if done else 'written'}.")
     app.emit({"profiles": [{"name": name, "file": str(path)}]}, said)

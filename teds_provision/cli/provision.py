@@ -21,7 +21,7 @@ from teds_provision.cli.build import order_options
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, said_here, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
-from teds_provision.errors import NotWhitelisted, TedsProvisionError, UsageFailure
+from teds_provision.errors import NotWhitelistedError, TedsProvisionError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import sanitize
 from teds_provision.talk.progress import Reporter, StepResult
@@ -136,7 +136,7 @@ def provision(
     """
     order = replace(order, adopt=adopt and bool(said_here("adopt")))  # a setting of that name is meant for ncap run
     if order.adopt and (batch is not None or job is not None):
-        raise UsageFailure("The sheet or job already defines what each board gets.", hint="Drop --adopt.")
+        raise UsageError("The sheet or job already defines what each board gets.", hint="Drop --adopt.")
     request = steps_room.batch.ProvisionRequest(uuid, order, watch, everything, batch, report, operator or "")
     several = everything or len(links.places) > 1
     reporter = BoardReporter(reporter_for(app, several=several))
@@ -157,7 +157,7 @@ def provision(
             line.office = office = plant.asking.PostOffice(base, post, links.timeout)
             app.closing(office.close)
     elif any((calibrations, operator and report is None, files, only, label_to, scan)):
-        raise UsageFailure(
+        raise UsageError(
             "--calibrations, --operator, --files, --only, --label-to and --scan require a job.",
             hint="Add --job FILE, or --evidence.",
         )
@@ -179,14 +179,14 @@ def provision(
 
 
 def _check_line(request: ProvisionRequest, job: str | None, only: str | None) -> None:
-    """Raise UsageFailure where a job is named beside what a job says itself."""
+    """Raise UsageError where a job is named beside what a job says itself."""
     order = request.order
     if only is not None and job is None:
-        raise UsageFailure("--only verify requires --job.", hint="Add --job FILE.")
+        raise UsageError("--only verify requires --job.", hint="Add --job FILE.")
     if request.sheet is not None:
-        raise UsageFailure("--batch cannot be combined with --job or --evidence.", hint="Drop --batch.")
+        raise UsageError("--batch cannot be combined with --job or --evidence.", hint="Drop --batch.")
     if job is not None and not (order.names_nothing and order.accept_calibration is None and not order.retype):
-        raise UsageFailure(
+        raise UsageError(
             "The job already defines what each board gets.", hint="Drop --profile, --calibration, --name and --retype."
         )
 
@@ -194,12 +194,12 @@ def _check_line(request: ProvisionRequest, job: str | None, only: str | None) ->
 def _one(app: App, boards: Boards, questions: Questions) -> None:
     try:
         done = boards.one(questions)
-    except steps_room.build.NotNamed as error:
+    except steps_room.build.UnrequestedChangeError as error:
         # With --json the changes stand beside the error, so that whoever asked can name them.
         changes = [change.text for change in error.changes]
         app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
         return
-    except steps_room.adopting.NotAdopted as error:
+    except steps_room.adopting.NotAdoptedError as error:
         _show_brought(app, error.brought)
         app.conclude({"findings": error.brought.findings}, None, error)
         return
@@ -245,7 +245,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
         if (yes and strangers) or (who.uuid, who.fingerprint) in accepted:
             return
         if not app.interactive:
-            raise NotWhitelisted(
+            raise NotWhitelistedError(
                 f"Node {who.uuid.hex()} is not on the whitelist, and there is no terminal to ask on.",
                 hint=f"Add --yes, or: teds-provision whitelist add {who.uuid.hex()} --fingerprint {who.fingerprint}",
             )
@@ -254,7 +254,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
                 f"Node {who.uuid.hex()}, key {who.fingerprint[:32]}\nTrust this board and add it to the whitelist?",
                 who.fingerprint,
             ):
-                raise steps_room.batch_sheet.Declined(
+                raise steps_room.batch_sheet.DeclinedError(
                     f"Cancelled. Node {who.uuid.hex()} was not whitelisted; nothing was changed."
                 )
         accepted.add((who.uuid, who.fingerprint))
@@ -269,7 +269,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
             if len(changes) > _CHANGES_SHOWN:
                 app.note(f"  and {len(changes) - _CHANGES_SHOWN} more")
             if not app.ask("Write it?"):
-                raise steps_room.batch_sheet.Declined(f"Cancelled. Node {uuid.hex()} keeps its datasheet.")
+                raise steps_room.batch_sheet.DeclinedError(f"Cancelled. Node {uuid.hex()} keeps its datasheet.")
 
     def low(question: str) -> None:
         with turn:
@@ -278,7 +278,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
     def take_over(question: str) -> None:
         with turn:  # whatever --yes says: it locks another station out, and no option of this command names that
             if not app.ask(question):
-                raise steps_room.batch_sheet.Declined("Cancelled. The node keeps its key; nothing was changed.")
+                raise steps_room.batch_sheet.DeclinedError("Cancelled. The node keeps its key; nothing was changed.")
 
     asked = app.interactive
     retype = app.asks_retype(yes=yes or several)
@@ -291,7 +291,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
             if yes:
                 return
             if not app.ask("Sign this datasheet, and put the node in service?"):
-                raise steps_room.batch_sheet.Declined("Cancelled. The board's datasheet was not signed.")
+                raise steps_room.batch_sheet.DeclinedError("Cancelled. The board's datasheet was not signed.")
 
     return steps_room.batch.Questions(
         accept, confirm if asked else None, low, take_over if asked else None, retype, adopt
@@ -381,7 +381,7 @@ def _tell_board(app: App, board: BoardResult, **line: Any) -> None:
         of: dict[str, object] = {"uuid": board.uuid.hex(), "time": board.time, "row": board.row}
         if app.json:
             of |= {"seconds": round(board.seconds, 3), **line}
-            if isinstance(board.error, steps_room.build.NotNamed):
+            if isinstance(board.error, steps_room.build.UnrequestedChangeError):
                 of["changes"] = [change.text for change in board.error.changes]
         app.fail_line(board.error, **of)
 

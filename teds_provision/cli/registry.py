@@ -24,7 +24,7 @@ from teds_provision.cli.options import (
     yes_option,
 )
 from teds_provision.cli.rendering import local_time, moment, print_json_list
-from teds_provision.errors import NotFound, PolicyRefused
+from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.files import SHARED, write_new
 from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize
@@ -108,7 +108,7 @@ def _emit_change(
     with station.lock("registry", app.note):
         held = station.plant.roster
         if held is None or draft.previous != held.hash:  # two rosters of one version would be an alarm everywhere
-            raise PolicyRefused("Another command changed the roster in the meantime.", hint="Run this again.")
+            raise PolicyError("Another command changed the roster in the meantime.", hint="Run this again.")
         signed = plant.owner.signed(station, draft)
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
@@ -414,7 +414,7 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
     joined = station.plant.joined
     same = joined is not None and joined.registry == found.registry
     if joined is not None and not same:
-        raise PolicyRefused(
+        raise PolicyError(
             f"This station already belongs to registry {joined.registry}.", hint="Leave it first: registry disconnect"
         )
     past = [] if same else list(plant.backlog.backlog(station))
@@ -469,7 +469,7 @@ def _post(station: Station, files: Path | None) -> tuple[Post, bool]:
         return named, joined is not None and joined.where == str(files.resolve())
     if joined is None:
         plant.folding.require_roster(station)
-        raise NotFound(
+        raise NotFoundError(
             "This station does not know how to reach the registry.", hint="Name a folder: registry sync --files DIR"
         )
     return joined, True
@@ -638,7 +638,7 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
     if name is not None:
         found = held.named(name)
         if found is None:
-            raise NotFound(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
+            raise NotFoundError(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
         of = found.fingerprint
     uuid = None if node is None else plant.status.resolve(station, node)
     said = plant.status.log(station, uuid=uuid, of=of, since=moment(since) if since else None)
@@ -787,7 +787,7 @@ def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str]
         asked = document.open_request(read_file(member))
         left = held.removed_one(asked.fingerprint)
         if left is not None:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"{left.name} was removed from {held.name} ({left.why}); its login stays closed.",
                 hint="A removed key cannot return: create a new station (init), and add that one.",
             )
@@ -808,7 +808,7 @@ def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str]
 def _of_roster(held: Roster, name: str) -> str:
     found = held.named(name)
     if found is None:
-        raise NotFound(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
+        raise NotFoundError(f"{name!r} is not in the roster.", hint="See: teds-provision registry status")
     return found.fingerprint
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.sanitize import sanitize
 from teds_provision.talk.progress import NOTHING, Reporter, Silent, StepResult
 
@@ -210,15 +210,15 @@ _UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks
 
 
 def duration(text: str) -> float:
-    """Seconds of a time span as people give it: ``90s``, ``15m``, ``2h``; raises UsageFailure."""
+    """Seconds of a time span as people give it: ``90s``, ``15m``, ``2h``; raises UsageError."""
     found = re.fullmatch(r"(\d{1,6})\s*([smhdw])", text.strip().lower())
     if found is None:
-        raise UsageFailure(f"{text!r} is not a valid time span.", hint="Use 90s, 15m or 2h.")
+        raise UsageError(f"{text!r} is not a valid time span.", hint="Use 90s, 15m or 2h.")
     return timedelta(**{_UNITS[found[2]]: int(found[1])}).total_seconds()
 
 
 def moment(text: str, now: datetime | None = None) -> str:
-    """Return a moment in UTC as the store writes it (``2026-01-31T12:00:00Z``); raises UsageFailure.
+    """Return a moment in UTC as the store writes it (``2026-01-31T12:00:00Z``); raises UsageError.
 
     A time without an offset is local; a date alone, and ``today``, mean its first moment there.
     """
@@ -234,6 +234,6 @@ def moment(text: str, now: datetime | None = None) -> str:
             found = datetime.fromisoformat(text.strip())
         return found.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError) as error:
-        raise UsageFailure(
+        raise UsageError(
             f"{text!r} is not a valid time.", hint="Use 2026-01-31, 2026-01-31T12:00, today, or a time ago: 2h, 3d."
         ) from error

@@ -17,7 +17,7 @@ from teds_provision import measure, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import ChannelNumber, Number, WholeNumber, command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
-from teds_provision.errors import LinkFailure, NodeRefused, UsageFailure
+from teds_provision.errors import LinkError, NodeRefusedError, UsageError
 from teds_provision.links import LinkSettings
 from teds_provision.protocol import operation
 
@@ -71,7 +71,7 @@ def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *
     with talk.meeting.meet(station, over_the_bus(links), uuid, reporter, before=lambda: station.unlock(uuid)) as node:
         try:
             yield measure.trusting.open_trusted(station, node, by=by)
-        except talk.conversation.SessionLost as lost:
+        except talk.conversation.SessionLostError as lost:
             raise lost.cause from lost
 
 
@@ -128,7 +128,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
         found = measure.trusting.operation(trusted.node)
         try:
             power = operation.commands.Power.decode(trusted.node.send(operation.commands.POWER, "to tell its power"))
-        except NodeRefused:
+        except NodeRefusedError:
             power = None
         names = {one.number: one.name for one in trusted.sheet.channels}
     result = {
@@ -209,7 +209,7 @@ def set_value(
     docs/actuators.md.
     """
     if not math.isfinite(value):
-        raise UsageFailure("VALUE is not a finite number.")
+        raise UsageError("VALUE is not a finite number.")
     station = app.station()
     uuid = station.nodes.resolve(node)
     measure.standing.require_whitelisted(station, uuid)
@@ -240,7 +240,7 @@ def set_value(
                     break
     station.audit("set", uuid, "done", channel=channel, safe=actuator.safe)
     if actuator.safe is None:
-        raise LinkFailure(
+        raise LinkError(
             "The node did not confirm that its actuator is in its safe state.",
             hint="Its dead-man timer brings it there. To check: teds-provision mode UUID",
         )
@@ -250,7 +250,7 @@ def set_value(
 def _require_unit(app: App, channel: Channel, value: float, unit: str | None) -> None:
     """Refuse a bare number of a person where the unit that this channel is shown in is not SI: 45 would be radians."""
     if unit is None and app.interactive and channel.shown.text != channel.si_unit:
-        raise UsageFailure(
+        raise UsageError(
             f"Without --unit, {value:g} means {value:g} {channel.si_unit}, but channel {channel.number} is shown in "
             f"{channel.shown.text}.",
             hint=f"Add --unit {channel.shown.text} or --unit {channel.si_unit}.",

@@ -17,7 +17,7 @@ from teds_provision import teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import command
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import open_to_read
 from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
@@ -43,7 +43,7 @@ else:
     markup, rich_table = late("rich.markup"), late("rich.table")
 
 CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
-_BAD_DATA = BadData.exit_code
+_BAD_DATA = BadDataError.exit_code
 _POLICY = 6
 
 
@@ -81,18 +81,18 @@ def show(
     plain = form in {"table", "json"}
     if diff is not None:
         if files or plot or not plain:
-            raise UsageFailure("--diff compares two files and cannot be combined with anything else.")
+            raise UsageError("--diff compares two files and cannot be combined with anything else.")
         _diff(app, *diff, as_json=form == "json")
         return
     if not files:
-        raise UsageFailure("No file given.", hint="Name a file, or - for standard input.")
+        raise UsageError("No file given.", hint="Name a file, or - for standard input.")
     if app.json and not plain:
-        raise UsageFailure("--json and --format cannot be combined.", hint="Omit one of them.")
+        raise UsageError("--json and --format cannot be combined.", hint="Omit one of them.")
     wanted = cast("Edition", int(edition)) if edition else None
     shown = [load(name, wanted) for name in files]
     if plot is not None:
         if len(shown) != 1:
-            raise UsageFailure("--plot works with one file.", hint="Run show once per file.")
+            raise UsageError("--plot works with one file.", hint="Run show once per file.")
         channels = teds.plot.plot_blocks(placed(shown[0].blocks), plot)
         app.note(f"Plotted in {plot}: channel {', '.join(map(str, channels))}.")
     _tell(app, shown, form)
@@ -118,7 +118,7 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
 def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
     for file in files:
         if file.bundle is not None:
-            raise BadData(f"{file.name} contains no TEDS that could be written as {form}.")
+            raise BadDataError(f"{file.name} contains no TEDS that could be written as {form}.")
         for finding in chain.from_iterable(file.conversions.values()):
             if finding.severity == "error":
                 app.warn(f"{file.name}: {finding.message}")
@@ -128,7 +128,7 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
 def _write(app: App, blocks: Sequence[TedsBlock], form: Format) -> None:
     written = teds.formats.write_blocks(blocks, form)
     if isinstance(written, bytes) and sys.stdout.isatty():
-        raise UsageFailure(
+        raise UsageError(
             "Binary output cannot go to a terminal.", hint="Redirect it to a file: … --format binary > FILE"
         )
     for sentence in teds.formats.lost(blocks, form):
@@ -317,7 +317,10 @@ class ShownFile:
 
 
 def read_file(name: str) -> bytes:
-    """Octets of a file or, for ``-``, of standard input; raises NotFound and, for more than 32 MiB, BadData."""
+    """Octets of a file or, for ``-``, of standard input.
+
+    Raises NotFoundError and, for more than 32 MiB, BadDataError.
+    """
     if name != STDIN:
         with open_to_read(Path(name)) as file:
             octets = file.read(LIMITS.teds_file + 1)
@@ -326,7 +329,7 @@ def read_file(name: str) -> bytes:
         raise _no_teds(name, octets, f"it has more than {LIMITS.teds_file >> 20} MiB")
     octets = sys.stdin.buffer.read(LIMITS.teds_file + 1)
     if len(octets) > LIMITS.teds_file:
-        raise BadData(f"Standard input gives more than {LIMITS.teds_file >> 20} MiB; no file of TEDS has.")
+        raise BadDataError(f"Standard input gives more than {LIMITS.teds_file >> 20} MiB; no file of TEDS has.")
     return octets
 
 
@@ -344,10 +347,10 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
         if kind == "bundle":
             return ShownFile(name, kind, bundle=handover.bundle.peek_bundle(octets))
         blocks = read_blocks(octets, kind, path=Path(name) if name != STDIN else None)
-    except BadData as error:
+    except BadDataError as error:
         raise _of_file(name, kind, error) from error
     if not blocks:
-        raise BadData(f"{name} holds no TEDS.")
+        raise BadDataError(f"{name} holds no TEDS.")
     if len(blocks) == 1 and is_message(blocks[0].octets):
         return ShownFile(name, kind, message=decode_message(blocks[0].octets))
     return _described(name, kind, blocks, edition)
@@ -365,28 +368,28 @@ def _long_bundle(name: str) -> BundleHeader | None:
             return None
         try:
             return handover.bundle.peek_bundle(file)
-        except BadData:
+        except BadDataError:
             return None
 
 
-def _no_teds(name: str, octets: bytes, why: str) -> BadData:
+def _no_teds(name: str, octets: bytes, why: str) -> BadDataError:
     """The error for a file of another kind: what it is, and which command reads it, where its first octets tell."""
     for head, (what, reader) in _OTHERS.items():
         if octets.startswith(head):
-            return BadData(f"{name} holds no TEDS: it is {what}.", hint=f"Read it with: {reader.format(name)}")
-    return BadData(f"{name} holds no TEDS: {why}.")
+            return BadDataError(f"{name} holds no TEDS: it is {what}.", hint=f"Read it with: {reader.format(name)}")
+    return BadDataError(f"{name} holds no TEDS: {why}.")
 
 
-def _of_file(name: str, kind: Kind | None, error: BadData) -> BadData:
+def _of_file(name: str, kind: Kind | None, error: BadDataError) -> BadDataError:
     """What is wrong with a file, with its name before it."""
     if kind == "hex" and "Line 1 holds" in error.message:  # whatever is text and nothing else is taken for hex
-        return BadData(
+        return BadDataError(
             f"{name} holds no TEDS: it is neither binary nor hex (read as hex: {error.message[:1].lower()}"
             f"{error.message[1:].rstrip('.')}).",
             hint="TEDS come as binary, hex, Intel HEX, JSON, XML, an image, a profile or a bundle.",
         )
     named = error.message.startswith((f"{name}:", f"{name} "))
-    return BadData(error.message if named else f"{name}: {error.message}", hint=error.hint)
+    return BadDataError(error.message if named else f"{name}: {error.message}", hint=error.hint)
 
 
 def _described(name: str, kind: Kind, blocks: Sequence[TedsBlock], edition: Edition | None) -> ShownFile:
@@ -436,7 +439,7 @@ def _converted(blocks: Sequence[TedsBlock], edition: Edition) -> tuple[list[Teds
         decoded: Decoded = decode(block.octets)
         try:
             octets, findings = convert(decoded, edition)
-        except BadData as error:
+        except BadDataError as error:
             octets, findings = block.octets, [Finding("error", "not-converted", error.message)]
         out.append(block._replace(octets=octets))
         said[number] = tuple(findings)

@@ -11,7 +11,7 @@ import click
 from teds_provision import client, doctor, measure, steps
 from teds_provision.cli.context import SOCKET, App
 from teds_provision.cli.rendering import count_of, print_table, shown
-from teds_provision.errors import LinkFailure, NotFound, TedsProvisionError
+from teds_provision.errors import LinkError, NotFoundError, TedsProvisionError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def start(app: App, ctx: click.Context) -> None:
     """Show one screen: the station, its links and who answers there, what is wrong, and what to run next."""
     try:
         station = app.station()
-    except NotFound:
+    except NotFoundError:
         found: dict[str, Any] = {
             "station": None,
             "links": [_link(each) for each in measure.present.readers()],
@@ -106,7 +106,7 @@ def _of_service(app: App, station: Station) -> dict[str, Any] | None:
     try:
         with client.connect(home=app.home, timeout=5) as running:
             status, nodes = running.status(), running.nodes()
-    except (LinkFailure, OSError, TedsProvisionError):
+    except (LinkError, OSError, TedsProvisionError):
         return None
     here = [node for node in nodes if node["present"]]
     return {

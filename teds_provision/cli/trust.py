@@ -18,7 +18,7 @@ from teds_provision.cli.options import (
     yes_option,
 )
 from teds_provision.cli.rendering import count_of
-from teds_provision.errors import OtherKey
+from teds_provision.errors import KeyMismatchError
 from teds_provision.files import holds, read_limited, write_new
 from teds_provision.protocol.fingerprints import same_key
 
@@ -113,7 +113,7 @@ def _candidates(
         raise click.UsageError("Give NAME and FILE, or --from DIR.")
     found = handover.trust.candidate(station, name, file, role)
     if fingerprint is not None and not same_key(fingerprint, found.record.fingerprint):
-        raise OtherKey(
+        raise KeyMismatchError(
             f"{file} holds the key {found.record.fingerprint[:32]}, not {fingerprint[:32]}.",
             hint="Nothing was changed. Compare it with its owner again.",
         )

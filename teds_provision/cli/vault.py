@@ -10,7 +10,7 @@ from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, yes_option
 from teds_provision.cli.rendering import duration, local_time
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.vault import agent
 
 
@@ -114,7 +114,7 @@ def unlock(app: App, span: str) -> None:
     """
     seconds = duration(span)
     if not 1 <= seconds <= agent.MOST_SECONDS:
-        raise UsageFailure(f"The vault can stay unlocked for 1 s to {agent.MOST_SECONDS // 3600} h, not {span}.")
+        raise UsageError(f"The vault can stay unlocked for 1 s to {agent.MOST_SECONDS // 3600} h, not {span}.")
     station = app.station()
     kind = station.identity.keystore.partition(":")[0]
     if kind not in agent.KINDS:
@@ -133,7 +133,7 @@ def unlock(app: App, span: str) -> None:
     opened = station.vault
     opener = opened.opener() or said.encode()
     if not opener:
-        raise UsageFailure("The token has its own PIN pad, so there is nothing to keep in memory.")
+        raise UsageError("The token has its own PIN pad, so there is nothing to keep in memory.")
     with station.lock("unlock", app.note):
         opened.refresh()  # an old passphrase is not held, and an old PIN costs no try
         agent.start(app.home, kind, opener, int(seconds))

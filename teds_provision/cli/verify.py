@@ -12,7 +12,7 @@ from teds_provision import steps
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.files import json_files
 from teds_provision.links import LinkSettings
 from teds_provision.sanitize import printable
@@ -47,7 +47,7 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
     node = len(what) == 1 and bool(said_here("via", "nfc", "can", "ble"))
     if not node and are_files(what):
         if accept_calibration is not None:
-            raise UsageFailure("--accept-calibration applies to a single image.", hint="Verify that image by itself.")
+            raise UsageError("--accept-calibration applies to a single image.", hint="Verify that image by itself.")
         verify_many(app, what)
         return
     done = steps.commands.verify_at(

@@ -14,7 +14,7 @@ from teds_provision.cli.build import write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.cli.rendering import local_time, print_json_list, shown
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFoundError
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.label import read_label
 
@@ -77,7 +77,7 @@ def _meant(station: Station, uuid: str) -> bytes:
     """The UUID, or the one that stands for an EUI-64 of which no node is known by its first digits."""
     try:
         return plant.status.resolve(station, uuid)
-    except NotFound:
+    except NotFoundError:
         by_rule = steps.whitelist.uuid_of_eui64(uuid)
         if by_rule == uuid:
             raise

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from teds_provision import plant
 from teds_provision.demo.story import PROFILE, Demo, make_node, new_station, run_node
-from teds_provision.errors import LinkFailure, PolicyRefused
+from teds_provision.errors import LinkError, PolicyError
 from teds_provision.handover import trust
 from teds_provision.plant.evidence import export
 from teds_provision.plant.jobs import digest_of_file, take_job
@@ -29,7 +29,7 @@ from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import Role
 from teds_provision.protocol.plant.signing import SignRequest
 from teds_provision.station.station import Station
-from teds_provision.steps.board_type import WrongBoard
+from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.provision import Provisioned, inspect, provision
 from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
@@ -85,9 +85,9 @@ def _run(demo: Demo) -> LineDone:
         with demo.steps.step(f"board {name}") as step, run_node(folders[name], "--nfc", demo.nfc) as uuid:
             try:
                 step.detail = f"unit {_build(demo, line, uuid)} of {BOARDS}"
-            except PolicyRefused as error:
+            except PolicyError as error:
                 step.detail = error.message
-                refused.append("wrong-board" if isinstance(error, WrongBoard) else "one too many")
+                refused.append("wrong-board" if isinstance(error, WrongBoardError) else "one too many")
     demo.say("Then somebody changes a TEDS in board two's flash. The office tests boards one and two.")
     _tamper(folders["two"])
     tests = LineRun(office, line.job, only_verify=True)
@@ -181,6 +181,6 @@ def _proof(demo: Demo, office: Station, bench: Station) -> EvidenceTotals:
             for path in export(station.plant.line, rows, demo.folder / "evidence" / station.name):
                 totals.add(judge_file(Grounds(office.ca, roster=plant.jobs.roster_of(office)), path))
         if totals.exit_code:
-            raise LinkFailure(f"The demo's evidence is not valid: {totals.words}")
+            raise LinkError(f"The demo's evidence is not valid: {totals.words}")
         step.detail = f"{totals.files} files valid: " + ", ".join(f"{n} {word}" for word, n in totals.words.items())
     return totals

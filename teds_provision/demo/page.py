@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from teds_provision import client, vault
-from teds_provision.errors import LinkFailure, TedsProvisionError
+from teds_provision.errors import LinkError, TedsProvisionError
 from teds_provision.links.ports import free_port
 from teds_provision.station.station import initialise
 
@@ -85,7 +85,7 @@ def _measured(api: client.Client) -> None:
 
     while not all(map(authentic, uuids)):
         if time.monotonic() > until:
-            raise LinkFailure(f"The virtual transducers were not ready within {_READY:.0f} s.", hint="Try again.")
+            raise LinkError(f"The virtual transducers were not ready within {_READY:.0f} s.", hint="Try again.")
         time.sleep(0.2)
     api.request("POST", "/groups", {"name": GROUP, "uuids": uuids})
     api.measure(group=GROUP, rate=RATE)

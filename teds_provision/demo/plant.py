@@ -19,7 +19,7 @@ from typing import Any, Final
 from teds_provision import plant, vault
 from teds_provision.demo import cluster
 from teds_provision.demo.story import PROFILE, Demo, _node, provision_over
-from teds_provision.errors import NotAuthentic
+from teds_provision.errors import NotAuthenticError
 from teds_provision.handover import trust
 from teds_provision.links.ports import free_port
 from teds_provision.plant.post import Post
@@ -106,7 +106,7 @@ class _Story:
             step.detail = "the thief signs and writes another datasheet with west's key"
         after = self._verdict("verify")
         if (before, after) != ("authentic", "not authentic"):
-            raise NotAuthentic(f"South found the board {before} before the theft and {after} after it.")
+            raise NotAuthenticError(f"South found the board {before} before the theft and {after} after it.")
         by = "files" if self.server is None else "postgresql"
         return PlantDone(tuple(demo.steps.done), by, before, after, time.monotonic() - began)
 

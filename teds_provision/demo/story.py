@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from teds_provision import steps as steps_room
 from teds_provision import vault
-from teds_provision.errors import LinkFailure, NotAuthentic, PolicyRefused
+from teds_provision.errors import LinkError, NotAuthenticError, PolicyError
 from teds_provision.handover.incoming import Imported, Proven, import_bundle, plan_import, prove_nodes
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
@@ -97,7 +97,7 @@ def verify_from(demo: Demo, station: Station, what: str) -> None:
             held = require_session(station, node)
             verified = verify_node(station, node, read_image(node), who.point).verified
         if verified.verdict != "authentic":
-            raise NotAuthentic(f"The demo's node is {verified.verdict} as seen from {station.name}.")
+            raise NotAuthenticError(f"The demo's node is {verified.verdict} as seen from {station.name}.")
         step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
 
 
@@ -119,10 +119,10 @@ def hand_over(demo: Demo, first: Station, second: Station) -> None:
     with demo.steps.step("refuse") as step:
         try:
             first.policy.require_whitelisted(demo.uuid)
-        except PolicyRefused as refused:
+        except PolicyError as refused:
             step.detail = refused.message
         else:
-            raise LinkFailure("The demo's first station still uses a key that it gave away.")
+            raise LinkError("The demo's first station still uses a key that it gave away.")
 
 
 def _send(demo: Demo, sender: Station, receiver: Station, mode: Literal["copy", "move"]) -> None:
@@ -136,7 +136,7 @@ def _send(demo: Demo, sender: Station, receiver: Station, mode: Literal["copy", 
         taken = planned if isinstance(planned, Imported) else import_bundle(receiver, planned)
         outcome = prove_nodes(receiver, demo.over("can"), taken.uuids, demo.reporter)[0]
         if not isinstance(outcome, Proven):
-            raise LinkFailure(f"The node was not reached after the import: {outcome.why}")
+            raise LinkError(f"The node was not reached after the import: {outcome.why}")
         rotated = ", key rotated, the sender is locked out" if outcome.rotated else ""
         step.detail = f"proven in a session{rotated}"
     with demo.steps.step("receipt") as step:
@@ -231,7 +231,7 @@ def move_gripper(demo: Demo, station: Station, uuid: bytes) -> None:
                 time.sleep(min(hand.pause, _HALF_WAY))
                 hand.apply(OPENING)
             if not hand.safe:
-                raise LinkFailure("The demo's gripper is not in its safe state.")
+                raise LinkError("The demo's gripper is not in its safe state.")
         step.detail = f"hand: opening {applied.value:.4g} {applied.unit}, then back to its safe state"
 
 
@@ -326,7 +326,7 @@ _NODE_COMMAND = (sys.executable, "-m", "teds_provision", "--json", "node")
 
 
 def make_node(demo: Demo, name: str, profile: str) -> Path:
-    """Make a virtual transducer that describes itself as this profile; its folder. Raises LinkFailure."""
+    """Make a virtual transducer that describes itself as this profile; its folder. Raises LinkError."""
     folder = demo.folder / f"{name}-flash"
     words = [*_NODE_COMMAND, "create", str(folder), "--profile", profile]
     made = subprocess.run(words, capture_output=True, text=True, check=False)
@@ -337,7 +337,7 @@ def make_node(demo: Demo, name: str, profile: str) -> Path:
 
 @contextmanager
 def run_node(folder: Path, *links: str) -> Iterator[bytes]:
-    """Run a virtual transducer as a process while the context lasts; gives its UUID. Raises LinkFailure."""
+    """Run a virtual transducer as a process while the context lasts; gives its UUID. Raises LinkError."""
     process = subprocess.Popen([*_NODE_COMMAND, "run", str(folder), *links], stdout=subprocess.PIPE, text=True)
     try:
         yield _ready(process)
@@ -364,10 +364,10 @@ def _ready(process: subprocess.Popen[str]) -> bytes:
         raise _failure("The virtual node did not start", line) from None
 
 
-def _failure(what: str, said: str) -> LinkFailure:
+def _failure(what: str, said: str) -> LinkError:
     """Tell what the node's process said on its stdout: an error as JSON, or nothing that can be read."""
     try:
         error = json.loads(said)["error"]
-        return LinkFailure(f"{what}: {error['message']}", hint=error["hint"])
+        return LinkError(f"{what}: {error['message']}", hint=error["hint"])
     except (ValueError, KeyError, TypeError):
-        return LinkFailure(f"{what}: {said.strip() or 'no answer'}")
+        return LinkError(f"{what}: {said.strip() or 'no answer'}")

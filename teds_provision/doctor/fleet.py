@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from teds_provision import teds
 from teds_provision.doctor.checks import Finding, System, check
-from teds_provision.errors import BadData, NotFound, StoreChanged, StoreFailure, VaultFailure
+from teds_provision.errors import BadDataError, NotFoundError, StoreChangedError, StoreError, VaultError
 from teds_provision.files import read_text
 from teds_provision.limits import LIMITS, load_toml
 from teds_provision.station.station import Station
@@ -27,7 +27,7 @@ def config(system: System) -> Iterator[Finding]:
         return
     try:
         values = load_toml(read_text(path, LIMITS.text_file, "config.toml"), str(path))
-    except (BadData, NotFound) as error:
+    except (BadDataError, NotFoundError) as error:
         yield Finding("config", "failed", error.message, error.hint or "Fix or remove the file.")
         return
     unknown = list(_unknown(values, system))
@@ -121,10 +121,10 @@ def seals(system: System) -> Iterator[Finding]:
             return
         station.unlock()
         broken = list(station.seals.all_broken())
-    except StoreChanged as error:
+    except StoreChangedError as error:
         yield Finding("seals", "failed", error.message, error.hint)
         return
-    except (VaultFailure, StoreFailure) as error:
+    except (VaultError, StoreError) as error:
         yield Finding("seals", "skipped", error.message, error.hint)
         return
     finally:
@@ -138,4 +138,4 @@ def seals(system: System) -> Iterator[Finding]:
 
 
 def _nobody(_prompt: str, _confirm: bool = False) -> str:
-    raise VaultFailure("doctor never asks for a passphrase.")
+    raise VaultError("doctor never asks for a passphrase.")

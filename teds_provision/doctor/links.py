@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from teds_provision.doctor.checks import Finding, Result, System, check
-from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.errors import LinkError, NoReaderError, UsageError
 from teds_provision.links import can as can_room
 from teds_provision.links import nfc as nfc_room
 from teds_provision.links.ble.bluez import AdapterFacts, adapters
@@ -116,7 +116,7 @@ def pcsc(system: System) -> Iterator[Finding]:
 
     try:
         found = nfc_room.pcsc.contactless(nfc_room.pcsc.names())
-    except NoReader as failure:
+    except NoReaderError as failure:
         yield Finding("pc/sc", "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
         return
     if found:
@@ -170,12 +170,12 @@ def nfc(system: System) -> Iterator[Finding]:
 
     try:
         reader = nfc_room.reader.open_reader(system.nfc)
-    except (NoReader, UsageFailure) as failure:
+    except (NoReaderError, UsageError) as failure:
         yield Finding("nfc", "failed", failure.message, failure.hint)
         return
     try:
         tag = any(reader.sense() is not None for _ in range(_SENSES))
-    except nfc_room.tag.ReaderLost as error:
+    except nfc_room.tag.ReaderLostError as error:
         yield Finding(
             "nfc", "failed", f"{reader.name} opened but failed immediately: {error}.", "Unplug it, plug it in."
         )
@@ -253,7 +253,7 @@ def _self_test(spec: str) -> tuple[bool, str, str]:
         buses += [can_room.bus.Bus(can_room.spec.parse_spec(spec)), can_room.bus.Bus(can_room.spec.parse_spec(spec))]
         buses[0].send(sent)
         arrived = buses[1].receive(2.0) == sent
-    except LinkFailure as failure:
+    except LinkError as failure:
         return False, failure.message, failure.hint
     finally:
         for bus in buses:
@@ -271,7 +271,7 @@ def can(system: System) -> Iterator[Finding]:
 
     try:
         bus = can_room.bus.Bus(can_room.spec.parse_spec(system.can))
-    except (LinkFailure, UsageFailure) as failure:
+    except (LinkError, UsageError) as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
     rivals = can_room.shared.Rivals(bus.spec.source)
@@ -281,7 +281,7 @@ def can(system: System) -> Iterator[Finding]:
             frame = bus.receive(left)
             if frame is not None:
                 rivals.heard(frame)
-    except LinkFailure as failure:
+    except LinkError as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
     finally:
@@ -361,7 +361,7 @@ def bluetooth(system: System) -> Iterator[Finding]:
         spec = parse_spec(system.ble or "")
         found = adapters(system.environment.get("DBUS_SYSTEM_BUS_ADDRESS"))
         _require(found, spec)
-    except (NoReader, UsageFailure) as failure:
+    except (NoReaderError, UsageError) as failure:
         yield Finding(_BLUETOOTH, "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
         return
     for each in found:
@@ -369,12 +369,12 @@ def bluetooth(system: System) -> Iterator[Finding]:
 
 
 def _require(found: list[AdapterFacts], spec: BleSpec) -> None:
-    """Raise NoReader where there is no adapter, or not the one that was named."""
+    """Raise NoReaderError where there is no adapter, or not the one that was named."""
     if not found:
-        raise NoReader("bluetoothd has no adapter.", hint="Plug one in; bluetoothctl list")
+        raise NoReaderError("bluetoothd has no adapter.", hint="Plug one in; bluetoothctl list")
     if spec.adapter is not None and spec.adapter not in {each.name for each in found}:
         named = ", ".join(each.name for each in found)
-        raise NoReader(f"There is no Bluetooth adapter {spec.adapter}.", hint=f"There is {named}.")
+        raise NoReaderError(f"There is no Bluetooth adapter {spec.adapter}.", hint=f"There is {named}.")
 
 
 def _adapter(facts: AdapterFacts, spec: BleSpec, *, asked: bool) -> Finding:

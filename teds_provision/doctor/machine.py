@@ -14,7 +14,7 @@ from typing import Final
 from teds_provision import store as store_room
 from teds_provision import vault
 from teds_provision.doctor.checks import Finding, System, check
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.lazy import install_command
 from teds_provision.store.database import has_store
 
@@ -134,7 +134,7 @@ def _last_entry(system: System) -> datetime | None:
         with store_room.Store.open(system.home) as store:
             latest = store.audit.latest()
         return datetime.strptime(latest, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if latest is not None else None
-    except (StoreFailure, ValueError):  # the checks of the store say so
+    except (StoreError, ValueError):  # the checks of the store say so
         return None
 
 

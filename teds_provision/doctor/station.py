@@ -13,7 +13,7 @@ from typing import Final
 
 from teds_provision import vault as vault_room
 from teds_provision.doctor.checks import Finding, System, check
-from teds_provision.errors import NoKeyring, NotFound, StoreFailure, VaultFailure
+from teds_provision.errors import KeyringUnavailableError, NotFoundError, StoreError, VaultError
 from teds_provision.files import open_to_read
 from teds_provision.store import Choice, Store
 from teds_provision.store.database import has_store
@@ -121,13 +121,13 @@ def keyring(system: System) -> Iterator[Finding]:
     try:
         with _quiet_logging():
             name = vault_room.keyring_vault.inspect()
-    except VaultFailure as failure:
+    except VaultError as failure:
         if used == "keyring":
             yield Finding("keyring", "failed", failure.message, failure.hint)
         elif used is not None:
             yield Finding("keyring", "skipped", f"Not used by this station: {failure.message}")
         else:
-            none = isinstance(failure, NoKeyring)
+            none = isinstance(failure, KeyringUnavailableError)
             fix = "teds-provision init --keystore file" if none else failure.hint
             yield Finding("keyring", "warning", f"{failure.message} init will use a passphrase file.", fix)
         return
@@ -161,7 +161,7 @@ def vault(system: System) -> Iterator[Finding]:
     else:
         token = vault_room.pkcs11_token.find_token(vault_room.pkcs11_uri.Pkcs11Uri.parse(used))
         if not (system.home / "vault-pkcs11.json").exists():
-            raise VaultFailure("The file vault-pkcs11.json is missing.", hint="teds-provision restore FILE")
+            raise VaultError("The file vault-pkcs11.json is missing.", hint="teds-provision restore FILE")
         yield Finding("vault", "ok", f"The token {token.label.strip()!r} is there.")
 
 
@@ -180,7 +180,7 @@ def _file_vault(system: System) -> Finding:
     with Store.open(system.home) as opened:
         content = vault_room.file_vault.read_sealed(system.home / "vault.json")
         if content.get("store") != opened.id:
-            raise VaultFailure("vault.json belongs to another store.", hint="teds-provision restore FILE")
+            raise VaultError("vault.json belongs to another store.", hint="teds-provision restore FILE")
     memory = content.get("memory_kib")
     if not isinstance(memory, int) or memory < 19 * 1024:  # OWASP's least for Argon2id
         return Finding("vault", "warning", "The passphrase file has weak demo settings.", "Create a new station.")
@@ -194,7 +194,7 @@ def _keystore(system: System) -> str | None:
         with Store.open(system.home) as opened:
             facts = opened.facts()
             return facts.keystore if facts is not None else None
-    except StoreFailure:  # the check of the store says so
+    except StoreError:  # the check of the store says so
         return None
 
 
@@ -219,7 +219,7 @@ def holds_private_key(path: Path) -> bool:
     try:
         with open_to_read(path) as file:
             octets = file.read(_MAX_KEY_FILE)
-    except (OSError, NotFound):
+    except (OSError, NotFoundError):
         return False
     if b"PRIVATE KEY" in octets or b"PuTTY-User-Key-File" in octets:
         return True

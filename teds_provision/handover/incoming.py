@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from teds_provision.errors import LinkFailure, NoNode, NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.errors import LinkError, NoNodeError, NotAuthenticError, PolicyError, TedsProvisionError
 from teds_provision.handover import gc_pause
 from teds_provision.handover.deny import deny_all, why_not
 from teds_provision.handover.pending import IMPORTED, Notes, digest_of
@@ -208,7 +208,7 @@ class Imported:
         return tuple(bytes.fromhex(uuid) for uuid in self.notes.uuids if uuid not in refused)
 
 
-class NothingTaken(PolicyRefused):
+class NothingImportedError(PolicyError):
     """Every node of a bundle is refused; ``nodes`` say why."""
 
     def __init__(self, bundle: Bundle, nodes: tuple[PlannedNode, ...]) -> None:
@@ -226,8 +226,8 @@ def plan_import(station: Station, source: Source, now: datetime | None = None) -
     A bundle that was taken in before is returned as such, even when it has expired since. What it says of sequences
     and epochs is hearsay: none of it is kept but the epoch of a pending key, which the first session corrects. A node
     that was moved away comes back only from the station that it went to. Raises what
-    :func:`open_bundle` raises, and PolicyRefused: an id seen with other content, no signature of the bundle's CA over
-    this station, or every node refused (NothingTaken).
+    :func:`open_bundle` raises, and PolicyError: an id seen with other content, no signature of the bundle's CA over
+    this station, or every node refused (NothingImportedError).
     """
     opened = open_bundle(source, station.vault.identity(), station.policy.station_points().get, None)
     bundle, content = opened.bundle, digest_of(opened.bundle)
@@ -239,7 +239,7 @@ def plan_import(station: Station, source: Source, now: datetime | None = None) -
     denied, passed_over = _new_revocations(station, opened)
     nodes = tuple(_Judge(station, denied, bundle).each(bundle.nodes))
     if nodes and all(node.decision == "refused" for node in nodes):
-        raise NothingTaken(bundle, nodes)
+        raise NothingImportedError(bundle, nodes)
     return ImportPlan(opened, content, nodes, denied, _is_known_ca(station, bundle.ca), passed_over)
 
 
@@ -311,10 +311,10 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
 
 
 def _before(row: Handover, content: str) -> Imported:
-    """A bundle of an id that came before: the same import again, or PolicyRefused where its content differs."""
+    """A bundle of an id that came before: the same import again, or PolicyError where its content differs."""
     notes = Notes.from_json(row.nodes)
     if notes.content != content:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The bundle {row.id} was already imported with different content: it is a replay or a forgery.",
             hint="Ask its sender by voice what was sent.",
         )
@@ -326,7 +326,7 @@ def _check_certified(station: Station, opened: OpenedBundle) -> None:
     """The receiver must be able to write and rotate: it needs the CA's signature over its key."""
     ca = opened.bundle.ca
     if opened.station_signature is None and station.identity.certificate(ca, station.point) is None:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The bundle has no signature by CA {fingerprint(ca)[:16]} over this station's key.",
             hint="Ask the sender to export it again on the station with that CA key.",
         )
@@ -438,7 +438,7 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
         if point is None or digits == station.fingerprint:
             continue
         if not verify(bundle.ca, station_key_message(point), signature):
-            raise NotAuthentic(f"The bundle's CA signature over station {digits[:16]} does not verify.")
+            raise NotAuthenticError(f"The bundle's CA signature over station {digits[:16]} does not verify.")
         station.identity.keep_certificate(bundle.ca, point, signature)
 
 
@@ -498,7 +498,7 @@ def prove_nodes(
     waiting, outcomes = set(uuids), dict[bytes, Proven | NotProven]()
     try:
         port = open_port(links)
-    except LinkFailure as error:
+    except LinkError as error:
         return [NotProven(uuid, error.message) for uuid in uuids]
     try:
         while waiting:
@@ -506,7 +506,7 @@ def prove_nodes(
                 contact = port.find(
                     lambda identity: identity.uuid in waiting, seconds=links.timeout, notice=reporter.notice
                 )
-            except NoNode:
+            except NoNodeError:
                 break
             uuid = contact.identity.uuid
             waiting.discard(uuid)
@@ -515,7 +515,7 @@ def prove_nodes(
                     outcomes[uuid] = prove_node(station, node)
             except TedsProvisionError as error:
                 outcomes[uuid] = NotProven(uuid, error.message)
-    except LinkFailure as error:
+    except LinkError as error:
         return [outcomes.get(uuid, NotProven(uuid, error.message)) for uuid in uuids]
     finally:
         port.close()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import BadData, NotFound, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.handover.deny import deny
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import seal_revocation
@@ -38,7 +38,7 @@ class Revoked:
 def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
     """Ban a node's key: off the whitelist, its keys deleted, and a signed statement that travels in every bundle."""
     if not why.strip() or not is_label(why):
-        raise UsageFailure("Say why, in printable text of at most 1,024 characters.")
+        raise UsageError("Say why, in printable text of at most 1,024 characters.")
     present = station.policy.revocation(uuid)
     if present is not None and not station.keys.held(uuid) and station.pins.entry(uuid) is None:
         return Revoked(present, fresh=False)
@@ -106,12 +106,15 @@ class TakeOver:
 
 
 def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration: bool) -> TakeOver:
-    """Look at both nodes; raises NotFound (OLD unknown, no calibration known), UsageFailure, NotWhitelisted (NEW)."""
+    """Look at both nodes.
+
+    Raises NotFoundError (OLD unknown, no calibration known), UsageError, NotWhitelistedError (NEW).
+    """
     if old == new:
-        raise UsageFailure("A node cannot replace itself.")
+        raise UsageError("A node cannot replace itself.")
     before = station.nodes.get(old)
     if before is None:
-        raise NotFound(f"Node {old.hex()} is not known here.", hint="See: teds-provision nodes")
+        raise NotFoundError(f"Node {old.hex()} is not known here.", hint="See: teds-provision nodes")
     station.policy.require_not_given_away(old)
     station.policy.require_whitelisted(new)
     after = station.nodes.get(new) or NodeRecord(new)
@@ -119,7 +122,10 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
 
 
 def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
-    """The Calibration TEDS that a node was last read to have; raises NotFound, BadData (they cannot be built in)."""
+    """The Calibration TEDS that a node was last read to have.
+
+    Raises NotFoundError, BadDataError (they cannot be built in).
+    """
     image = known_image(station, old.uuid) or Image(old.uuid, {})
     blocks = {
         block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
@@ -128,9 +134,9 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
     described = [(number, AccessCode.CHANNEL) for number, _ in blocks]
     blocks |= {block: image.blocks[block] for block in described if block in image.blocks}
     if not blocks:
-        raise NotFound(f"No calibration of node {old.uuid.hex()} is known here.", hint="Omit --copy-calibration.")
+        raise NotFoundError(f"No calibration of node {old.uuid.hex()} is known here.", hint="Omit --copy-calibration.")
     if old.profile is None:
-        raise BadData("The profile of the old node is not known, so its calibration cannot be built in.")
+        raise BadDataError("The profile of the old node is not known, so its calibration cannot be built in.")
     return blocks
 
 

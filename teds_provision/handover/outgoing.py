@@ -15,7 +15,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
-from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.files import new_file, require_new
 from teds_provision.handover import gc_pause
 from teds_provision.handover.pending import OPEN, Notes, content_digest
@@ -101,7 +101,7 @@ class Selection:
         why = self._every() if self.order.nodes is None else self._named(self.order.nodes)
         chosen = [self.keys[uuid] for uuid, obstacle in why.items() if not obstacle]
         if not chosen:
-            raise NotFound("There is no node to hand over.", hint="Name the nodes; see: teds-provision nodes")
+            raise NotFoundError("There is no node to hand over.", hint="Name the nodes; see: teds-provision nodes")
         return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
 
     def fitting(self) -> Chosen:
@@ -109,11 +109,11 @@ class Selection:
         return [self.keys[uuid] for uuid in sorted(set(self.order.nodes or ())) if not self._obstacle(uuid)]
 
     def _named(self, nodes: tuple[bytes, ...]) -> dict[bytes, str]:
-        """The nodes that were named; raises PolicyRefused where one cannot go."""
+        """The nodes that were named; raises PolicyError where one cannot go."""
         why = {uuid: self._obstacle(uuid) for uuid in sorted(set(nodes))}
         for uuid, obstacle in why.items():
             if obstacle:
-                raise PolicyRefused(f"Node {uuid.hex()} cannot be handed over: {obstacle}.", hint=_CURE)
+                raise PolicyError(f"Node {uuid.hex()} cannot be handed over: {obstacle}.", hint=_CURE)
         return why
 
     def _every(self) -> dict[bytes, str]:
@@ -124,12 +124,12 @@ class Selection:
         return why
 
     def _cut_again(self) -> dict[bytes, str]:
-        """The nodes of a move that was cut; PolicyRefused where one of them has been revoked or forgotten since."""
+        """The nodes of a move that was cut; PolicyError where one of them has been revoked or forgotten since."""
         resting = self._cut_move()
         for uuid in resting:
             if uuid in self.revoked or uuid not in self.keys:
                 why = "it is revoked" if uuid in self.revoked else "this station holds no key for it"
-                raise PolicyRefused(
+                raise PolicyError(
                     f"The pending move includes node {uuid.hex()} and cannot be sealed again: {why}.",
                     hint="Undo the move (handover list, handover undo ID), then hand over the others.",
                 )
@@ -250,10 +250,10 @@ class Exported:
 
 
 def plan_export(station: Station, order: ExportOrder, now: datetime | None = None) -> ExportPlan:
-    """:func:`plan_exports` for what fits into one bundle; raises UsageFailure for more."""
+    """:func:`plan_exports` for what fits into one bundle; raises UsageError for more."""
     plans = plan_exports(station, order, now=now)
     if len(plans) > 1:
-        raise UsageFailure("These are too many nodes for one bundle.", hint="Export them in several bundles.")
+        raise UsageError("These are too many nodes for one bundle.", hint="Export them in several bundles.")
     return plans[0]
 
 
@@ -263,15 +263,16 @@ def plan_exports(
 ) -> list[ExportPlan]:
     """Find the receivers and nodes, and the CA's signature over each receiver; changes nothing.
 
-    Returns a plan for each bundle, of at most ``most`` nodes. Raises NotFound, UsageFailure (two receivers of a move),
-    PolicyRefused (a node without proven key, given away, revoked, due for rotation or, for a move, with an agreement
-    that is not settled; nodes of several CAs; a receiver that is not certified), BadData (a receiver's file).
+    Returns a plan for each bundle, of at most ``most`` nodes. Raises NotFoundError, UsageError (two receivers of a
+    move), PolicyError (a node without proven key, given away, revoked, due for rotation or, for a move, with an
+    agreement that is not settled; nodes of several CAs; a receiver that is not certified), BadDataError (a receiver's
+    file).
     """
     receivers = tuple({record.point: record for record in _receivers(station, order)}.values())
     if order.mode == "move" and len(receivers) != 1:
-        raise UsageFailure("A move has exactly one receiver.", hint="For several receivers, use --mode copy.")
+        raise UsageError("A move has exactly one receiver.", hint="For several receivers, use --mode copy.")
     if order.days < 1:
-        raise UsageFailure("A bundle is valid for at least one day.")
+        raise UsageError("A bundle is valid for at least one day.")
     selection = Selection(station, order, {record.fingerprint for record in receivers})
     nodes, skipped = selection.choose()
     ca = _one_ca(station, order, nodes)
@@ -325,8 +326,8 @@ def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetim
     """Seal the bundle into a new file of mode 0600; a move's keys rest from before anybody could open that file.
 
     What is written before the store has it is a draft without signature and tag, under a name of its own.
-    The same command over its own file finds nothing to do. Raises UsageFailure (another file lies there),
-    StoreFailure, VaultFailure.
+    The same command over its own file finds nothing to do. Raises UsageError (another file lies there),
+    StoreError, VaultError.
     """
     before = _already(plan, output)
     if before is not None:
@@ -355,7 +356,7 @@ class Sealed:
 
 @gc_pause.put_off()
 def seal_export(station: Station, plan: ExportPlan, now: datetime) -> Sealed:
-    """Seal a bundle in memory, for a parcel. Raises StoreFailure, VaultFailure, PolicyRefused (a node changed)."""
+    """Seal a bundle in memory, for a parcel. Raises StoreError, VaultError, PolicyError (a node changed)."""
     made = _sealing(station, plan, now)
     octets = b"".join([*made.body(), made.end()])
     return Sealed(plan, octets, made.sha256, made.signed_sha256)
@@ -371,7 +372,7 @@ def plan_copies(
 ) -> list[ExportPlan]:
     """Plans of copies for one station: those of the nodes that may go and keep the owner's CA.
 
-    What an export leaves out is left out without a word. Raises PolicyRefused where the receiver is not certified.
+    What an export leaves out is left out without a word. Raises PolicyError where the receiver is not certified.
     """
     order = ExportOrder((receiver.fingerprint,), tuple(uuids), "copy", ca=fingerprint(station.ca))
     selection = Selection(station, order, {receiver.fingerprint})
@@ -412,7 +413,7 @@ def outputs_of(output: Path, count: int) -> list[Path]:
 
 def _receivers(station: Station, order: ExportOrder) -> list[TrustRecord]:
     if not order.to:
-        raise UsageFailure("No receiver was given.", hint="Add --to STATION; see: trust list")
+        raise UsageError("No receiver was given.", hint="Add --to STATION; see: trust list")
     return [find_trusted(station, text, "station") for text in order.to]
 
 
@@ -422,9 +423,9 @@ def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
     if order.ca is not None:
         found = {digits: ca for digits, ca in found.items() if digits.startswith(order.ca.lower())}
         if not found:
-            raise NotFound(f"None of these nodes holds the CA key {order.ca}.")
+            raise NotFoundError(f"None of these nodes holds the CA key {order.ca}.")
     if len(found) > 1:
-        raise PolicyRefused(
+        raise PolicyError(
             f"These nodes hold {len(found)} different CA keys; a bundle covers one.",
             hint=f"Export them separately: --ca {' / --ca '.join(sorted(digits[:16] for digits in found))}",
         )
@@ -448,10 +449,10 @@ def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
     if known is None and ca == station.ca:
         try:
             known = station.identity.certify(receiver.point)
-        except NotFound:
+        except NotFoundError:
             known = None
     if known is None:
-        raise PolicyRefused(
+        raise PolicyError(
             f"Station {receiver.name!r} is not certified by the CA {fingerprint(ca)[:16]}, whose key is not here:"
             " it could read these nodes but neither write nor rotate them.",
             hint="Where the CA key is kept: trust ca sign REQUEST --output CERT; here: trust add NAME CERT",
@@ -510,7 +511,7 @@ def _bundled(station: Station, nodes: Iterable[Leaving]) -> Iterator[BundledNode
         for leaving in page:
             record, key = records.get(leaving.uuid), keys.get((leaving.uuid, leaving.key_id))
             if record is None or record.point is None or key is None:
-                raise PolicyRefused(f"Node {leaving.uuid.hex()} was changed in the meantime.", hint="Run it again.")
+                raise PolicyError(f"Node {leaving.uuid.hex()} was changed in the meantime.", hint="Run it again.")
             yield BundledNode(
                 uuid=record.uuid,
                 node_key=record.point,

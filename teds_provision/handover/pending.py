@@ -14,7 +14,7 @@ from datetime import datetime
 from operator import attrgetter
 from typing import Any
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
@@ -100,10 +100,10 @@ def peer_name(station: Station, fingerprint: str) -> str:
 
 
 def find_handover(station: Station, text: str) -> Handover:
-    """Return the bundle that left under this id, or its first digits; raises NotFound."""
+    """Return the bundle that left under this id, or its first digits; raises NotFoundError."""
     fits = [row for row in station.handovers.all() if row.direction == "out" and row.id.startswith(text.lower())]
     if len(fits) != 1 or len(text) < 4:
-        raise NotFound(f"No outgoing handover matches {text!r}.", hint="See: teds-provision handover list")
+        raise NotFoundError(f"No outgoing handover matches {text!r}.", hint="See: teds-provision handover list")
     return fits[0]
 
 
@@ -119,17 +119,17 @@ class Undone:
 def undo(station: Station, row: Handover) -> Undone:
     """Take a move back before its receipt: the keys may be used again, and the next contact rotates them.
 
-    The receiver may have the bundle all the same; until the rotation it can use the keys. Raises PolicyRefused for a
+    The receiver may have the bundle all the same; until the rotation it can use the keys. Raises PolicyError for a
     copy and for a move whose receipt came.
     """
     uuids = tuple(bytes.fromhex(uuid) for uuid in Notes.from_json(row.nodes).uuids)
     if row.mode == "copy":
-        raise PolicyRefused(
+        raise PolicyError(
             "A copy cannot be undone: the other station holds the keys.",
             hint="To replace them: teds-provision agree UUID --rotate",
         )
     if row.state == CLOSED:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The receipt of this move has arrived: station {peer_name(station, row.peers[0])} holds the keys now.",
             hint="Have the nodes handed back: export-keys there, import-keys here.",
         )
@@ -159,13 +159,15 @@ def close(station: Station, octets: bytes) -> Closed:
     Only the keys that were in the bundle are deleted, and only while this very move stands: a receipt that comes after
     the node's return deletes nothing. A copy for several stations is closed when each has sent its receipt.
 
-    What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthentic
-    (signature, sender, another file), PolicyRefused (not ours, undone), NotFound (unknown id), BadData.
+    What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthenticError
+    (signature, sender, another file), PolicyError (not ours, undone), NotFoundError (unknown id), BadDataError.
     """
     receipt = open_receipt(octets, station.policy.station_points().get)
     row = station.handovers.get(receipt.id, "out")
     if row is None:
-        raise NotFound(f"No bundle {receipt.id} left this station.", hint="Give the receipt to the bundle's sender.")
+        raise NotFoundError(
+            f"No bundle {receipt.id} left this station.", hint="Give the receipt to the bundle's sender."
+        )
     _check_receipt(station, row, receipt)
     text = octets.strip().decode("ascii")
     texts = (row.receipt or "").split()
@@ -173,7 +175,7 @@ def close(station: Station, octets: bytes) -> Closed:
         return Closed(row, receipt, fresh=False)
     if row.state == UNDONE:
         station.audit("handover", None, "receipt of an undone move", handover=row.id)
-        raise PolicyRefused(
+        raise PolicyError(
             f"This move was undone here, but station {peer_name(station, receipt.sender)} took"
             f" {len(receipt.imported)} keys in all the same.",
             hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move anew.",
@@ -221,22 +223,22 @@ def signer_of(text: str) -> str:
     """Who signed a receipt or revocation that was verified when it came, "" where that cannot be read."""
     try:
         return str(load_object(decode_base64url(text.split(".")[1], "The receipt"), "The receipt").get("from", ""))
-    except (BadData, IndexError):
+    except (BadDataError, IndexError):
         return ""
 
 
 def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
     notes = Notes.from_json(row.nodes)
     if receipt.to != station.fingerprint or receipt.sender not in row.peers:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The receipt is between {receipt.to[:16]} and {receipt.sender[:16]}, not between this station and one"
             " that the bundle was sealed to."
         )
     if receipt.bundle_sha256 not in notes.files:
-        raise NotAuthentic("The receipt is for another bundle than any that left here under this id.")
+        raise NotAuthenticError("The receipt is for another bundle than any that left here under this id.")
     named = [uuid.hex() for uuid in receipt.imported] + [refused.uuid.hex() for refused in receipt.refused]
     if sorted(named) != sorted(notes.uuids):
-        raise NotAuthentic("The receipt names other nodes than the bundle.")
+        raise NotAuthenticError("The receipt names other nodes than the bundle.")
 
 
 def _lift(station: Station, uuid: bytes, row: Handover) -> None:

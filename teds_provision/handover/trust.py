@@ -9,7 +9,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from teds_provision import vault as vaults
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import read_limited
 from teds_provision.handover.pending import OPEN, Notes, signer_of
 from teds_provision.protocol.handover.jose import point_of, public_jwk
@@ -62,16 +62,18 @@ def make_request(name: str, key: PrivateKey) -> bytes:
 
 
 def read_request(octets: bytes) -> CertificateRequest:
-    """Read and check a request; raises BadData, NotAuthentic (the proof does not verify)."""
+    """Read and check a request; raises BadDataError, NotAuthenticError (the proof does not verify)."""
     if b"PRIVATE KEY" in octets:
-        raise BadData("This file contains a private key, not a request.")
+        raise BadDataError("This file contains a private key, not a request.")
     members = load_object(octets, "The request")
     if members.get("format") != REQUEST_FORMAT:
-        raise BadData(f"This is not a station's request ({REQUEST_FORMAT}).", hint="To create one: init --request FILE")
+        raise BadDataError(
+            f"This is not a station's request ({REQUEST_FORMAT}).", hint="To create one: init --request FILE"
+        )
     name = _name(members.get("name"))
     station = point_of(members.get("station"), "The station's key")
     if not verify(station, _LABEL + station + name.encode(), decode_base64url(members.get("proof"), "The proof")):
-        raise NotAuthentic("The request is not signed by the key that it names.")
+        raise NotAuthenticError("The request is not signed by the key that it names.")
     return CertificateRequest(name, station)
 
 
@@ -88,21 +90,21 @@ def write_certificate(certificate: Certificate) -> bytes:
 
 
 def read_certificate(octets: bytes) -> Certificate:
-    """Read and check a certificate; raises BadData, NotAuthentic (the CA's signature does not verify)."""
+    """Read and check a certificate; raises BadDataError, NotAuthenticError (the CA's signature does not verify)."""
     members = load_object(octets, "The certificate")
     if members.get("format") != CERTIFICATE_FORMAT:
-        raise BadData(f"This is not a station's certificate ({CERTIFICATE_FORMAT}).", hint="See: trust ca sign")
+        raise BadDataError(f"This is not a station's certificate ({CERTIFICATE_FORMAT}).", hint="See: trust ca sign")
     station, ca = point_of(members.get("station"), "The station's key"), point_of(members.get("ca"), "The CA's key")
     signature = decode_base64url(members.get("signature"), "The signature")
     if not verify(ca, station_key_message(station), signature):
-        raise NotAuthentic("The certificate's signature does not verify under the CA key that it names.")
+        raise NotAuthenticError("The certificate's signature does not verify under the CA key that it names.")
     return Certificate(_name(members.get("name")), station, ca, signature)
 
 
 def sign_request(station: Station, request: CertificateRequest) -> Certificate:
-    """Certify a station under this owner's CA, and remember that; raises NotFound where the CA key is not here."""
+    """Certify a station under this owner's CA, and remember that; raises NotFoundError where the CA key is not here."""
     if request.station == station.ca:
-        raise PolicyRefused("The request names the CA's own key as a station.")
+        raise PolicyError("The request names the CA's own key as a station.")
     known = station.identity.certificate(station.ca, request.station)
     signature = known or station.identity.certify(request.station)
     if known is None:
@@ -140,10 +142,10 @@ def _requested(station: Station, name: str | None, keystore: str | None, ask: As
 def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Station:
     """Complete a station that asked for a certificate; one that has it already is opened as it is.
 
-    Raises NotFound (no station asked here), PolicyRefused (a certificate for another key, or another CA already).
+    Raises NotFoundError (no station asked here), PolicyError (a certificate for another key, or another CA already).
     """
     if not has_store(home):
-        raise NotFound("This station has not requested a certificate.", hint="First: init --request FILE")
+        raise NotFoundError("This station has not requested a certificate.", hint="First: init --request FILE")
     station = Station(Store.open(home), ask)
 
     def adopt(known: Ask) -> None:
@@ -164,9 +166,9 @@ def _adopt(station: Station, certificate: Certificate) -> None:
     identity = station.identity
     own = identity.point if identity.is_complete() else identity.requested
     if own is None:
-        raise NotFound("This station has not requested a certificate.", hint="First: init --request FILE")
+        raise NotFoundError("This station has not requested a certificate.", hint="First: init --request FILE")
     if certificate.station != own:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The certificate is for station {fingerprint(certificate.station)[:16]},"
             f" this one is {fingerprint(own)[:16]}."
         )
@@ -183,7 +185,7 @@ def _adopt(station: Station, certificate: Certificate) -> None:
 
 def _name(value: object) -> str:
     if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 100:
-        raise BadData("A station's name is printable text of at most 100 characters.")
+        raise BadDataError("A station's name is printable text of at most 100 characters.")
     return value
 
 
@@ -191,10 +193,10 @@ def _name(value: object) -> str:
 
 
 def require_ca(station: Station) -> PrivateKey:
-    """Return the CA key; raises PolicyRefused where this station's CA is kept elsewhere."""
+    """Return the CA key; raises PolicyError where this station's CA is kept elsewhere."""
     ca = station.vault.ca()
     if ca is None or ca.point != station.ca:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The key of this station's CA {fingerprint(station.ca)[:16]} is not in this vault.",
             hint="To import it: trust ca import FILE. A station with its own CA is created by init in another --home.",
         )
@@ -202,7 +204,7 @@ def require_ca(station: Station) -> PrivateKey:
 
 
 def export_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
-    """Write the CA key to a new file under a passphrase; raises PolicyRefused, VaultFailure (token, file)."""
+    """Write the CA key to a new file under a passphrase; raises PolicyError, VaultError (token, file)."""
     require_ca(station)
     vault.export_ca(path, passphrase)
     station.audit("ca", None, "exported", ca=fingerprint(station.ca))
@@ -217,9 +219,9 @@ def drop_ca(station: Station) -> bool:
 
 
 def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
-    """Bring the CA key back; raises WrongPassphrase, NotFound, VaultFailure, PolicyRefused (another CA's key)."""
+    """Bring the CA key back; raises WrongPassphraseError, NotFoundError, VaultError, PolicyError (another CA's key)."""
     if SoftwareKey.from_secret(vaults.ca_file.read_ca(path, passphrase)).point != station.ca:
-        raise PolicyRefused(f"{path} contains a CA key other than this station's ({fingerprint(station.ca)[:16]}).")
+        raise PolicyError(f"{path} contains a CA key other than this station's ({fingerprint(station.ca)[:16]}).")
     vault.import_ca(path, passphrase)
     station.audit("ca", None, "imported", ca=fingerprint(station.ca))
 
@@ -248,17 +250,17 @@ def spoken(digits: str) -> str:
 def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candidate:
     """Read one public key (PEM) or a station's certificate.
 
-    Raises NotFound, BadData (private key, RSA, P-384, nothing of the kind), PolicyRefused (its own key, a name that
-    stands for another key).
+    Raises NotFoundError, BadDataError (private key, RSA, P-384, nothing of the kind), PolicyError (its own key, a name
+    that stands for another key).
     """
     point, certificate = _read(path)
     if certificate is not None and role == "ca":
-        raise UsageFailure(f"{path} is a station's certificate, not a CA's key.", hint="Omit --role.")
+        raise UsageError(f"{path} is a station's certificate, not a CA's key.", hint="Omit --role.")
     digits = fingerprint(point)
     if point == station.point or (role == "ca" and point == station.ca):
-        raise PolicyRefused(f"{path} contains this station's own key ({digits[:16]}), which is always trusted.")
+        raise PolicyError(f"{path} contains this station's own key ({digits[:16]}), which is always trusted.")
     if not name.strip() or name != name.strip() or not name.isprintable() or len(name) > 100:
-        raise UsageFailure(
+        raise UsageError(
             f"{name!r} is not a valid name for a key.", hint="Give printable text of at most 100 characters."
         )
     if role == "station":
@@ -269,18 +271,18 @@ def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candi
 
 def _refuse_in_roster(station: Station, fingerprint: str) -> None:
     if station.policy.in_roster(fingerprint):
-        raise PolicyRefused(
+        raise PolicyError(
             f"Trust in the key {fingerprint[:16]} is decided by the plant's roster, not by this station.",
             hint="On the station with the CA key: teds-provision registry add, or remove",
         )
 
 
 def _is_listed(station: Station, wanted: TrustRecord) -> bool:
-    """Whether this very key stands under this very name already; raises PolicyRefused where another one does."""
+    """Whether this very key stands under this very name already; raises PolicyError where another one does."""
     named = [record for record in station.policy.listed() if record.name == wanted.name]
     for old in named:
         if (old.role, old.point) != (wanted.role, wanted.point):
-            raise PolicyRefused(
+            raise PolicyError(
                 f"The name {wanted.name!r} already stands for the {old.role} {old.fingerprint[:16]}.",
                 hint=f"Choose another name, or run teds-provision trust remove {quote(wanted.name)} first.",
             )
@@ -290,10 +292,10 @@ def _is_listed(station: Station, wanted: TrustRecord) -> bool:
 def candidates_of(station: Station, folder: Path, role: TrustRole) -> list[Candidate]:
     """Read every key of a folder such as ``keys/``: ``NAME.pem``, ``NAME.ca.pem`` (a CA), ``NAME.cert`` (certificate).
 
-    A folder that holds a private key anywhere is refused whole (PolicyRefused).
+    A folder that holds a private key anywhere is refused whole (PolicyError).
     """
     if not folder.is_dir():
-        raise NotFound(f"There is no folder {folder}.")
+        raise NotFoundError(f"There is no folder {folder}.")
     refuse_private_keys(folder)
     found: list[Candidate] = []
     for path in sorted(folder.rglob("*")):
@@ -305,14 +307,16 @@ def candidates_of(station: Station, folder: Path, role: TrustRole) -> list[Candi
             continue
         found.append(candidate(station, name, path, "ca" if of_ca else role))
     if not found:
-        raise NotFound(f"{folder} contains no key of another station or CA.", hint="Keys are NAME.pem or NAME.ca.pem.")
+        raise NotFoundError(
+            f"{folder} contains no key of another station or CA.", hint="Keys are NAME.pem or NAME.ca.pem."
+        )
     return found
 
 
 def refuse_private_keys(folder: Path) -> None:
-    """Raise PolicyRefused where any file below ``folder`` holds a private key; such a folder is shared and kept."""
+    """Raise PolicyError where any file below ``folder`` holds a private key; such a folder is shared and kept."""
     for path, why in private_keys(folder):
-        raise PolicyRefused(
+        raise PolicyError(
             f"{path} holds {why}; this folder is for public keys.",
             hint="Remove it there and from the version history, and treat that key as compromised.",
         )
@@ -363,18 +367,18 @@ def add(station: Station, chosen: list[Candidate]) -> int:
 def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> TrustRecord:
     """Return the trusted key that ``text`` means: a name, the first digits of a fingerprint, or a PEM file.
 
-    Raises NotFound, UsageFailure (several fit), BadData (file), PolicyRefused (the file's key is not trusted).
+    Raises NotFoundError, UsageError (several fit), BadDataError (file), PolicyError (the file's key is not trusted).
     """
     known = station.policy.listed() if role is None else station.policy.trusted(role)
     fits = [record for record in known if record.name == text] or _by_digits(known, text)
     if len(fits) > 1:
-        raise UsageFailure(f"{text!r} matches {len(fits)} trusted keys.", hint="Give the name, or more digits.")
+        raise UsageError(f"{text!r} matches {len(fits)} trusted keys.", hint="Give the name, or more digits.")
     if fits:
         return fits[0]
     if Path(text).is_file():
         return _by_file(known, text)
     what = "station" if role == "station" else "key"
-    raise NotFound(
+    raise NotFoundError(
         f"No trusted {what} is known as {text!r}.", hint="teds-provision trust add NAME FILE; see trust list"
     )
 
@@ -391,7 +395,7 @@ def _by_file(known: list[TrustRecord], file: str) -> TrustRecord:
     for record in known:
         if record.point == point:
             return record
-    raise PolicyRefused(
+    raise PolicyError(
         f"The key {fingerprint(point)[:16]} of {file} is not trusted here.",
         hint=f"Compare its fingerprint by voice, then: teds-provision trust add NAME {quote(str(file))}",
     )
@@ -416,7 +420,7 @@ class Removal:
 
 
 def plan_removal(station: Station, record: TrustRecord) -> Removal:
-    """Find what hangs on the trust in a key; changes nothing. Raises PolicyRefused for one that the roster names."""
+    """Find what hangs on the trust in a key; changes nothing. Raises PolicyError for one that the roster names."""
     if record.role == "station":
         _refuse_in_roster(station, record.fingerprint)
     cas = _cas_of(station, record)
@@ -473,8 +477,8 @@ def _read(path: Path) -> tuple[bytes, Certificate | None]:
         return certificate.station, certificate
     try:
         return from_pem(octets), None
-    except BadData as error:
-        raise BadData(f"{path}: {error.message}", hint="Give the public key (PEM) that init shows.") from error
+    except BadDataError as error:
+        raise BadDataError(f"{path}: {error.message}", hint="Give the public key (PEM) that init shows.") from error
 
 
 def _kind(path: Path) -> tuple[str, bool] | None:

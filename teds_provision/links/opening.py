@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.links.ports import BLE, CAN, NFC, Capabilities, LinkSettings, Port, Trace
 
 
@@ -46,7 +46,7 @@ LINKS: Final = {
 
 
 def open_place(place: str, trace: Trace | None = None) -> Port:
-    """Open the reader or bus at ``LINK:WHERE``; raises NoReader with the cure, or UsageFailure.
+    """Open the reader or bus at ``LINK:WHERE``; raises NoReaderError with the cure, or UsageError.
 
     What goes over it is written to ``trace``.
     """
@@ -54,20 +54,20 @@ def open_place(place: str, trace: Trace | None = None) -> Port:
     kind = LINKS.get(name)
     if kind is None:
         known = " or ".join(f"--via {known}" for known in LINKS)
-        raise UsageFailure(f"The link {name!r} is not part of this version.", hint=f"Use {known}.")
+        raise UsageError(f"The link {name!r} is not part of this version.", hint=f"Use {known}.")
     if kind.needs and not where:
         problem, _, cure = kind.needs.partition(". ")
-        raise UsageFailure(f"{problem}.", hint=cure)
+        raise UsageError(f"{problem}.", hint=cure)
     opened: Callable[[str, Trace | None], Port] = import_module(kind.module).open_port
     return opened(where, trace)
 
 
 def open_port(settings: LinkSettings) -> Port:
-    """Open the one reader or bus that ``settings`` name; raises NoReader with the cure, or UsageFailure."""
+    """Open the one reader or bus that ``settings`` name; raises NoReaderError with the cure, or UsageError."""
     places = settings.places
     if len(places) > 1:
         named = ", ".join(place.partition(":")[2] for place in places)
-        raise UsageFailure(
+        raise UsageError(
             f"{len(places)} {'readers' if settings.via == 'nfc' else 'buses'} are named ({named}), "
             "but this command works with one.",
             hint=f"Choose one with --{settings.via}; several only work with --watch and measure.",

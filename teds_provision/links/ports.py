@@ -102,8 +102,8 @@ class Link(Protocol):
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return the whole reply frame that belongs to it.
 
-        Repeats as profile.md, "Repetition", allows (at most twice, within 15 s). Raises NodeSilent, Garbled,
-        AddressConflict or another LinkFailure; never returns a reply of another transaction.
+        Repeats as profile.md, "Repetition", allows (at most twice, within 15 s). Raises NodeSilentError, GarbledError,
+        AddressConflictError or another LinkError; never returns a reply of another transaction.
         """
 
     def close(self) -> None:
@@ -187,7 +187,7 @@ class Spaced(Protocol):
 
 @runtime_checkable
 class Abandons(Protocol):
-    """A link whose exchange is given up (NodeSilent) as soon as ``hopeless()`` says that no reply will come."""
+    """A link whose exchange is given up (NodeSilentError) as soon as ``hopeless()`` says that no reply will come."""
 
     hopeless: Callable[[], bool]
 
@@ -258,12 +258,12 @@ class Port(Protocol):
     ) -> Contact:
         """Wait until a node for which ``wanted`` is true is tapped or answers on the bus.
 
-        ``address`` is the CAN address to try first, a guess (ignored by NFC). Raises NoNode after ``seconds``.
+        ``address`` is the CAN address to try first, a guess (ignored by NFC). Raises NoNodeError after ``seconds``.
         Foreign tags and unwanted nodes are reported through ``notice`` and waited past.
         """
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Wait until any node is tapped, or answers on the bus: there, all that answer. Raises NoNode.
+        """Wait until any node is tapped, or answers on the bus: there, all that answer. Raises NoNodeError.
 
         Where a link carries many, it listens for ``listen`` seconds at least, however soon the first ones answered;
         a node that is named by its address is not waited past.

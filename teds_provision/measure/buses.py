@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
@@ -50,7 +50,7 @@ class MeasuredBus:
         return air_time(time, self.port.mtu(address)) if isinstance(self.port, BlePort) else time
 
     def drive(self, address: int, message: bytes) -> None:
-        """Send a Drive message to the node at ``address``; raises LinkFailure."""
+        """Send a Drive message to the node at ``address``; raises LinkError."""
         if isinstance(self.port, BlePort):
             self.port.link(address).drive(message)
             return
@@ -123,13 +123,13 @@ class Buses:
 
     def discover(self) -> list[Sighting]:
         """Ask every bus now; who answered until now. A bus that has failed is left out, the last failure raised."""
-        failure: LinkFailure | None = None
+        failure: LinkError | None = None
         worked = 0
         for bus in self.all():
             try:
                 bus.lookout.discover()
                 worked += 1
-            except LinkFailure as error:
+            except LinkError as error:
                 failure = error
         if failure is not None and not worked:
             raise failure

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import NotFound, PolicyRefused
+from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.files import SHARED, read_text, write_whole
 from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
@@ -18,7 +18,7 @@ from teds_provision.measure.sources import beside
 from teds_provision.measure.trusting import open_trusted
 from teds_provision.station.station import Station
 from teds_provision.steps.commands import at_node
-from teds_provision.talk.conversation import SessionLost
+from teds_provision.talk.conversation import SessionLostError
 from teds_provision.talk.progress import Reporter, Steps
 from teds_provision.teds.calibration.points import Point, points_of, with_point
 from teds_provision.teds.calibration.zero import reading_of
@@ -56,12 +56,13 @@ def capture_at(
 ) -> Captured:
     """Put a point into a file: channel ``number`` of the node that ``node`` names reads so, and is at ``reference``.
 
-    A claim of somebody else's on the sensor is no hindrance: several may measure it. Raises PolicyRefused (too
-    restless, at the wrap of its raw values, a file of another node), BadData (unit, channel, file), NotFound (folder).
+    A claim of somebody else's on the sensor is no hindrance: several may measure it. Raises PolicyError (too
+    restless, at the wrap of its raw values, a file of another node), BadDataError (unit, channel, file), NotFoundError
+    (folder).
     """
     uuid = station.nodes.resolve(node)
     if not file.parent.is_dir():
-        raise NotFound(f"There is no folder {file.parent}.")
+        raise NotFoundError(f"There is no folder {file.parent}.")
     steps = Steps(reporter)
     with (
         beside(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
@@ -74,7 +75,7 @@ def capture_at(
             with steps.step("read") as step:
                 point = _point(settle(trusted, number), si)
                 step.detail = f"raw {point.raw:.8g}, {point.count} samples"
-        except SessionLost as lost:
+        except SessionLostError as lost:
             raise lost.cause from lost
         text = read_text(file, LIMITS.text_file, "calibration") if file.exists() else ""
         today = datetime.now().astimezone().date()
@@ -84,16 +85,16 @@ def capture_at(
 
 
 def _point(settled: Settled, reference: float) -> Point:
-    """Mean and spread of the raw values; raises PolicyRefused where they say nothing of one place."""
+    """Mean and spread of the raw values; raises PolicyError where they say nothing of one place."""
     channel = settled.interpreter.channel
     raw, _ = settled.interpreter.reader.numbers(settled.raw)
     if not np.isfinite(raw).all():
-        raise PolicyRefused(f"Channel {channel.number} delivers raw values that are not numbers.")
+        raise PolicyError(f"Channel {channel.number} delivers raw values that are not numbers.")
     reading = reading_of(raw)
     ends = channel.calibration.raw_range if channel.calibration is not None else None
     ends = ends or settled.interpreter.reader.form.raw_range
     if channel.full_turn and ends is not None and float(np.ptp(raw)) > (ends[1] - ends[0]) / 2:
-        raise PolicyRefused(
+        raise PolicyError(
             f"Channel {channel.number} is at the wrap of its raw values: some are at either end of the turn.",
             hint="Turn it a little further and take the point there.",
         )

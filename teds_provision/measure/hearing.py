@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
@@ -168,7 +168,7 @@ class Hearing:
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self.lost_frames = 0
-        self.failure: LinkFailure | None = None
+        self.failure: LinkError | None = None
         """Why the bus itself cannot be heard now; None where it can."""
         self._thread = threading.Thread(target=self._run, name=f"hearing {place}", daemon=True)
         self._thread.start()
@@ -207,13 +207,13 @@ class Hearing:
         while not self._stop.is_set():
             try:
                 self._hear()
-            except LinkFailure as failure:
+            except LinkError as failure:
                 # The nodes' own threads meet the same failure, tell it, and open the bus again.
                 self.failure = failure
                 self._stop.wait(0.5)
 
     def _hear(self) -> None:
-        """Hear until the thread is to end; raises LinkFailure."""
+        """Hear until the thread is to end; raises LinkError."""
         raise NotImplementedError
 
     def _flush(self, looked: float, lost: int) -> float:

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from teds_provision.errors import BadData, LinkFailure, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, LinkError, PolicyError, TedsProvisionError
 from teds_provision.measure.sinks.lines import plain
 from teds_provision.measure.trusting import DEAD_MAN, LEASE, Trusted, claim, operation
 from teds_provision.protocol.operation.commands import ChannelState, idle, write_data_set
-from teds_provision.talk.conversation import SessionLost
+from teds_provision.talk.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Channel
 from teds_provision.teds.units import WrittenUnit, parse_unit
@@ -41,13 +41,16 @@ class Applied:
 
 
 def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
-    """The unit of a set point: the one that was named, else the datasheet's SI unit; raises BadData, UsageFailure."""
+    """The unit of a set point: the one that was named, else the datasheet's SI unit.
+
+    Raises BadDataError, UsageError.
+    """
     if text is None:
         return WrittenUnit(channel.si_unit, channel.units, 1.0, 0.0)
     unit = parse_unit(text)
     if unit.units != channel.units:
         words = " or ".join(dict.fromkeys((channel.shown.text, channel.unit.text, channel.si_unit)))
-        raise BadData(
+        raise BadDataError(
             f"{text} is not a unit for channel {channel.number}, whose values are in {channel.si_unit}.",
             hint=f"Use {words}.",
         )
@@ -60,21 +63,21 @@ class HeldActuator:
     def __init__(self, trusted: Trusted, number: int, *, unit: str | None = None, dead_man: int = DEAD_MAN) -> None:
         channel = trusted.channel(number)
         if not channel.actuator:
-            raise BadData(f"Channel {number} of node {trusted.uuid} is not an actuator.")
+            raise BadDataError(f"Channel {number} of node {trusted.uuid} is not an actuator.")
         self.unit = unit_for(channel, unit)
         self.channel, self._trusted, self._dead_man = channel, trusted, dead_man
         self._interpreter = ChannelInterpreter(trusted.sheet, number)
         if self._interpreter.problem:
-            raise BadData(self._interpreter.problem)
+            raise BadDataError(self._interpreter.problem)
         self.safe: bool | None = None
 
     def octets_of(self, value: float) -> bytes:
-        """The data set for a value in :attr:`unit`; raises PolicyRefused (6) beyond the limits of the datasheet."""
+        """The data set for a value in :attr:`unit`; raises PolicyError (6) beyond the limits of the datasheet."""
         one = self._interpreter
         own = one.unit.from_si(self.unit.to_si(value))
         beyond = one.beyond(own, self.unit)
         if beyond:
-            raise PolicyRefused(beyond, hint="Limits come from the signed datasheet and cannot be exceeded.")
+            raise PolicyError(beyond, hint="Limits come from the signed datasheet and cannot be exceeded.")
         return one.encode(own)
 
     def __enter__(self) -> HeldActuator:
@@ -88,7 +91,7 @@ class HeldActuator:
             self._trusted.node.send(idle(self.channel.number), "to let go of the actuator")
             state, _ = operation(self._trusted.node).channels[self.channel.number]
             self.safe = bool(state & ChannelState.SAFE)
-        except (TedsProvisionError, SessionLost, KeyError):
+        except (TedsProvisionError, SessionLostError, KeyError):
             self.safe = None  # nobody can say so from here; the node's dead-man sees to it
 
     @property
@@ -97,20 +100,20 @@ class HeldActuator:
         return min(self._dead_man / 4000, LONGEST_PAUSE)
 
     def apply(self, value: float) -> Applied:
-        """Send one value; raises PolicyRefused (limits, the node), LinkFailure where it was not taken in time."""
+        """Send one value; raises PolicyError (limits, the node), LinkError where it was not taken in time."""
         octets = self.octets_of(value)
         began = time.monotonic()
         try:
             self._trusted.node.send(
                 write_data_set(self.channel.number, octets), "to set the actuator", within=self._dead_man / 1000
             )
-        except SessionLost as lost:
-            raise LinkFailure(
+        except SessionLostError as lost:
+            raise LinkError(
                 f"The session was lost while the actuator was in use: {lost.cause.message}",
                 hint="The node returns it to its safe state by itself.",
             ) from lost
         if time.monotonic() - began > self._dead_man / 1000:
-            raise LinkFailure(
+            raise LinkError(
                 "Setting the value took longer than the dead-man time.", hint="The actuator is in its safe state."
             )
         raw = self._interpreter.reader.raw(octets)

@@ -16,15 +16,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from teds_provision.errors import (
-    BadData,
-    BadDatasheet,
-    Bug,
-    KeyStolen,
-    LinkFailure,
-    NodeRefused,
-    NoRoom,
-    NotAuthentic,
-    PolicyRefused,
+    BadDataError,
+    BadDatasheetError,
+    InternalError,
+    KeyStolenError,
+    LinkError,
+    NodeRefusedError,
+    NoRoomError,
+    NotAuthenticError,
+    PolicyError,
     TedsProvisionError,
 )
 from teds_provision.links.ports import Abandons
@@ -52,7 +52,7 @@ from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
 from teds_provision.station.station import Station
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.sheet import Channel
 
 _log = logging.getLogger(__name__)
@@ -169,8 +169,8 @@ class NodeKeeper:
                     break
                 self.error = error
                 if self._request.newcomers:
-                    final = isinstance(error, (NotAuthentic, PolicyRefused, BadData))
-                    if isinstance(error, NoRoom):
+                    final = isinstance(error, (NotAuthenticError, PolicyError, BadDataError))
+                    if isinstance(error, NoRoomError):
                         self._say("waiting", why="no room on the bus")
                     else:
                         self._say("refused" if final else "lost", error)
@@ -181,7 +181,7 @@ class NodeKeeper:
                     return
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
-                lost: State = "refused" if isinstance(error, BadDatasheet) else "lost"
+                lost: State = "refused" if isinstance(error, BadDatasheetError) else "lost"
                 self._say(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
                 self._wait(min(pause, patience.left), began)
                 pause = min(2 * pause, LAST_PAUSE)
@@ -211,13 +211,13 @@ class NodeKeeper:
         """Measure until the end or an error: what ended it, None for the end in order."""
         try:
             self._once()
-        except SessionLost as lost:
+        except SessionLostError as lost:
             return lost.cause
         except TedsProvisionError as error:
             return error
         except Exception as bug:  # noqa: BLE001 - a thread that ends without a word looks like an end in order
             _log.debug("Measuring node %s failed.", self.uuid.hex(), exc_info=True)
-            return Bug(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
+            return InternalError(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
         return None
 
     def _let_others_finish(self) -> None:
@@ -242,13 +242,13 @@ class NodeKeeper:
                 other.share.leave(self.uuid)
         try:
             self._in_session(self.bus, sighting, standing)
-        except NoRoom:
+        except NoRoomError:
             raise
         except BaseException as error:
             self._lost_at = time.monotonic()
             self._buses.sightings.let_announce(self.uuid)
             # Under its key it said what it is refused for: it is there, and another measurement may want it now.
-            if not (self._proven and isinstance(error, (NotAuthentic, PolicyRefused, BadData))):
+            if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
                 self._buses.sightings.wrong(sighting)
             raise
 
@@ -276,7 +276,7 @@ class NodeKeeper:
                 standing.unsigned = trusted.unsigned or trusted.unverified
                 self._keep(bus, trusted, standing)
                 answers = True
-            except (NotAuthentic, PolicyRefused, BadData, KeyStolen):
+            except (NotAuthenticError, PolicyError, BadDataError, KeyStolenError):
                 answers = True  # what it was asked for would go on until its lease ends
                 raise
             finally:
@@ -368,7 +368,7 @@ class NodeKeeper:
             try:
                 for plan in plans.streams:
                     self.streams.subscribe(bus, trusted, plan, address, ahead=self._common_start.until(start))
-            except NodeRefused as refusal:
+            except NodeRefusedError as refusal:
                 if refusal.reason == Reason.TOO_LATE and start != SOON:
                     self._common_start.late(self.uuid)
                     start = SOON
@@ -431,7 +431,7 @@ class NodeKeeper:
             if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
                 raise failure
             if silent:
-                raise LinkFailure(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
+                raise LinkError(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
 
     def _is_gone(self) -> bool:
         """Whether it is of no use to wait for its answer: it is silent, or was since it was seen at another place."""
@@ -463,7 +463,7 @@ class NodeKeeper:
             elif now - since > LOOK_FOR_DATA:
                 self._announced = 0.0
                 self._anew.set()
-                raise LinkFailure("The node has restarted, or now answers elsewhere.")
+                raise LinkError("The node has restarted, or now answers elsewhere.")
             return False
         doubted = now - since >= ANNOUNCED
         if doubted:
@@ -481,7 +481,7 @@ class NodeKeeper:
             with bus.share.lock:
                 bus.share.taken.pop(self.uuid, None)
         if answers:
-            with suppress(TedsProvisionError, SessionLost):
+            with suppress(TedsProvisionError, SessionLostError):
                 trusted.node.send(idle(0), "to let go")
         else:
             trusted.node.forget()

@@ -16,7 +16,7 @@ from collections import deque
 from dataclasses import replace
 from typing import ClassVar
 
-from teds_provision.errors import AddressConflict, LinkFailure, NoNode
+from teds_provision.errors import AddressConflictError, LinkError, NoNodeError
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.finding import (
     LONGEST_SECONDS,
@@ -75,7 +75,7 @@ class Asking:
         self._stop, self._asked = threading.Event(), threading.Event()
         self._begun = self._finished = 0  # rounds of questions
         self._turn = threading.Condition()
-        self.failure: LinkFailure | None = None
+        self.failure: LinkError | None = None
         self._thread = threading.Thread(target=self._run, name=f"look-out {place}", daemon=True)
         self._thread.start()
 
@@ -90,7 +90,7 @@ class Asking:
         self._poll = seconds
 
     def discover(self, seconds: float | None = None) -> None:
-        """Ask everybody now, and wait until that is done; raises LinkFailure where the link has failed."""
+        """Ask everybody now, and wait until that is done; raises LinkError where the link has failed."""
         with self._turn:
             wanted = self._begun + 1  # a round that is under way may be past the node that has just come
             self._asked.set()
@@ -138,7 +138,7 @@ class Lookout(Asking):
         while not self._stop.is_set():
             try:
                 self._watch()
-            except LinkFailure as failure:
+            except LinkError as failure:
                 self.failure = failure
                 self._round_begins()  # whoever waits for the next round hears of the failure now
                 self._round_ends()
@@ -227,7 +227,7 @@ class Lookout(Asking):
             self._sightings.note(twice_text(uuid, addresses))
 
     def ask(self, address: int, seconds: float) -> None:
-        """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkFailure.
+        """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkError.
 
         An Announce from there ends it: the look-out asks because of that itself.
         """
@@ -236,7 +236,7 @@ class Lookout(Asking):
     def _ask_one(self, address: int, seconds: float, *, until_announced: bool = False) -> None:
         try:
             identity = self.port.identify(address, seconds=seconds, until_announced=until_announced)
-        except AddressConflict:
+        except AddressConflictError:
             self._sightings.conflict(self.port.place, address)
             return
         if identity is not None:
@@ -311,9 +311,9 @@ class AirLookout(Asking):
             for contact in self.port.everyone(seconds=2 * LEAST, notice=_nothing):
                 number = contact.connection or 0
                 self._sightings.saw(Sighting(contact.identity, number, self.port, time.monotonic()))
-        except NoNode:
+        except NoNodeError:
             pass
-        except LinkFailure as failure:
+        except LinkError as failure:
             self.failure = failure
         self._round_ends()
 

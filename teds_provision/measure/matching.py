@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, PolicyError, UsageError
 from teds_provision.measure.planning import BusTime, plan_node, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.base import ROWS
@@ -44,7 +44,7 @@ class Match:
 
     @classmethod
     def parse(cls, text: str) -> Match:
-        """Read an expression; raises UsageFailure with the term that is wrong."""
+        """Read an expression; raises UsageError with the term that is wrong."""
         parts = [part.strip() for part in text.split(",")]
         if parts == [ALL]:
             return cls(ALL)
@@ -64,12 +64,12 @@ class Match:
                 found["group"].append(part)
         try:
             fits = parse_fits(", ".join(bounds)) if bounds else None
-        except BadData as error:
-            raise UsageFailure(f"{text!r}: {error.message}", hint=error.hint) from error
+        except BadDataError as error:
+            raise UsageError(f"{text!r}: {error.message}", hint=error.hint) from error
         return cls(text, tuple(found["type"]), tuple(found["name"]), tuple(found["group"]), fits)
 
     def require_groups(self, station: Station) -> None:
-        """Raise NotFound where the expression names a group that is not there."""
+        """Raise NotFoundError where the expression names a group that is not there."""
         for group in self.groups:
             station.groups.get(group)
 
@@ -164,7 +164,7 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
         plans = plan_node(
             sensors_of(sensors, (), request.kind), time, rate=request.rate, kind=request.kind, at_most=True
         )
-    except (BadData, PolicyRefused):  # its session will say so
+    except (BadDataError, PolicyError):  # its session will say so
         return Load()
     rates = [1 / period for period in plans.periods().values() if period > 0]
     return Load(plans.load, len(rates), max(rates, default=0.0))
@@ -173,12 +173,12 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
 def _is_profile(kind: str, station: Station) -> bool:
     try:
         return is_profile_name(kind) and find_profile(kind, default_folders(station.home)).is_file()
-    except NotFound:
+    except NotFoundError:
         return False
 
 
-def _wrong(part: str, text: str) -> UsageFailure:
-    return UsageFailure(
+def _wrong(part: str, text: str) -> UsageError:
+    return UsageError(
         f"{part!r} in {text!r} does not select nodes to measure.",
         hint="Use all, a group, type:PROFILE, name:GLOB, group:NAME or 'angle >= 360 deg', joined by commas.",
     )

@@ -1,6 +1,6 @@
 """Which streams a node is asked for: channels by period, instants in a message, the gap, what the bus bears.
 
-Raises PolicyRefused where an asked rate does not fit, with the fastest that does; without one the datasheet's periods
+Raises PolicyError where an asked rate does not fit, with the fastest that does; without one the datasheet's periods
 are slowed to what fits, and ``Plans.slowed`` says so.
 """
 
@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from teds_provision.errors import BadData, NoRoom, PolicyRefused
+from teds_provision.errors import BadDataError, NoRoomError, PolicyError
 from teds_provision.protocol.operation.budget import BLE_OVERHEAD, MOST_LOAD, bus_load, frames, share
 from teds_provision.protocol.operation.datagram import MOST_OCTETS
 from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_STREAM_CHANNELS, SOON, StreamKind
@@ -169,7 +169,9 @@ def plan_node(
             break
         factor *= max(1.02, load / MOST_LOAD)
     else:
-        raise NoRoom("The bus has no capacity left for another node.", hint="Measure fewer nodes, or at a lower rate.")
+        raise NoRoomError(
+            "The bus has no capacity left for another node.", hint="Measure fewer nodes, or at a lower rate."
+        )
     slowed = _slowed(_fastest(groups), _fastest(paced), rate, by_bus=factor > slower)
     streams = tuple(replace(plan, subscribe=replace(plan.subscribe, gap=gap)) for plan in plans)
     return Plans(streams, load - bus.taken, slowed)
@@ -185,7 +187,7 @@ def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> st
         return ""
     possible = f"{1e9 / fastest:.6g}"
     if rate is not None:
-        raise NoRoom(
+        raise NoRoomError(
             f"{rate:g} Hz does not fit the bus ({MOST_LOAD:.0%} of it for data).",
             hint=f"The maximum is --rate {possible}",
         )
@@ -194,16 +196,16 @@ def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> st
 
 
 def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: StreamKind | None) -> list[Channel]:
-    """The sensors to measure: those that were asked for, or all; raises BadData where one cannot be."""
+    """The sensors to measure: those that were asked for, or all; raises BadDataError where one cannot be."""
     fitting = {one.number: one for one in channels if one.sample and one.kind in _SENSORS_OF[kind]}
     for number in wanted:
         if number not in fitting:
-            raise BadData(
+            raise BadDataError(
                 f"Channel {number} is not a sensor that can be measured this way.",
                 hint=f"It has {', '.join(map(str, fitting)) or 'none'}.",
             )
     if not fitting:
-        raise BadData("The datasheet has no sensor that can be measured this way.")
+        raise BadDataError("The datasheet has no sensor that can be measured this way.")
     return [fitting[number] for number in dict.fromkeys(wanted or fitting)]
 
 
@@ -228,7 +230,7 @@ def _groups(channels: Sequence[Channel], rate: float | None, kind: StreamKind | 
     if len(groups) > LAST_STREAM + 1:
         groups = _cut(_at_the_slowest(paced))
     if len(groups) > LAST_STREAM + 1:
-        raise PolicyRefused(
+        raise PolicyError(
             f"{len(channels)} channels need {len(groups)} streams; a node has {LAST_STREAM + 1}.",
             hint="Select fewer with --channel.",
         )
@@ -264,7 +266,7 @@ def period_of(channel: Channel, rate: float | None, *, at_most: bool = False) ->
     if at_most:
         period = max(period, stated)
     if period < stated * (1 - 1e-6):
-        raise PolicyRefused(
+        raise PolicyError(
             f"Channel {channel.number} gives at most {1e9 / stated:g} samples a second.",
             hint=f"Use --rate {1e9 / stated:g}",
         )
@@ -278,7 +280,9 @@ def _plan(
     octets = sum(width for _, width in widths)
     most = most_instants(kind, octets, bus.most_octets)
     if most < 1:
-        raise BadData(f"One sample of channels {', '.join(str(n) for n, _ in widths)} does not fit into a message.")
+        raise BadDataError(
+            f"One sample of channels {', '.join(str(n) for n, _ in widths)} does not fit into a message."
+        )
     n = max(1, min(most, BLOCK // period)) if kind != StreamKind.EVENT else 1
     plan = StreamPlan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
     # Fuller messages where the bus is short of room: the overhead of a message is 13 octets.

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from teds_provision.errors import NoNode, TedsProvisionError
+from teds_provision.errors import NoNodeError, TedsProvisionError
 from teds_provision.links import LinkSettings, Notice, nfc, open_place
 from teds_provision.measure.sources import beside
 from teds_provision.protocol.messages.identity import Identity
@@ -50,7 +50,7 @@ def look(station: Station, places: Sequence[str]) -> Iterator[Present]:
                     contacts = port.everyone(seconds=_LISTEN_SECONDS, notice=told.append)
                 finally:
                     port.close()
-        except NoNode:
+        except NoNodeError:
             contacts = []
         except TedsProvisionError as error:
             yield Present(place, "down", error.message, error.hint)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyError
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.trusting import DEAD_MAN, LEASE
 from teds_provision.protocol.operation.stream_commands import StreamKind
@@ -46,7 +46,7 @@ class Requirements:
             self._turn.notify_all()
 
     def offer(self, uuid: bytes, sheet: Sheet, stop: threading.Event) -> None:
-        """The datasheet that a node has now; returns where all of them suffice. Raises PolicyRefused (6)."""
+        """The datasheet that a node has now; returns where all of them suffice. Raises PolicyError (6)."""
         with self._turn:
             self._sheets[uuid] = sheet
             self._coming.discard(uuid)
@@ -56,7 +56,7 @@ class Requirements:
                 self._turn.wait(min(left, 0.2))
             unmet = self._judge()
         if unmet:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"The datasheets do not meet: {', '.join(unmet)}.",
                 hint="For the reasons: nodes --fits, or --json.",
             )

@@ -12,7 +12,7 @@ import time
 from datetime import UTC, datetime
 from typing import Final
 
-from teds_provision.errors import BadData, BadDatasheet, Garbled, NodeRefused, NodeSilent
+from teds_provision.errors import BadDataError, BadDatasheetError, GarbledError, NodeRefusedError, NodeSilentError
 from teds_provision.measure.buses import MeasuredBus
 from teds_provision.measure.trusting import Trusted
 from teds_provision.station.station import Station
@@ -44,7 +44,7 @@ class Rest:
     def step(self) -> bool:
         """One exchange, if the bus is free for it now; False where nothing is left to do.
 
-        Raises BadDatasheet where what was read is not what the values rest on; SessionLost.
+        Raises BadDatasheetError where what was read is not what the values rest on; SessionLostError.
         """
         began = time.monotonic()
         if began < self._due:
@@ -59,7 +59,12 @@ class Rest:
             self.close()
             self._conclude(done.value)
             return False
-        except (NodeSilent, Garbled, NodeRefused, BadData):  # its data still come, or the keeper finds that they do not
+        except (
+            NodeSilentError,
+            GarbledError,
+            NodeRefusedError,
+            BadDataError,
+        ):  # its data still come, or the keeper finds that they do not
             self.close()
             self._steps, self._due = read_in_between(self._trusted.node, gap=GAP), began + AGAIN
             self._left -= 1
@@ -84,7 +89,7 @@ class Rest:
         ):
             return
         failed = next((check.why for check in verified.checks if check.result == "failed"), "another Security TEDS")
-        raise BadDatasheet(
+        raise BadDatasheetError(
             f"The datasheet on the node is not the one used for the measurement: {failed}. "
             f"Values recorded of it since {iso(datetime.fromtimestamp(self._began, UTC))} do not count.",
             hint=f"See: teds-provision verify {uuid.hex()}",

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from teds_provision.errors import LinkFailure, NoNode, StoreFailure, TedsProvisionError
+from teds_provision.errors import LinkError, NoNodeError, StoreError, TedsProvisionError
 from teds_provision.measure.blocks import (
     Block,
     ChannelFacts,
@@ -169,7 +169,7 @@ class Measurement:
 
     def _gave_up(self) -> bool:
         """Whether no node ever ran and each has had its time."""
-        return not self._open and all(not one.ever_ran and isinstance(one.error, NoNode) for one in self.keepers)
+        return not self._open and all(not one.ever_ran and isinstance(one.error, NoNodeError) for one in self.keepers)
 
     def _look(self) -> None:
         for keeper in self.keepers:
@@ -363,7 +363,7 @@ class Measurement:
     def _note_who_never_came(self) -> None:
         for keeper in self.keepers:
             if not keeper.ever_ran and keeper.error is None:
-                keeper.error = NoNode(
+                keeper.error = NoNodeError(
                     f"Node {keeper.uuid.hex()} did not answer before the measurement ended.",
                     hint="Check its power, the bit rate and the address.",
                 )
@@ -392,8 +392,8 @@ def _as_error(sink: Sink) -> TedsProvisionError | None:
     stats, recorder = sink.stats, sink.recorder
     if stats.dropped and not stats.written and not recorder:
         why = stats.error or f"{sink.name} accepted nothing: all {stats.dropped} values were dropped."
-        return LinkFailure(why, hint=stats.hint or "Check that it is running, and where it listens.")
-    kind = StoreFailure if recorder else TedsProvisionError
+        return LinkError(why, hint=stats.hint or "Check that it is running, and where it listens.")
+    kind = StoreError if recorder else TedsProvisionError
     return kind(stats.error, hint=stats.hint) if stats.error else None
 
 

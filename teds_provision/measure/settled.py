@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadData, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, PolicyError, UsageError
 from teds_provision.lazy import late
 from teds_provision.measure.held_actuator import unit_for
 from teds_provision.measure.trusting import Trusted, claim
@@ -39,10 +39,10 @@ class Settled:
     others: dict[int, NDArray[np.generic]]
 
     def calibrated(self) -> NDArray[np.float64]:
-        """Values in the calibrated unit, before limits; raises PolicyRefused where a raw value cannot be."""
+        """Values in the calibrated unit, before limits; raises PolicyError where a raw value cannot be."""
         values, possible, _ = self.interpreter.calibrated(self.raw, self.others)
         if not (possible & np.isfinite(values)).all():
-            raise PolicyRefused(
+            raise PolicyError(
                 f"Channel {self.interpreter.channel.number} delivers raw values that its type does not allow."
             )
         return values
@@ -56,12 +56,12 @@ class Settled:
 def settle(trusted: Trusted, number: int, *, count: int = SAMPLES, seconds: float = SECONDS) -> Settled:
     """Take ``count`` samples of a sensor over at least ``seconds``, and let it go.
 
-    Raises BadData (no such channel, an actuator, an event sensor), NodeRefused, LinkFailure; PolicyRefused where the
-    node marks a sample as not valid.
+    Raises BadDataError (no such channel, an actuator, an event sensor), NodeRefusedError, LinkError; PolicyError where
+    the node marks a sample as not valid.
     """
     channel = trusted.channel(number)
     if channel.actuator:
-        raise BadData(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
+        raise BadDataError(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
     one = ChannelInterpreter(trusted.sheet, number)
     readers = {number: one} | {other: ChannelInterpreter(trusted.sheet, other) for other in one.others}
     width = sum(reader.octets for reader in readers.values())
@@ -74,7 +74,7 @@ def settle(trusted: Trusted, number: int, *, count: int = SAMPLES, seconds: floa
             time.sleep(max(0.0, began + taken * seconds / (count - 1) - time.monotonic()))
             reply = Sampled.decode(trusted.node.send(sample(tuple(readers)), "to sample"), width)
             if not reply.valid:
-                raise PolicyRefused(
+                raise PolicyError(
                     f"The node marks the reading of channel {number} as invalid: it is warming up, or has a fault.",
                     hint="See: teds-provision mode UUID",
                 )
@@ -90,7 +90,7 @@ def settle(trusted: Trusted, number: int, *, count: int = SAMPLES, seconds: floa
 
 
 def require_still(settled: Settled) -> SampleStatistics:
-    """The reading in the calibrated unit (of angles the circular mean); raises PolicyRefused where it is restless.
+    """The reading in the calibrated unit (of angles the circular mean); raises PolicyError where it is restless.
 
     That is where it spreads, or drifts, by more than the stated uncertainty, or without one a hundredth of the range.
     """
@@ -104,7 +104,7 @@ def require_still(settled: Settled) -> SampleStatistics:
         return reading
     moves = abs(reading.drift) > reading.spread
     amount = own.unit.difference_to_si(abs(reading.drift) if moves else reading.spread)
-    raise PolicyRefused(
+    raise PolicyError(
         f"Channel {channel.number} is not steady: its reading {'drifts' if moves else 'spreads'} by "
         f"{channel.show(amount, difference=True)}; {channel.show(least, difference=True)} is allowed.",
         hint="Keep it still and try again.",
@@ -114,13 +114,13 @@ def require_still(settled: Settled) -> SampleStatistics:
 def reference_for(channel: Channel, value: float | None, unit: str | None, *, shown_unit_asked: bool) -> float:
     """What a person says that a channel stands at, in SI units; None is 0 in the unit that is shown.
 
-    ``shown_unit_asked``: who asks has to name the unit where the one that is shown is not SI. Raises UsageFailure for
-    that, and where 0 is not the same in both; BadData for a unit of another kind.
+    ``shown_unit_asked``: who asks has to name the unit where the one that is shown is not SI. Raises UsageError for
+    that, and where 0 is not the same in both; BadDataError for a unit of another kind.
     """
     other = (channel.shown.scale, channel.shown.offset) != (1.0, 0.0)
     unclear = bool(channel.shown.offset) if value is None else shown_unit_asked and other
     if unit is None and unclear:
-        raise UsageFailure(
+        raise UsageError(
             f"Channel {channel.number} is shown in {channel.shown.text}; give the unit of the value.",
             hint=f"Add --unit {_TYPED.get(channel.shown.text, channel.shown.text)}, or --unit {channel.si_unit}.",
         )

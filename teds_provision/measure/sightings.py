@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from teds_provision.errors import LinkFailure, NoNode
+from teds_provision.errors import LinkError, NoNodeError
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.finding import conflict_text
 from teds_provision.links.can.link import conflict
@@ -151,7 +151,7 @@ class Sightings:
             return [max(places.values(), key=lambda one: one.at) for _, places in sorted(self._seen.items()) if places]
 
     def find(self, uuid: bytes, *, seconds: float, stop: threading.Event, fresh: float = 0.0) -> Sighting:
-        """Wait for a node that was seen after ``fresh`` (time.monotonic); raises NoNode, AddressConflict."""
+        """Wait for a node that was seen after ``fresh`` (time.monotonic); raises NoNodeError, AddressConflictError."""
         until = time.monotonic() + seconds
         with self._turn:
             self._missing[uuid] = self._missing.get(uuid, 0) + 1
@@ -201,11 +201,11 @@ class Sightings:
             return best
         return best if time.monotonic() - best.at >= TWIN else None
 
-    def _nobody(self, uuid: bytes, seconds: float) -> LinkFailure:
+    def _nobody(self, uuid: bytes, seconds: float) -> LinkError:
         recent = [address for (_, address), at in self._conflicts.items() if time.monotonic() - at < RECENT]
         if recent:
             return conflict(min(recent))
-        return NoNode(
+        return NoNodeError(
             f"Node {uuid.hex()} did not answer within {seconds:g} s.",
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
             " nodes that answer.",

@@ -11,14 +11,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
-from teds_provision.errors import AddressConflict, StoreLocked
+from teds_provision.errors import AddressConflictError, StoreLockedError
 from teds_provision.links import LinkSettings
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import CanSpec, parse_spec
 from teds_provision.protocol.operation.can_frames import DATA
 from teds_provision.station.station import Station
-from teds_provision.store.lock import Mark, MarkTaken
+from teds_provision.store.lock import Mark, UsageLockTakenError
 
 LISTENING = 0.25  # seconds in which the data of somebody else's streams to our address is heard
 SIGN_OF_LIFE = 4.0  # seconds in which whoever reads it sends something: lease / 3 is 3.3 s unless he says otherwise
@@ -29,8 +29,8 @@ _MASK = 0x1FFF0000
 def sole_user(station: Station, ports: Sequence[CanPort], command: str) -> Iterator[None]:
     """Use the source addresses of these ports alone; where none was named, each takes the next one that is free.
 
-    Raises StoreLocked (7) where another process of this home has the one that was named, and names it; AddressConflict
-    (5) where another machine is heard to measure under it.
+    Raises StoreLockedError (7) where another process of this home has the one that was named, and names it;
+    AddressConflictError (5) where another machine is heard to measure under it.
     """
     with ExitStack() as stack:
         for port in ports:
@@ -48,7 +48,7 @@ def beside(station: Station, links: LinkSettings, command: str, *, shared: bool 
     """Have short sessions from the source address of ``links``, beside others who do; over a reader there is none.
 
     Gives the links with the address in them: the next free one where none was named and a measurement has it, or, not
-    ``shared``, anybody. Raises StoreLocked (7) where a measurement has the one that was named.
+    ``shared``, anybody. Raises StoreLockedError (7) where a measurement has the one that was named.
     """
     if links.via != "can":
         yield links
@@ -68,28 +68,28 @@ def beside(station: Station, links: LinkSettings, command: str, *, shared: bool 
 
 def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, shared: bool) -> tuple[Mark, int]:
     """Hold the mark of the first source address that is free; gives both."""
-    first: MarkTaken | None = None
+    first: UsageLockTakenError | None = None
     for source in spec.sources:
         mark = station.measurements.source(spec.wire, source, command=command, shared=shared)
         try:
             return stack.enter_context(mark), source
-        except MarkTaken as taken:
+        except UsageLockTakenError as taken:
             first = first or taken
     assert first is not None
     if not spec.source_named:
-        raise StoreLocked(
+        raise StoreLockedError(
             f"Every source address on {spec.text} is in use, 0x{spec.source:02X} by {first.holder}.",
             hint="Stop one of those processes.",
         ) from first
     another = "0xF2" if spec.source == 0xF1 else "0xF1"
-    raise StoreLocked(
+    raise StoreLockedError(
         f"Source address 0x{spec.source:02X} on {spec.text} is in use by {first.holder}.",
         hint=f"Add source={another} to --can, omit source=, or stop that process.",
     ) from first
 
 
 def _require_alone(port: CanPort) -> None:
-    """Raise AddressConflict where data comes for our address, and somebody who is not us sends from it."""
+    """Raise AddressConflictError where data comes for our address, and somebody who is not us sends from it."""
     bus, own = port.bus(), port.spec.source & 7
 
     def ours(frame: Frame) -> bool:
@@ -101,5 +101,5 @@ def _require_alone(port: CanPort) -> None:
     until = time.monotonic() + SIGN_OF_LIFE
     while time.monotonic() < until:
         if bus.rivals.seen():
-            raise AddressConflict(bus.rivals.text, hint=bus.rivals.hint)
+            raise AddressConflictError(bus.rivals.text, hint=bus.rivals.hint)
         time.sleep(0.05)

@@ -12,11 +12,11 @@ from datetime import UTC, datetime
 from typing import Final
 
 from teds_provision.errors import (
-    BadDatasheet,
-    KeyStolen,
-    NotAuthentic,
-    NotWhitelisted,
-    PolicyRefused,
+    BadDatasheetError,
+    KeyStolenError,
+    NotAuthenticError,
+    NotWhitelistedError,
+    PolicyError,
     TedsProvisionError,
 )
 from teds_provision.station.station import Station
@@ -36,23 +36,23 @@ def is_listed(station: Station, uuid: bytes) -> bool:
 def require_measurable(station: Station, uuid: bytes) -> None:
     """Raise unless the decisions made here let this station measure a node; its datasheet is the session's matter.
 
-    Raises NotAuthentic for a revoked node, NotWhitelisted in whitelist mode, PolicyRefused if its key was given away or
-    is not held.
+    Raises NotAuthenticError for a revoked node, NotWhitelistedError in whitelist mode, PolicyError if its key was given
+    away or is not held.
     """
     banned = station.policy.denied(uuid, station.pins.pinned(uuid))
     if banned is not None:
-        raise NotAuthentic(
+        raise NotAuthenticError(
             f"Node {uuid.hex()} was revoked: {banned.why}.",
             hint=f"If that was a mistake: teds-provision revoke --lift {uuid.hex()}",
         )
     station.policy.require_not_given_away(uuid)
     if not station.keys.held(uuid):
-        raise PolicyRefused(
+        raise PolicyError(
             f"This station holds no key of node {uuid.hex()}.",
             hint=f"Tap it and agree on one: teds-provision agree {uuid.hex()}",
         )
     if station.measurements.detection == "whitelist" and not is_listed(station, uuid):
-        raise NotWhitelisted(
+        raise NotWhitelistedError(
             f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"
         )
 
@@ -61,15 +61,15 @@ def why_not_measured(station: Station, uuid: bytes) -> str:
     """Return why a node cannot be measured whatever is asked for; "" if its session decides."""
     try:
         require_measurable(station, uuid)
-    except (NotAuthentic, PolicyRefused) as error:
+    except (NotAuthenticError, PolicyError) as error:
         return error.message.rstrip(".")
     return ""
 
 
 def require_whitelisted(station: Station, uuid: bytes) -> None:
-    """Actuators move only for nodes on the whitelist (operation.md section 7); raises PolicyRefused."""
+    """Actuators move only for nodes on the whitelist (operation.md section 7); raises PolicyError."""
     if station.pins.entry(uuid) is None:
-        raise PolicyRefused(
+        raise PolicyError(
             f"Node {uuid.hex()} is not on the whitelist, so its actuators are not moved.",
             hint=f"To add it: teds-provision whitelist add {uuid.hex()}",
         )
@@ -96,14 +96,14 @@ class NodeStanding:
         """As the function of this name; the error is also kept in ``ended``."""
         try:
             require_measurable(self._station, self._uuid)
-        except (NotAuthentic, PolicyRefused) as error:
+        except (NotAuthenticError, PolicyError) as error:
             self.ended = error
             raise
 
     def require(self) -> None:
-        """Raise NotAuthentic or PolicyRefused if the node may not be measured, or not be moved, any more.
+        """Raise NotAuthenticError or PolicyError if the node may not be measured, or not be moved, any more.
 
-        KeyStolen if it may, under a new key: the session ends, and the next one begins with a rotation. Costs one
+        KeyStolenError if it may, under a new key: the session ends, and the next one begins with a rotation. Costs one
         question to the store until any process has changed it.
         """
         changes, now = self._station.changes(), time.monotonic()
@@ -116,7 +116,7 @@ class NodeStanding:
         self._changes, self._judged = changes, now
         try:
             self._require_today()
-        except (NotAuthentic, PolicyRefused) as error:
+        except (NotAuthenticError, PolicyError) as error:
             self.ended = error
             raise
         self._good = asked
@@ -129,7 +129,7 @@ class NodeStanding:
         failed = [] if judged is None else [one for one in judged.verified.checks if one.result == "failed"]
         why = "; ".join(one.why or one.name for one in failed)
         if verdict == "not authentic" or (verdict == "unsigned" and not self.unsigned):
-            raise BadDatasheet(
+            raise BadDatasheetError(
                 f"The datasheet of node {uuid.hex()} is {verdict} now: {why}. "
                 f"Values recorded of it since {iso(datetime.fromtimestamp(self._good, UTC))} do not count.",
                 hint=f"See: teds-provision verify {uuid.hex()}",
@@ -139,6 +139,6 @@ class NodeStanding:
         if stolen is None:
             self._stolen = None
         elif stolen != self._stolen:
-            raise KeyStolen(f"Node {uuid.hex()} gets a new key: {stolen}.")
+            raise KeyStolenError(f"Node {uuid.hex()} gets a new key: {stolen}.")
         if self.drives:
             require_whitelisted(station, uuid)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NotAuthentic, TedsProvisionError
+from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NotAuthenticError, TedsProvisionError
 from teds_provision.measure.blocks import Block, SetPointCommand
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.trusting import LEASE, Trusted, claim
@@ -29,7 +29,7 @@ from teds_provision.protocol.operation.commands import write_data_set
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
 from teds_provision.protocol.operation.stream_commands import CLOCK, Driven, drive
-from teds_provision.talk.conversation import SessionLost
+from teds_provision.talk.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 
 DRIVE_ABOVE = 50  # set points a second
@@ -108,7 +108,7 @@ class TopicActuators:
             for command in commands:
                 try:
                     self._apply(command)
-                except SessionLost as lost:
+                except SessionLostError as lost:
                     self._refuse(f"channel {command.channel}: the session was lost: {lost.cause.message}")
                 except TedsProvisionError as error:
                     self._refuse(f"channel {command.channel}: {error.message}")
@@ -133,10 +133,10 @@ class TopicActuators:
         self._say(command.channel, actuator, octets)
 
     def _seconds_left(self, command: SetPointCommand) -> float:
-        """Seconds until a set point is too old; raises LinkFailure where it is."""
+        """Seconds until a set point is too old; raises LinkError where it is."""
         age = time.monotonic() - command.received
         if age > self._dead_man / 1000:
-            raise LinkFailure(f"It is {age:.2f} s old; the dead-man is {self._dead_man} ms.")
+            raise LinkError(f"It is {age:.2f} s old; the dead-man is {self._dead_man} ms.")
         return self._dead_man / 1000 - age
 
     def _send(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
@@ -160,14 +160,14 @@ class TopicActuators:
     def _set(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
         try:
             self._write(command, octets)
-        except NodeRefused as refusal:
+        except NodeRefusedError as refusal:
             actuator.claimed_until = 0.0
             if refusal.reason != Reason.WRONG_STATE:
                 raise
             # Its dead-man has run out meanwhile, by the node's clock: the way back is a new Operate.
             self._claim(command.channel, actuator)
             self._write(command, octets)
-        except LinkFailure:
+        except LinkError:
             self._unsure, actuator.claimed_until, actuator.driver = True, 0.0, None
             raise
 
@@ -179,7 +179,7 @@ class TopicActuators:
         actuator.driver = None
         try:
             claim(self._trusted, number, lease=LEASE, dead_man=self._dead_man)
-        except NodeRefused as refusal:
+        except NodeRefusedError as refusal:
             if refusal.reason != Reason.WRONG_STATE:  # it is claimed by this session still
                 raise
 
@@ -189,8 +189,10 @@ class TopicActuators:
             return False
         try:
             self._drive(command, actuator, octets)
-        except (NodeRefused, NotAuthentic, Garbled) as error:
-            if not (isinstance(error, NodeRefused) and error.reason == Reason.WRONG_STATE):  # its claim is gone: _set
+        except (NodeRefusedError, NotAuthenticError, GarbledError) as error:
+            if not (
+                isinstance(error, NodeRefusedError) and error.reason == Reason.WRONG_STATE
+            ):  # its claim is gone: _set
                 actuator.drivable = False
                 self._tell(f"channel {command.channel} takes no Drive messages: {error.message}")
             return False

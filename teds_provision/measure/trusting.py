@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.links.ports import Timed
 from teds_provision.measure.blocks import ChannelFacts, Kind
 from teds_provision.measure.clock import ClockMap, Exchange
@@ -131,18 +131,18 @@ class Trusted:
         return replace(known, siblings=siblings, frame=frame, deviation=_deviation(of_type, channel))
 
     def channel(self, number: int) -> Channel:
-        """A channel of the datasheet; raises BadData where there is none."""
+        """A channel of the datasheet; raises BadDataError where there is none."""
         found = self.sheet.channel(number)
         if found is None:
             numbers = ", ".join(str(one.number) for one in self.sheet.channels) or "none"
-            raise BadData(f"Node {self.uuid} has no channel {number}; its datasheet has {numbers}.")
+            raise BadDataError(f"Node {self.uuid} has no channel {number}; its datasheet has {numbers}.")
         return found
 
 
 def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: bool = False) -> Trusted:
     """Open a session and verify the datasheet for the command ``by``; ``unsigned`` also takes one that nobody signed.
 
-    Raises PolicyRefused (no key, not listed), NotAuthentic and Unproven (revoked, the datasheet), LinkFailure.
+    Raises PolicyError (no key, not listed), NotAuthenticError and UnprovenError (revoked, the datasheet), LinkError.
     """
     require_measurable(station, node.uuid)
     require_session(station, node)
@@ -152,14 +152,14 @@ def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: boo
 def open_unverified(station: Station, node: Conversation, *, by: str) -> Trusted:
     """Open a session with a node whose datasheet nobody has signed, all of it read in a session since its last start.
 
-    The session says that it is this node's; that it is right, nobody says. Raises PolicyRefused where somebody signed
+    The session says that it is this node's; that it is right, nobody says. Raises PolicyError where somebody signed
     it, and what :func:`open_trusted` raises.
     """
     require_measurable(station, node.uuid)
     require_session(station, node)
     looked = look_in_session(station, node, by=by)
     if looked.verified.verdict == "authentic":
-        raise PolicyRefused("Its datasheet is signed now.")
+        raise PolicyError("Its datasheet is signed now.")
     if looked.verified.verdict != "unsigned":
         require_authentic(looked.verified)
     image = looked.image

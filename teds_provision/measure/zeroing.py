@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.measure.held_actuator import unit_for
@@ -28,7 +28,7 @@ from teds_provision.steps.commands import Visit, at_node
 from teds_provision.steps.sign import sign
 from teds_provision.steps.verify_node import Looked, look_in_session, verify_node
 from teds_provision.steps.write import Low, wait_for_charge, write
-from teds_provision.talk.conversation import SessionLost
+from teds_provision.talk.conversation import SessionLostError
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.zero import offset_for, reading_of, shortest, turn_of, with_zero_offset
@@ -98,9 +98,9 @@ def zero_at(
 ) -> Zeroed:
     """Have a channel of the node that ``node`` names read ``order.value`` now.
 
-    A running `ncap` of this home that measures the node lets it go, and gets it back. Raises PolicyRefused (too
-    restless, no calibration whose offset could carry it, a value beyond the limits, the guard), NotAuthentic where the
-    datasheet on the node is not good, and what reading, signing and writing raise.
+    A running `ncap` of this home that measures the node lets it go, and gets it back. Raises PolicyError (too
+    restless, no calibration whose offset could carry it, a value beyond the limits, the guard), NotAuthenticError where
+    the datasheet on the node is not good, and what reading, signing and writing raise.
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
@@ -111,7 +111,7 @@ def zero_at(
     ):
         try:
             return _Zeroing(visit, order, Steps(reporter), low, dry_run=dry_run).run()
-        except SessionLost as lost:
+        except SessionLostError as lost:
             raise lost.cause from lost
 
 
@@ -174,7 +174,7 @@ class _Zeroing:
         return self._bring(wanted_image, found)
 
     def _wanted(self, channel: Channel, own: Calibration) -> float:
-        """What the channel is to read, in the calibrated unit; raises PolicyRefused beyond its limits."""
+        """What the channel is to read, in the calibrated unit; raises PolicyError beyond its limits."""
         order = self.order
         si = reference_for(channel, order.value, order.unit, shown_unit_asked=order.shown_unit_asked)
         if not channel.full_turn:
@@ -182,7 +182,7 @@ class _Zeroing:
             if si < channel.low - slack or si > channel.high + slack:
                 said = unit_for(channel, order.unit) if order.unit is not None else channel.shown
                 asked, low, high = (format_value(each, said) for each in (si, channel.low, channel.high))
-                raise PolicyRefused(
+                raise PolicyError(
                     f"{asked} exceeds the limits of channel {channel.number}, {low} to {high}.",
                     hint="Limits come from the signed datasheet and cannot be exceeded.",
                 )
@@ -233,24 +233,24 @@ class _Zeroing:
 
 
 def _require_nobody_else(trusted: Trusted) -> None:
-    """Raise PolicyRefused where another session claims a channel: the node would refuse what was signed by then."""
+    """Raise PolicyError where another session claims a channel: the node would refuse what was signed by then."""
     claimed = [one for one in operation(trusted.node).channels.values() if one[0] & ChannelState.CLAIMED_BY_OTHER]
     if claimed:
-        raise PolicyRefused(
+        raise PolicyError(
             f"Node {trusted.uuid} is being measured by another station, source address 0x{claimed[0][1]:02X}.",
             hint="End that measurement first. A running ncap of this home releases the node by itself.",
         )
 
 
 def _adjustable(trusted: Trusted, number: int) -> tuple[Channel, Calibration]:
-    """A sensor and its calibration; raises PolicyRefused where there is no offset that could be moved."""
+    """A sensor and its calibration; raises PolicyError where there is no offset that could be moved."""
     channel = trusted.channel(number)
     if channel.actuator:
-        raise BadData(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
+        raise BadDataError(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
     own = channel.calibration
     if own is None:
         why = channel.calibration_problem or "it has none."
-        raise PolicyRefused(
+        raise PolicyError(
             f"Channel {number} has no calibration with an offset that can be changed: {why}",
             hint="Calibrate it first: calibrate capture, then provision with --calibration FILE.",
         )

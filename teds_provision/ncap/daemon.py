@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final, get_args
 
 from teds_provision import __version__
-from teds_provision.errors import Frozen, NotFound, UsageFailure, VaultFailure
+from teds_provision.errors import FrozenError, NotFoundError, UsageError, VaultError
 from teds_provision.links import Port
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
@@ -178,7 +178,7 @@ class Daemon:
         problem: dict[str, str] | None = None
         try:
             self.station.current_vault()
-        except VaultFailure as failure:
+        except VaultError as failure:
             problem = {"code": failure.code, "message": failure.message, "hint": failure.hint}
         if (problem is None) == (self._vault_problem is None):
             return
@@ -274,12 +274,12 @@ class Daemon:
         return self.station.measurements.detection
 
     def set_detection(self, mode: str) -> None:
-        """Change the mode, and look at all links anew; raises UsageFailure.
+        """Change the mode, and look at all links anew; raises UsageError.
 
         What was found in another mode is forgotten until it is found again; in the same one it stays.
         """
         if mode not in get_args(Detection):
-            raise UsageFailure(f"{mode!r} is not a detection mode.", hint="Use transparent or whitelist.")
+            raise UsageError(f"{mode!r} is not a detection mode.", hint="Use transparent or whitelist.")
         changes = mode != self.station.measurements.detection
         with self.station.durable("detection"):
             self.station.measurements.detection = mode  # type: ignore[assignment]
@@ -299,29 +299,29 @@ class Daemon:
         return self.roster.nodes()
 
     def known(self, text: str) -> str:
-        """The UUID that a path names, of a node that something is known of; raises NotFound, UsageFailure."""
+        """The UUID that a path names, of a node that something is known of; raises NotFoundError, UsageError."""
         uuid = self.resolve(text)
         if not self.roster.known(uuid) and not self.station.nodes.is_known(bytes.fromhex(uuid)):
-            raise NotFound(f"No node matches {uuid!r}.", hint="See /nodes.")
+            raise NotFoundError(f"No node matches {uuid!r}.", hint="See /nodes.")
         return uuid
 
     def resolve(self, text: str) -> str:
-        """The UUID that a word names: whole, or a prefix or name as everywhere; raises NotFound, UsageFailure."""
+        """The UUID that a word names: whole, or a prefix or name as everywhere; raises NotFoundError, UsageError."""
         digits = text.lower().removeprefix("0x")
         if self.roster.known(digits):
             return digits
         try:
             return self.station.nodes.resolve(text).hex()
-        except NotFound:
+        except NotFoundError:
             near = [uuid for uuid in self.roster.uuids() if uuid.startswith(digits)] if len(digits) >= 4 else []
             if len(near) == 1:
                 return near[0]
             raise
 
     def login_url(self, *, read_only: bool = False) -> str:
-        """The page's address with a token that works once; raises UsageFailure where no page is served."""
+        """The page's address with a token that works once; raises UsageError where no page is served."""
         if self.url is None:
-            raise UsageFailure(
+            raise UsageError(
                 "The station is not serving its page.", hint="Restart it with --http: ncap run --http 127.0.0.1:8351"
             )
         return f"{self.url}/login?token={self.tokens.login_link(read_only=read_only)}"
@@ -340,13 +340,13 @@ class Daemon:
         ]
 
     def make_group(self, name: str, uuids: list[str]) -> None:
-        """A new group; raises UsageFailure."""
+        """A new group; raises UsageError."""
         with self.station.lock("group create"):
             self.station.groups.create(name, [bytes.fromhex(uuid) for uuid in uuids])
         self._group_changed(name)
 
     def change_group(self, name: str, uuids: list[str]) -> None:
-        """Other members; raises NotFound, Frozen while it is measured."""
+        """Other members; raises NotFoundError, FrozenError while it is measured."""
         wanted = {bytes.fromhex(uuid) for uuid in uuids}
         with self.station.lock("group change"):
             present = set(self.station.groups.get(name).uuids)
@@ -357,7 +357,7 @@ class Daemon:
         self._group_changed(name)
 
     def drop_group(self, name: str) -> None:
-        """Delete a group; raises NotFound, Frozen while it is measured."""
+        """Delete a group; raises NotFoundError, FrozenError while it is measured."""
         with self.station.lock("group delete"):
             self.station.groups.get(name)
             self._require_thawed(name)
@@ -366,7 +366,7 @@ class Daemon:
 
     def _require_thawed(self, name: str) -> None:
         if self.measuring.group_is_measured(name):
-            raise Frozen(
+            raise FrozenError(
                 f"Group {name!r} is being measured and cannot be changed now.", hint="End the measurement first."
             )
 
@@ -380,18 +380,21 @@ class Daemon:
     def make_virtual(
         self, *, name: str | None, source: str, content: str | None, profile: str | None
     ) -> dict[str, Any]:
-        """Make one and start it; it is provisioned when it answers. Raises UsageFailure, BadData, NotFound."""
+        """Make one and start it; it is provisioned when it answers. Raises UsageError, BadDataError, NotFoundError."""
         made = self.virtuals.make(name=name, source=source, content=content, profile=profile)
         self._start_virtuals()
         self.roster.refresh([made.uuid])
         return made.as_json()
 
     def drop_virtual(self, uuid: str) -> None:
-        """End one, and its key with it; raises NotFound, Frozen (it is measured), NodeBusy (it is worked on)."""
+        """End one, and its key with it.
+
+        Raises NotFoundError, FrozenError (it is measured), NodeBusyError (it is worked on).
+        """
         with self.turns.of(uuid, "it is removed"):
             with self.station.lock("virtual"):  # nobody begins to measure it meanwhile
                 if self.measuring.of(uuid) is not None:
-                    raise Frozen(f"Node {uuid} is being measured.", hint="End the measurement first.")
+                    raise FrozenError(f"Node {uuid} is being measured.", hint="End the measurement first.")
                 one = self.virtuals.forget(uuid)
             self.virtuals.end(one)
             self.roster.note(uuid, "left", present=False)

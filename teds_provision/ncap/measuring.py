@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 from teds_provision.errors import (
-    Frozen,
-    LinkFailure,
-    NodeBusy,
-    NotFound,
-    PolicyRefused,
+    FrozenError,
+    LinkError,
+    NodeBusyError,
+    NotFoundError,
+    PolicyError,
     TedsProvisionError,
-    UsageFailure,
+    UsageError,
 )
 from teds_provision.measure.blocks import ChannelFacts, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
@@ -120,7 +120,7 @@ class Measuring:
     def match(self, expression: str, *, rate: float | None = None, frozen: bool = False) -> None:
         """Measure whoever comes and is meant, for the life of this process (``ncap run --measure``).
 
-        Raises UsageFailure, NotFound for an expression that says nothing, or names a group that is not there.
+        Raises UsageError, NotFoundError for an expression that says nothing, or names a group that is not there.
         """
         Match.parse(expression).require_groups(self._station)
         same = (expression, rate, frozen)
@@ -200,17 +200,17 @@ class Measuring:
     ) -> dict[str, Any]:
         """Measure from now on, after every restart too, until it is deleted; ``owner`` is who asked for it.
 
-        Raises UsageFailure (no node, a sink that cannot be named so), NotFound (the group), NodeBusy (one of the nodes
-        is measured already).
+        Raises UsageError (no node, a sink that cannot be named so), NotFoundError (the group), NodeBusyError (one of
+        the nodes is measured already).
         """
         if sum((group is not None, bool(uuids), match is not None)) != 1:
-            raise UsageFailure(
+            raise UsageError(
                 "A measurement needs a group, nodes, or an expression.", hint='Give "group", "uuids" or "match".'
             )
         if match is not None:
             Match.parse(match).require_groups(self._station)
             if trigger and not frozen:
-                raise UsageFailure(
+                raise UsageError(
                     "Nodes that join one by one cannot start together.", hint='Omit the trigger, or set "frozen".'
                 )
         kept = KeptMeasurement(
@@ -232,7 +232,7 @@ class Measuring:
         # What can never be measured is refused before it is kept: it would be tried for ever, after each restart too.
         nodes = self._station.measurements.nodes_of(kept)
         if not nodes and match is None:
-            raise UsageFailure(f"Group {group!r} is empty.", hint="Add a node to it first.")
+            raise UsageError(f"Group {group!r} is empty.", hint="Add a node to it first.")
         for uuid in nodes:
             self._require_unmeasured(uuid)
             self._require_plan(uuid, kept)
@@ -252,10 +252,15 @@ class Measuring:
     def _require_unmeasured(self, uuid: bytes) -> None:
         other = self.of(uuid.hex())
         if other is not None:
-            raise NodeBusy(f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first.")
+            raise NodeBusyError(
+                f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first."
+            )
 
     def _require_plan(self, uuid: bytes, kept: KeptMeasurement) -> None:
-        """Raise what :func:`require_measurable` does, and BadData if the known datasheet can never be measured so."""
+        """Raise what :func:`require_measurable` does.
+
+        And BadDataError if the known datasheet can never be measured so.
+        """
         require_measurable(self._station, uuid)
         image = self._station.nodes.datasheet(uuid)
         if image is None:
@@ -268,15 +273,15 @@ class Measuring:
             period_of(channel, kept.rate)
 
     def delete(self, measurement_id: str) -> None:
-        """End it, and forget it; raises NotFound, PolicyRefused for one that a command of this home runs."""
+        """End it, and forget it; raises NotFoundError, PolicyError for one that a command of this home runs."""
         with self._guard:
             one = self._running.pop(measurement_id, None)
         if one is None:
             kept = next((other for other in self._station.measurements.all() if other.id == measurement_id), None)
             if kept is None:
-                raise NotFound(f"No measurement has the ID {measurement_id!r}.")
+                raise NotFoundError(f"No measurement has the ID {measurement_id!r}.")
             if not kept.lasting:
-                raise PolicyRefused(
+                raise PolicyError(
                     f"Measurement {measurement_id} belongs to the command measure (process {kept.pid}).",
                     hint="End it there with Ctrl-C.",
                 )
@@ -285,7 +290,7 @@ class Measuring:
             self._end(one)
         with self._station.durable("measure"):
             if not self._station.measurements.forget(measurement_id) and one is None:
-                raise NotFound(f"No measurement has the ID {measurement_id!r}.")
+                raise NotFoundError(f"No measurement has the ID {measurement_id!r}.")
             self._station.audit("measure", None, "ended", id=measurement_id)
         self._live.event("measurement", state="deleted", id=measurement_id)
 
@@ -299,7 +304,7 @@ class Measuring:
         """Return those of commands that live, to be shown; the nodes of one whose group is gone are not known."""
         found = []
         for kept in self._station.measurements.of_commands():
-            with suppress(NotFound):
+            with suppress(NotFoundError):
                 uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
                 why = f"measured by the command measure (process {kept.pid})"
                 found.append(Running(kept, uuids, state="running", why=why))
@@ -346,8 +351,8 @@ class Measuring:
     def let_go(self, loan: Loan) -> bool:
         """Let a node go until :meth:`give_back`, so that somebody can write to it; False where nobody measures it.
 
-        It may be let go to several at once, who take turns at the node. Raises NodeBusy where its session did not end
-        in order within :data:`LETTING_GO` seconds; then it is measured on.
+        It may be let go to several at once, who take turns at the node. Raises NodeBusyError where its session did not
+        end in order within :data:`LETTING_GO` seconds; then it is measured on.
         """
         with self._lending:
             if loan.ended:
@@ -357,14 +362,14 @@ class Measuring:
                 self._loans.setdefault(loan.uuid, []).append(loan)
                 return False
             if job.kept.frozen:
-                raise Frozen(
+                raise FrozenError(
                     f"Node {loan.uuid} is in a frozen measurement ({job.kept.id}).", hint="End the measurement first."
                 )
             self._loans.setdefault(loan.uuid, []).append(loan)
             if job.let_go(bytes.fromhex(loan.uuid), loan.why, LETTING_GO):
                 return True
         self.give_back(loan)
-        raise NodeBusy(
+        raise NodeBusyError(
             f"Node {loan.uuid} is being measured and was not released within {LETTING_GO:g} s.", hint="Try again."
         )
 
@@ -394,7 +399,7 @@ class Measuring:
             return
         lookout = self._buses.of(seen).lookout
         if isinstance(lookout, Lookout):
-            with suppress(LinkFailure):
+            with suppress(LinkError):
                 lookout.ask(record.can_address, ANSWERING)
 
     def sheet(self, uuid: str) -> Image | None:
@@ -480,7 +485,7 @@ class Measuring:
         try:
             kept = self._station.measurements.get(one.kept.id)
             uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
-        except NotFound as error:
+        except NotFoundError as error:
             self._say(one, "ended", error.message)
             with self._guard:
                 self._running.pop(one.kept.id, None)
@@ -500,7 +505,7 @@ class Measuring:
             return job.kept.ends is None and not one.stop.is_set()
         try:
             return {uuid.hex() for uuid in self._station.measurements.nodes_of(kept)} != set(one.uuids)
-        except NotFound:
+        except NotFoundError:
             return True
 
     def _run_with_members(self, one: Running) -> bool:

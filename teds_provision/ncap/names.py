@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from teds_provision.errors import Frozen, NotFound, UsageFailure
+from teds_provision.errors import FrozenError, NotFoundError, UsageError
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.running.measurement_job import station_facts
 from teds_provision.measure.sinks.names import Topics, is_topic
@@ -63,26 +63,26 @@ class Names:
     def rename(self, uuid: str, channel: int, name: str | None) -> None:
         """Publish it under this name; None: under the one that is made for it.
 
-        Raises UsageFailure, NotFound for a channel that the node has not, Frozen.
+        Raises UsageError, NotFoundError for a channel that the node has not, FrozenError.
         """
         if name is not None and not is_topic(name):
-            raise UsageFailure(
+            raise UsageError(
                 f"{name!r} is not a valid topic name.",
                 hint="Use letters, digits and single _, beginning with a letter; / between parts.",
             )
         known = [number for number, _ in self._roster.channel_names(uuid)]
         if name is not None and channel and known and channel not in known:
-            raise NotFound(
+            raise NotFoundError(
                 f"{uuid} has no channel {channel}.", hint=f"Channels in its datasheet: {', '.join(map(str, known))}."
             )
         if name is not None:
             self._now().require_free(uuid, channel, name)
             meant = name.strip("/") if not channel else f"/{name.strip('/')}"
             if any(row["topic"] == meant for row in self.all() if (row["uuid"], row["channel"]) != (uuid, channel)):
-                raise UsageFailure(f"{name!r} is published already.", hint="Choose another name.")
+                raise UsageError(f"{name!r} is published already.", hint="Choose another name.")
         raw = bytes.fromhex(uuid)
         if self._is_measured(uuid) or self._station.measurements.is_running(raw):
-            raise Frozen(
+            raise FrozenError(
                 f"Node {uuid} is being measured, so its names cannot be changed now.", hint="End the measurement first."
             )
         with self._station.durable("rename"):

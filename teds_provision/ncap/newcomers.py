@@ -16,7 +16,14 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import Final
 
-from teds_provision.errors import BadData, LinkFailure, NoRoom, NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.errors import (
+    BadDataError,
+    LinkError,
+    NoRoomError,
+    NotAuthenticError,
+    PolicyError,
+    TedsProvisionError,
+)
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.keeper import NodeKeeper
@@ -291,7 +298,7 @@ class Newcomers:
             return
         try:
             member.stack.enter_context(self._station.measurements.running([octets], what=f"measure {self._match.text}"))
-        except PolicyRefused as error:  # it is being renamed
+        except PolicyError as error:  # it is being renamed
             self._wait(uuid, error.message, None, 1.0)
             return
         self._lost.pop(uuid, None)
@@ -317,9 +324,9 @@ class Newcomers:
         if last is not None:
             self._places[uuid] = last
         self._release(uuid)
-        if isinstance(error, NoRoom) and sighting is not None:
+        if isinstance(error, NoRoomError) and sighting is not None:
             self._waits[uuid] = _Waits(now + AGAIN, self._buses.of(sighting).share.room)
-        elif isinstance(error, (NotAuthentic, PolicyRefused, BadData)):
+        elif isinstance(error, (NotAuthenticError, PolicyError, BadDataError)):
             self._waits[uuid] = _Waits(now + AGAIN)
             if last is not None and last.identity.state == NodeState.FACTORY:  # whoever adopts hears it, now it is free
                 self._askers.submit(self._ask, last)
@@ -374,7 +381,7 @@ class Newcomers:
 
     def _ask(self, sighting: Sighting) -> None:
         """Ask a lost node where it was; where it answers, it is seen, and so joins."""
-        with suppress(LinkFailure, KeyError):
+        with suppress(LinkError, KeyError):
             lookout = self._buses.of(sighting).lookout
             if isinstance(sighting.port, CanPort) and isinstance(lookout, Lookout):
                 lookout.ask(sighting.address, ANSWERING)

@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFoundError
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ class Past:
 
         ``bin`` is their width in s, ``time`` their beginnings; a bin in which nothing happened is left out. ``low`` and
         ``high`` are SI values, None where none was valid. The last minute is given in bins of 10 ms if no more is asked
-        for. Raises NotFound where nothing of the channel was measured within the hour.
+        for. Raises NotFoundError where nothing of the channel was measured within the hour.
         """
         self._take_in()
         end = time.time() if until is None else until
@@ -213,7 +213,7 @@ class Past:
         with self._turn:
             one = self._channels.get((uuid, channel))
             if one is None:
-                raise NotFound(
+                raise NotFoundError(
                     f"Nothing was measured of channel {channel} of node {uuid} within the last hour.",
                     hint="Start a measurement; the station keeps an hour of it in memory.",
                 )

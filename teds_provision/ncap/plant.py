@@ -15,11 +15,11 @@ from typing import Any, Final
 
 from teds_provision import plant
 from teds_provision.errors import (
-    LinkFailure,
-    NotAuthentic,
-    NotFound,
-    NotMember,
-    StoreLocked,
+    LinkError,
+    NotAuthenticError,
+    NotFoundError,
+    NotMemberError,
+    StoreLockedError,
     TedsProvisionError,
 )
 from teds_provision.ncap.live import Live
@@ -53,7 +53,7 @@ class PlantWatch:
         self._look_again = 0.0
 
     def start(self) -> None:
-        """Begin; raises PolicyRefused where no registry was joined."""
+        """Begin; raises PolicyError where no registry was joined."""
         plant.folding.require_roster(self._station)
         for run, name in ((self._run, "registry"), (self._listen, "registry listener")):
             self._threads.append(threading.Thread(target=run, name=name, daemon=True))
@@ -110,7 +110,7 @@ class PlantWatch:
         }  # fmt: skip
 
     def nodes(self, text: str) -> dict[str, Any]:
-        """api.md, `/plant/nodes`; raises PolicyRefused where no registry was joined."""
+        """api.md, `/plant/nodes`; raises PolicyError where no registry was joined."""
         found = plant.status.nodes(self._station, plant.folding.require_roster(self._station), text)
         first = list(islice(found, MOST_SHOWN + 1))
         return {"nodes": first[:MOST_SHOWN], "more": len(first) > MOST_SHOWN}
@@ -119,15 +119,15 @@ class PlantWatch:
         """api.md, `/jobs`."""
         found = []
         for row in self._station.plant.line.jobs():
-            with suppress(NotAuthentic):  # of a keeper that no roster names any more
+            with suppress(NotAuthenticError):  # of a keeper that no roster names any more
                 found.append(self._job(plant.jobs.kept_job(self._station, row), row.state))
         return found
 
     def job(self, text: str) -> dict[str, Any]:
-        """api.md, `/jobs/{id}`; raises NotFound. What a sync brought, and nobody took, is no job yet."""
+        """api.md, `/jobs/{id}`; raises NotFoundError. What a sync brought, and nobody took, is no job yet."""
         rows = [row for row in self._station.plant.line.jobs() if len(text) >= 4 and row.id.startswith(text.lower())]
         if len(rows) != 1:
-            raise NotFound(f"{len(rows) or 'No'} jobs begin with {text[:64]}.", hint="GET /jobs lists them.")
+            raise NotFoundError(f"{len(rows) or 'No'} jobs begin with {text[:64]}.", hint="GET /jobs lists them.")
         [row] = rows
         found = plant.jobs.kept_job(self._station, row)
         parts = plant.yields.yields(self._station, found, plant.yields.attempts_of(self._station, found.id))
@@ -168,11 +168,11 @@ class PlantWatch:
             if time.monotonic() >= self._look_again:
                 plant.reaching.check_database(station, self._post)
                 self._look_again = time.monotonic() + _DATABASE_CHECK
-        except StoreLocked:
+        except StoreLockedError:
             return True
-        except NotMember as error:
+        except NotMemberError as error:
             self._tell("removed", error.message)
-        except LinkFailure as error:
+        except LinkError as error:
             self._tell("unreachable", error.message)
         except TedsProvisionError as error:
             self._tell("alarm", error.message)

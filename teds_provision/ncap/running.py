@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Final
 
 from teds_provision.client import SOCKET
-from teds_provision.errors import StoreLocked
+from teds_provision.errors import StoreLockedError
 from teds_provision.files import listen_alone, open_lock
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.settings import Settings, require_safe
@@ -28,7 +28,7 @@ LOCK: Final = "ncap.lock"
 
 
 class Presence:
-    """``with Presence(home):`` is the one daemon of this home; raises StoreLocked where there is one, StoreFailure."""
+    """``with Presence(home):`` is the one daemon of this home; raises StoreLockedError if there is one, StoreError."""
 
     def __init__(self, home: Path) -> None:
         self._home = home
@@ -41,7 +41,7 @@ class Presence:
         except BlockingIOError:
             pid = os.pread(descriptor, 20, 0).decode(errors="replace").strip()
             os.close(descriptor)
-            raise StoreLocked(
+            raise StoreLockedError(
                 f"A base station is already running for {self._home} (pid {pid or 'unknown'}).",
                 hint="Show it: teds-provision ncap status. Stop it: kill -TERM PID.",
             ) from None
@@ -71,7 +71,7 @@ Tell = Callable[[dict[str, Any]], None]
 def run(station: Station, settings: Settings, tell: Tell) -> None:
     """Run until SIGTERM or Ctrl-C; ``tell`` gets the line that it is ready, then a line for each event.
 
-    Raises StoreLocked where this home has a daemon, LinkFailure where the address is taken, UsageFailure.
+    Raises StoreLockedError where this home has a daemon, LinkError where the address is taken, UsageError.
     """
     require_safe(settings)
     station.released = lambda _uuid, _command: nullcontext()  # in this process the turns of each node see to that

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
 
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import read_limited
 from teds_provision.links import Trace
 from teds_provision.links.ble import spec as ble
@@ -76,11 +76,11 @@ def with_source(place: str, source: int) -> str:
 
 
 def parse_http(text: str) -> tuple[str, int]:
-    """``HOST:PORT``, ``[::1]:PORT`` or ``PORT`` alone (this machine); raises UsageFailure."""
+    """``HOST:PORT``, ``[::1]:PORT`` or ``PORT`` alone (this machine); raises UsageError."""
     host, colon, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if colon else "127.0.0.1"
     if not port.isdecimal() or int(port) > 0xFFFF or not host:
-        raise UsageFailure(f"--http {text!r} is not HOST:PORT.", hint="Use, for example, 127.0.0.1:8351.")
+        raise UsageError(f"--http {text!r} is not HOST:PORT.", hint="Use, for example, 127.0.0.1:8351.")
     return host, int(port)
 
 
@@ -93,27 +93,27 @@ def is_loopback(host: str) -> bool:
 
 
 def _require_pair(certificate: Path, key: Path) -> None:
-    """Raise BadData where OpenSSL cannot serve with these two files; an encrypted key is not asked for."""
+    """Raise BadDataError where OpenSSL cannot serve with these two files; an encrypted key is not asked for."""
 
     def no_passphrase() -> str:
-        raise BadData(
+        raise BadDataError(
             f"{key} is encrypted.", hint="A service starts unattended: store the key decrypted, with mode 0600."
         )
 
     for path in (certificate, key):
         if len(read_limited(path, _MOST_PEM, "PEM file")) == 0:
-            raise BadData(f"{path} is empty.")
+            raise BadDataError(f"{path} is empty.")
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, no_passphrase)
     except (ssl.SSLError, OSError) as error:
-        raise BadData(
+        raise BadDataError(
             f"{certificate} and {key} are not a certificate and its key: {getattr(error, 'reason', None) or error}.",
             hint="Both must be PEM files, and the certificate must come first in its file.",
         ) from error
 
 
 def require_places(settings: Settings) -> None:
-    """Raise UsageFailure for a link whose words are wrong: that does not mend itself, as a missing one may."""
+    """Raise UsageError for a link whose words are wrong: that does not mend itself, as a missing one may."""
     for place in settings.places:
         link, _, where = place.partition(":")
         if link == "can":
@@ -123,20 +123,20 @@ def require_places(settings: Settings) -> None:
 
 
 def require_safe(settings: Settings) -> None:
-    """Raise UsageFailure where the page would go to other machines without TLS, or with half of it."""
+    """Raise UsageError where the page would go to other machines without TLS, or with half of it."""
     if (settings.certificate is None) != (settings.key is None):
-        raise UsageFailure("--tls-cert and --tls-key must be used together.", hint="Give both, or neither.")
+        raise UsageError("--tls-cert and --tls-key must be used together.", hint="Give both, or neither.")
     if settings.certificate is not None and settings.key is not None:
         _require_pair(settings.certificate, settings.key)
     if settings.http is None or is_loopback(settings.http[0]):
         return
     if settings.certificate is None:
-        raise UsageFailure(
+        raise UsageError(
             f"--http {settings.http[0]} would send values and tokens over the network unencrypted.",
             hint="Add --tls-cert and --tls-key, or serve 127.0.0.1 and use an SSH tunnel.",
         )
     if not settings.allow:
-        raise UsageFailure(
+        raise UsageError(
             f"--http {settings.http[0]} needs the names under which browsers may reach it.",
             hint="Add --http-allow HOST for each of them.",
         )

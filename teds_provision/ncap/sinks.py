@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.measure.sinks import FILES, CommandTaker, Sink, open_sink
 from teds_provision.store import KeptMeasurement
 
@@ -33,7 +33,7 @@ class DaemonSinks:
     """``specs`` are the words of the sinks that take every measurement, ``record`` a folder for recordings of each.
 
     ``brokers``: URLs by the names that config.toml gives them. ``actuators``: whether set points may come by the topics
-    of any of the sinks. Raises UsageFailure for a name or URL that is none.
+    of any of the sinks. Raises UsageError for a name or URL that is none.
     """
 
     def __init__(
@@ -56,21 +56,21 @@ class DaemonSinks:
             self._brokers[name] = url
 
     def whole(self, spec: str) -> str:
-        """The words for a sink that a request names; a file lies in the folder of recordings. Raises UsageFailure."""
+        """The words for a sink that a request names; a file lies in the folder of recordings. Raises UsageError."""
         if spec in _ROS or spec in self._brokers:
             return spec
         if not _NAME.match(spec) or Path(spec).suffix.lower() not in FILES:
             named = ", ".join(sorted(_ROS | self._brokers.keys()))
-            raise UsageFailure(
+            raise UsageError(
                 f"{spec!r} is not a sink that a request may name.",
                 hint=f"Use {named}, or a file name in {', '.join(FILES)}. Brokers: config.toml, [ncap.brokers]",
             )
         return str(self._folder() / spec)
 
     def open(self, spec: str, take: CommandTaker | None = None) -> Sink:
-        """The sink of a kept measurement, not yet opened; raises UsageFailure, also for a name that is gone."""
+        """The sink of a kept measurement, not yet opened; raises UsageError, also for a name that is gone."""
         if spec not in self._brokers and _BROKER.match(spec) and spec not in _ROS:
-            raise UsageFailure(
+            raise UsageError(
                 f"Broker {spec!r} is no longer configured.",
                 hint=f'Name it in config.toml: [ncap.brokers], {spec} = "mqtts://HOST".',
             )
@@ -106,12 +106,12 @@ class DaemonSinks:
 
 def _require_broker(name: str, url: str) -> None:
     if not _BROKER.match(name) or name in _ROS or name == STARTED:
-        raise UsageFailure(
+        raise UsageError(
             f"{name!r} is not a valid broker name.",
             hint="Use letters, digits, _ and -, beginning with a letter; not ros1, ros2, mqtt.",
         )
     if urlsplit(url).scheme not in ("mqtt", "mqtts"):
-        raise UsageFailure(f"Broker {name!r} in config.toml has no MQTT URL.", hint='Use "mqtts://USER@HOST".')
+        raise UsageError(f"Broker {name!r} in config.toml has no MQTT URL.", hint='Use "mqtts://USER@HOST".')
     open_sink(url)
 
 

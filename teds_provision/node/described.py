@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.node.flash_file import FILE, FlashFile
@@ -34,12 +34,12 @@ class Described:
 def from_file(path: Path) -> Described:
     """Read an image, XML, JSON, hex or binary file; a channel's TEDS without a channel are those of channel 1.
 
-    Raises NotFound, and BadData that names the TEDS which no node holds.
+    Raises NotFoundError, and BadDataError that names the TEDS which no node holds.
     """
     found = _placed(path)
     for (channel, code), teds in found.items():
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
-            raise BadData(
+            raise BadDataError(
                 f"{path}: no node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.",
                 hint=f"To see what is wrong: show {path}",
             )
@@ -51,12 +51,12 @@ def _placed(path: Path) -> dict[BlockId, bytes]:
     octets = read_limited(path, LIMITS.teds_file, "file of TEDS")
     try:
         return placed(octets, path=path)
-    except BadData as error:
-        raise BadData(f"{path}: {error.message}", hint=error.hint) from error
+    except BadDataError as error:
+        raise BadDataError(f"{path}: {error.message}", hint=error.hint) from error
 
 
 def from_profile(profile: str, folders: tuple[Path, ...] | None, uuid: bytes, name: str = "") -> Described:
-    """The TEDS of a type, without calibration; raises NotFound and BadData."""
+    """The TEDS of a type, without calibration; raises NotFoundError and BadDataError."""
     made = load_profile(profile, folders).build(uuid, name=name or None)
     return Described({key: teds for key, teds in made.blocks.items() if key != SECURITY}, uuid)
 
@@ -73,7 +73,7 @@ def create(
 ) -> FlashFile:
     """Make a node, or open the one that was made so before. Its UUID: the one given, else the file's, else random.
 
-    Raises UsageFailure (another node lies there), NotFound, BadData, StoreFailure.
+    Raises UsageError (another node lies there), NotFoundError, BadDataError, StoreError.
     """
     described = from_file(teds) if teds is not None else None
     wanted = uuid or (described.uuid if described is not None else None)

@@ -13,11 +13,11 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, StoreLockedError, UsageError
 from teds_provision.files import read_limited, whole_file
 from teds_provision.limits import load_json
 from teds_provision.protocol.announce import default_can_address
-from teds_provision.protocol.flash import Flash, FlashFailure, in_factory_state
+from teds_provision.protocol.flash import Flash, FlashError, in_factory_state
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.protocol.messages.frames import LIST_OVERHEAD
 from teds_provision.teds.image import BlockId
@@ -31,8 +31,8 @@ _MOST_OCTETS = 64 << 20
 class FlashFile:
     """Flash and identity key of one virtual node in ``folder/flash.json`` (mode 0600); ``delay`` seconds a commit.
 
-    ``exclusive`` takes the node for this process until it ends. Raises NotFound, BadData, StoreLocked (it runs),
-    StoreFailure (the folder cannot be used).
+    ``exclusive`` takes the node for this process until it ends. Raises NotFoundError, BadDataError, StoreLockedError
+    (it runs), StoreError (the folder cannot be used).
     """
 
     def __init__(self, folder: Path, *, delay: float = 0.0, exclusive: bool = False) -> None:
@@ -60,7 +60,7 @@ class FlashFile:
         if (folder / FILE).exists():
             existing = cls(folder)
             if uuid not in (None, existing.load().uuid) or blocks not in (None, existing.hardware):
-                raise UsageFailure(f"{folder} already holds another node.", hint="Choose another folder.")
+                raise UsageError(f"{folder} already holds another node.", hint="Choose another folder.")
             return existing
         try:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -69,7 +69,7 @@ class FlashFile:
         uuid = secrets.token_bytes(10) if uuid is None else uuid
         least = LIST_OVERHEAD + 3 * (len(blocks or {}) + 1)
         if max_message < least:
-            raise UsageFailure(
+            raise UsageError(
                 f"A node with {len(blocks or {})} TEDS needs messages of {least} octets to list them.",
                 hint=f"--max-message {least}",
             )
@@ -121,7 +121,7 @@ class FlashFile:
         try:
             _replace(self.path, document)
         except OSError as error:
-            raise FlashFailure from error
+            raise FlashError from error
         self._document = document
 
     def release(self) -> None:
@@ -138,34 +138,34 @@ class FlashFile:
             )
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise StoreLocked(f"The node in {self.path.parent} is already running.") from None
+            raise StoreLockedError(f"The node in {self.path.parent} is already running.") from None
         except OSError as error:
             raise _unusable(self.path.parent, error) from error
 
     def _read(self) -> dict[str, Any]:
         try:
-            octets = read_limited(self.path, _MOST_OCTETS, "flash", failure=StoreFailure)
-        except NotFound:
+            octets = read_limited(self.path, _MOST_OCTETS, "flash", failure=StoreError)
+        except NotFoundError:
             if self.path.exists():
                 raise
-            raise NotFound(
+            raise NotFoundError(
                 f"There is no virtual node in {self.path.parent}.",
                 hint=f"Make one: teds-provision node create {quote(str(self.path.parent))}",
             ) from None
         try:
             document = load_json(octets, "the flash", octets=_MOST_OCTETS)
-        except BadData as error:
-            raise BadData(f"{self.path} is not a virtual node's flash.") from error
+        except BadDataError as error:
+            raise BadDataError(f"{self.path} is not a virtual node's flash.") from error
         try:
             document = _migrated(document)
             whole = document["format"] == FORMAT and "name" in document and int(document["max_message"]) > 0
             SoftwareKey.from_secret(bytes.fromhex(document["key"]))
             _flash_from_json(document["flash"])
             _blocks_from_json(document.get("hardware", []))
-        except (KeyError, TypeError, ValueError, AttributeError, BadData):
+        except (KeyError, TypeError, ValueError, AttributeError, BadDataError):
             whole = False
         if not whole:
-            raise BadData(f"{self.path} is not a virtual node's flash, or it is damaged.", hint="Make a new node.")
+            raise BadDataError(f"{self.path} is not a virtual node's flash, or it is damaged.", hint="Make a new node.")
         return dict(document)
 
 
@@ -181,8 +181,8 @@ def _migrated(document: dict[str, Any]) -> dict[str, Any]:
     return {**document, "format": FORMAT, "flash": _flash_to_json(flash)}
 
 
-def _unusable(folder: Path, error: OSError) -> StoreFailure:
-    return StoreFailure(f"The folder {folder} cannot be used: {error.strerror}.", hint="Choose another folder.")
+def _unusable(folder: Path, error: OSError) -> StoreError:
+    return StoreError(f"The folder {folder} cannot be used: {error.strerror}.", hint="Choose another folder.")
 
 
 def _blocks_to_json(blocks: Mapping[BlockId, bytes]) -> list[list[int | str]]:

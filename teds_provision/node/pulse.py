@@ -12,7 +12,7 @@ import threading
 import time
 from typing import Protocol
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.can.pacing import sharp_timers
 
 
@@ -62,7 +62,7 @@ class Pulse:
         while (node := self._next()) is not None:
             try:
                 wait = node.beat()
-            except LinkFailure:
+            except LinkError:
                 wait = None  # the reading thread of that bus meets the same failure, and its sessions end
             except Exception:
                 logging.getLogger(__name__).exception("A node's measuring failed.")

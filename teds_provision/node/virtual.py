@@ -56,7 +56,7 @@ class LinkServer(Protocol):
     """One link of the node, served in threads of its own."""
 
     def start(self) -> None:
-        """Open the link; raises a LinkFailure where it cannot."""
+        """Open the link; raises a LinkError where it cannot."""
 
     def stop(self) -> None:
         """Close it; never raises."""

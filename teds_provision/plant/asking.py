@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from teds_provision.errors import (
-    BadData,
-    LinkFailure,
-    NotAuthentic,
-    NotFound,
-    PolicyRefused,
+    BadDataError,
+    LinkError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
     TedsProvisionError,
-    Unproven,
-    UsageFailure,
+    UnprovenError,
+    UsageError,
 )
 from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.links import LinkSettings
@@ -66,13 +66,13 @@ _LOOK_SECONDS: Final = 0.05
 _MOST_LOOK_SECONDS: Final = 1.0
 
 
-class OfficeRefused(PolicyRefused):
+class OfficeRefusedError(PolicyError):
     """The office signs nothing; its reason stands in the message."""
 
     code = "office-refused"
 
 
-class NotAnswered(Unproven):
+class OfficeSilentError(UnprovenError):
     """The office did not answer in time; the request stays, and the same command carries on."""
 
     code = "no-answer"
@@ -85,7 +85,7 @@ def post_of(station: Station, folder: Path | None) -> Post:
     """What carries between the stations: the folder, or the registry that this station is connected to."""
     post = FilesPost(folder) if folder is not None else reaching.post_of(station)
     if post is None:
-        raise PolicyRefused(
+        raise PolicyError(
             "This station has no way to reach the other stations.", hint="Give a transfer folder: --files DIR"
         )
     return post
@@ -94,11 +94,11 @@ def post_of(station: Station, folder: Path | None) -> Post:
 def send(station: Station, post: Post, to: str, document: bytes, name: str) -> None:
     """Seal a signed document for a member and hand it over; ``name`` (a UUID) makes the same one the same parcel.
 
-    Raises PolicyRefused (no member, no room), LinkFailure.
+    Raises PolicyError (no member, no room), LinkError.
     """
     member = roster_of(station).member(to)
     if member is None:
-        raise PolicyRefused(f"Station {to[:16]} is not a member of the plant.", hint="See: registry status")
+        raise PolicyError(f"Station {to[:16]} is not a member of the plant.", hint="See: registry status")
     sealed = jose.encrypt(document, [member.point], cty=CONTENT_TYPE)
     until = time_text(datetime.now(UTC) + timedelta(days=DAYS))
     post.send(Parcel(name, to, sealed, until, station.identity.fingerprint))
@@ -126,7 +126,7 @@ class Inbox:
         self._hears = isinstance(post, postgres.PostgresPost)
 
     def take(self) -> list[Delivery]:
-        """What came since; raises LinkFailure."""
+        """What came since; raises LinkError."""
         station, own = self._station, self._station.identity.fingerprint
         tables = station.plant.parcels
         found = []
@@ -157,7 +157,7 @@ class Inbox:
                 else:
                     self._listener.wait(seconds, parcel_to=self._station.identity.fingerprint)
                     return
-            except LinkFailure:  # the station has no connection left, or the server goes: looking tells
+            except LinkError:  # the station has no connection left, or the server goes: looking tells
                 self.close()
             self._hears = False
         time.sleep(min(seconds, pause))
@@ -179,7 +179,7 @@ class Inbox:
         try:
             document = jose.decrypt(octets, self._station.credentials().key, cty=CONTENT_TYPE, max_octets=SMALL)
             header = load_object(decode_base64url(document.partition(b".")[0], "The header"), "The header")
-        except (BadData, NotAuthentic, PolicyRefused):
+        except (BadDataError, NotAuthenticError, PolicyError):
             return None
         return document if header.get("typ") == self._kind.typ else None
 
@@ -259,7 +259,7 @@ class PostOffice:
                 document.strip(), roster_of(self.station).point_of, typ=SIGNED.typ, max_octets=SIGNED.most
             )
             return told.kid, str(load_object(told.payload, "The answer").get("of"))
-        except (BadData, NotAuthentic, PolicyRefused):
+        except (BadDataError, NotAuthenticError, PolicyError):
             return "", ""
 
     def close(self) -> None:
@@ -299,8 +299,8 @@ def by_office(
     """Have the office sign. What it signed before, and what the node has, is not asked for again.
 
     ``on_node``: the node's Security TEDS where its other TEDS are those of the image. A request that was asked before
-    for the very same datasheet is asked again as it is, so that no second one is made. Raises NotAnswered (5), Refused
-    (6), NotAuthentic (the answer is not the office's, or signs something else).
+    for the very same datasheet is asked again as it is, so that no second one is made. Raises OfficeSilentError (5),
+    Refused (6), NotAuthenticError (the answer is not the office's, or signs something else).
     """
     roster = roster_of(station)
     if on_node is not None and _says_the_same(station, roster, keys, wanted, on_node):
@@ -317,7 +317,7 @@ def by_office(
         request = _new_request(station, node, keys, wanted)
     answer = office.ask(request)
     if answer is None:
-        raise NotAnswered(
+        raise OfficeSilentError(
             f"The office {roster.name_of(wanted.office)} has not answered yet.",
             hint="The request is kept. Run the same command again once the office has signed.",
         )
@@ -350,18 +350,18 @@ class SignBy:
 def sign_by_office(station: Station, links: LinkSettings, order: SignBy, reporter: Reporter) -> Signed:
     """Have an office sign the draft of the node that lies there, and keep it, signed, until it is written.
 
-    Raises UsageFailure (no job), NotFound (no draft), and what :func:`by_office` raises.
+    Raises UsageError (no job), NotFoundError (no draft), and what :func:`by_office` raises.
     """
     if order.job is None:
-        raise UsageFailure("An office only signs for a job.", hint="Name it: --job ID; see: teds-provision job list")
+        raise UsageError("An office only signs for a job.", hint="Name it: --job ID; see: teds-provision job list")
     job = find_job(station, order.job)
     member = roster_of(station).named(order.by)
     if member is None or member.fingerprint != job.office:
-        raise PolicyRefused(f"The job “{job.title}” names another office than {order.by}.")
+        raise PolicyError(f"The job “{job.title}” names another office than {order.by}.")
     uuid = station.nodes.resolve(order.node)
     draft = station.nodes.draft(uuid)
     if draft is None:
-        raise NotFound(
+        raise NotFoundError(
             f"Nothing has been built for node {uuid.hex()}.", hint=f"To build it: teds-provision build {uuid.hex()}"
         )
     with ExitStack() as stack:
@@ -412,7 +412,7 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
     asked = challenge(nonce, key.point, keys.uuid, wanted.epoch, wanted.sequence, blocks)
     proof = node.ask(security_command(Function.PROVE, asked), "to sign the request to the office")
     if not verify(keys.key, prove_message(keys.uuid, asked), proof):
-        raise NotAuthentic("The node's signature of the request does not match the key it presented.")
+        raise NotAuthenticError("The node's signature of the request does not match the key it presented.")
     unsigned = SignRequest(
         str(uuids.uuid4()),
         wanted.office,
@@ -440,15 +440,15 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
 def _taken(
     station: Station, roster: Roster, keys: SignedNodeKey, wanted: Wanted, request: bytes, octets: bytes
 ) -> Signed:
-    """The image with what the office signed; raises Refused, NotAuthentic (not its word, or something else)."""
+    """The image with what the office signed; raises Refused, NotAuthenticError (not its word, or something else)."""
     office = roster.point_of(wanted.office)
     answer = open_answer(octets, lambda kid: office if kid == wanted.office else None)
     if answer.of != hash_of(request):
-        raise NotAuthentic("The office's answer belongs to another request.")
+        raise NotAuthenticError("The office's answer belongs to another request.")
     if answer.refused:
         raise _refusal(roster, wanted, answer)
     if not _says_the_same(station, roster, keys, wanted, answer.security, by=wanted.office):
-        raise NotAuthentic(
+        raise NotAuthenticError(
             "The office signed something other than what was requested.", hint="Ask the owner to check this office."
         )
     return Signed(wanted.image.with_block(SECURITY, answer.security), answer.sequence, reused=False)
@@ -461,7 +461,7 @@ def _refusal(roster: Roster, wanted: Wanted, answer: Answer) -> TedsProvisionErr
         "differs": "Station and office need the same profile and version of the program.",
         "sequence": "Someone at the office must confirm it: signer once FILE --jump",
     }
-    return OfficeRefused(
+    return OfficeRefusedError(
         f"The office {roster.name_of(wanted.office)} does not sign ({answer.refused}): {answer.why.rstrip('.')}.",
         hint=hints.get(answer.refused, ""),
     )
@@ -473,7 +473,7 @@ def _says_the_same(
     """Whether a Security TEDS signs exactly this for this board and epoch, by a member with ``sign`` (or ``by``)."""
     try:
         shown = security.decode(octets)
-    except BadData:
+    except BadDataError:
         return False
     signer = fingerprint(shown.station_key) if shown.station_key is not None else ""
     return (

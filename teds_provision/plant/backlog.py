@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from teds_provision.errors import BadData, TedsProvisionError
+from teds_provision.errors import BadDataError, TedsProvisionError
 from teds_provision.handover.pending import UNDONE, Notes
 from teds_provision.protocol.datasheet import signature_good
 from teds_provision.protocol.fingerprints import is_whole
@@ -76,7 +76,7 @@ def signed_here(station: Station, uuid: bytes) -> Iterator[tuple[int, int, str]]
         octets = image.security
         try:
             shown = security.decode(octets) if octets is not None else None
-        except BadData:
+        except BadDataError:
             continue
         if octets is None or shown is None or not shown.signed or shown.station_key != station.point:
             continue

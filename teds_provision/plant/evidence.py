@@ -8,14 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from teds_provision import __version__
-from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic, StoreFailure
+from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError, StoreError
 from teds_provision.files import SHARED, holds, write_whole
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.plant.evidence import NONCE_OCTETS, EvidenceClaim, seal
 from teds_provision.store import EvidenceRow, LineTables, utc_now
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 
 TOOL = f"teds-provision {__version__}"
@@ -31,7 +31,7 @@ def sign_evidence(
 ) -> bytes:
     """Have the board sign the facts of ``claim``, and return the envelope that the station signed over both.
 
-    A board that passed must answer: raises NotAuthentic where its signature does not verify, LinkFailure. One whose
+    A board that passed must answer: raises NotAuthenticError where its signature does not verify, LinkError. One whose
     attempt failed may be gone; then the envelope holds the station's word alone. ``finished``: now, unless it is named.
     """
     nonce = os.urandom(NONCE_OCTETS)
@@ -39,7 +39,7 @@ def sign_evidence(
     if claim.facts.failure is None:
         proof = prove_claim(node, claim, nonce)
     else:
-        with suppress(LinkFailure, NodeRefused, NotAuthentic, SessionLost):
+        with suppress(LinkError, NodeRefusedError, NotAuthenticError, SessionLostError):
             proof = prove_claim(node, claim, nonce)
     return seal(
         credentials.key,
@@ -53,11 +53,11 @@ def sign_evidence(
 
 
 def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes:
-    """The board's signature over the facts (128.8); raises NotAuthentic where it is not that of field 101."""
+    """The board's signature over the facts (128.8); raises NotAuthenticError where it is not that of field 101."""
     asked = claim.challenge(nonce)
     proof = node.ask(security_command(Function.PROVE, asked), "to sign the evidence")
     if not verify(security.decode(claim.teds).node_key, prove_message(claim.uuid, asked), proof):
-        raise NotAuthentic("The node's signature of the evidence does not match the key it presented.")
+        raise NotAuthenticError("The node's signature of the evidence does not match the key it presented.")
     return proof
 
 
@@ -65,7 +65,7 @@ def export(tables: LineTables, rows: Iterable[EvidenceRow], folder: Path, *, wri
     """Write documents as ``UUID.N.json``; returns every file, and whether it was not there before.
 
     N counts all documents of a board that are kept here, whichever are chosen. Each file is written whole; raises
-    StoreFailure where one cannot be.
+    StoreError where one cannot be.
     """
     files: dict[Path, bool] = {}
     numbers: dict[bytes, dict[str, int]] = {}
@@ -83,8 +83,8 @@ def export(tables: LineTables, rows: Iterable[EvidenceRow], folder: Path, *, wri
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for results; raises StoreFailure."""
+    """Make a folder for results; raises StoreError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StoreFailure(f"Cannot create folder {folder}: {error.strerror}.") from error
+        raise StoreError(f"Cannot create folder {folder}: {error.strerror}.") from error

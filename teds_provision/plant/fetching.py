@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from teds_provision.errors import NotAuthentic, TedsProvisionError
+from teds_provision.errors import NotAuthenticError, TedsProvisionError
 from teds_provision.plant.folding import EVENTS_AT_ONCE, alarm, take_pages
 from teds_provision.plant.post import Carried, Post
-from teds_provision.protocol.plant.document import NewerFormat, hash_of
+from teds_provision.protocol.plant.document import NewerFormatError, hash_of
 from teds_provision.protocol.plant.page import Page, open_page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
@@ -25,10 +25,13 @@ class Taken:
 
 
 def open_carried(carried: Carried, roster: Roster, station: str) -> Page:
-    """Return a page that its station signed and that is in its own place; raises NotAuthentic, NewerFormat."""
+    """Return a page that its station signed and that is in its own place.
+
+    Raises NotAuthenticError, NewerFormatError.
+    """
     page = open_page(carried.octets, roster.registry, roster.point_of)
     if page.station != station or page.n != carried.n:
-        raise NotAuthentic("It is in the place of another page.")
+        raise NotAuthenticError("It is in the place of another page.")
     return page
 
 
@@ -39,7 +42,7 @@ def read_pages(carried: Iterable[Carried], roster: Roster, station: str) -> tupl
     for one in carried:
         try:
             good.append(open_carried(one, roster, station))
-        except NewerFormat:
+        except NewerFormatError:
             raise
         except TedsProvisionError:
             junk.append(one.n)
@@ -84,7 +87,7 @@ def take_carried(
             continue
         try:
             page = open_carried(carried, roster, author)
-        except NewerFormat as newer:
+        except NewerFormatError as newer:
             taken.waits = newer.message
             break
         except TedsProvisionError:

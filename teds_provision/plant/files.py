@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, LinkFailure, NotFound, TedsProvisionError
+from teds_provision.errors import BadDataError, LinkError, NotFoundError, TedsProvisionError
 from teds_provision.files import SHARED, read_limited, write_new
 from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Parcel, Returned
 from teds_provision.protocol.plant.document import PAGE, ROSTER, hash_of
@@ -32,7 +32,7 @@ class FilesPost:
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
-            raise LinkFailure(f"There is no folder {folder}.", hint="Create it, or plug in the stick.")
+            raise LinkError(f"There is no folder {folder}.", hint="Create it, or plug in the stick.")
         self._folder = folder
         self.where = str(folder)
 
@@ -115,7 +115,7 @@ class FilesPost:
                 return
 
     def _write(self, path: Path, octets: bytes) -> None:
-        write_new(path, octets, mode=SHARED, failure=LinkFailure)
+        write_new(path, octets, mode=SHARED, failure=LinkError)
 
     def _make(self, folder: Path) -> None:
         try:
@@ -141,15 +141,15 @@ class FilesPost:
     def _read(self, path: Path, most: int) -> bytes | None:
         """A file, None where it is gone, a link, or larger than any of its kind: not what a station put there."""
         try:
-            return read_limited(path, most + 64, "document of a plant", failure=LinkFailure, follow=False)
-        except (BadData, NotFound):
+            return read_limited(path, most + 64, "document of a plant", failure=LinkError, follow=False)
+        except (BadDataError, NotFoundError):
             return None
-        except LinkFailure:
+        except LinkError:
             if path.is_symlink():
                 return None
             raise
 
     def _failed(self, error: OSError) -> TedsProvisionError:
-        return LinkFailure(
+        return LinkError(
             f"Cannot use folder {self._folder}: {error.strerror}.", hint="Check its owner, its mode and the free space."
         )

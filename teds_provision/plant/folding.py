@@ -12,7 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
-from teds_provision.errors import PolicyRefused, TedsProvisionError
+from teds_provision.errors import PolicyError, TedsProvisionError
 from teds_provision.handover import deny
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.protocol.handover.revocation import open_revocation
@@ -41,10 +41,10 @@ def now() -> datetime:
 
 
 def require_roster(station: Station) -> Roster:
-    """The roster that counts here; raises PolicyRefused where no registry was joined."""
+    """The roster that counts here; raises PolicyError where no registry was joined."""
     roster = station.plant.roster
     if roster is None:
-        raise PolicyRefused(
+        raise PolicyError(
             "This station has joined no registry.", hint="Join one: teds-provision registry connect --files DIR"
         )
     return roster

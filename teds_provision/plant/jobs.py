@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, RosterExpired
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, RosterExpiredError
 from teds_provision.files import read_limited
 from teds_provision.plant import parcels
 from teds_provision.protocol.plant.document import JOB, is_form
@@ -23,15 +23,15 @@ _MAX_PROFILE_OCTETS: Final = 1 << 20
 
 
 def roster_of(station: Station) -> Roster:
-    """The roster that counts; raises PolicyRefused where none was joined, RosterExpired."""
+    """The roster that counts; raises PolicyError where none was joined, RosterExpiredError."""
     roster = station.plant.roster
     if roster is None:
-        raise PolicyRefused(
+        raise PolicyError(
             "Jobs need a registry, and this station has not joined one.",
             hint="To join one: teds-provision registry connect. To create one: teds-provision registry create",
         )
     if now_of(roster) >= roster.expires:
-        raise RosterExpired(
+        raise RosterExpiredError(
             "The roster has expired, so no job can start.",
             hint="Ask the owner to renew it: teds-provision registry renew",
         )
@@ -44,33 +44,33 @@ def now_of(roster: Roster) -> datetime:
 
 
 def read_job(station: Station, octets: bytes) -> Job:
-    """Read a signed job. Raises PolicyRefused (not a keeper's, another registry's), NotAuthentic, BadData."""
+    """Read a signed job. Raises PolicyError (not a keeper's, another registry's), NotAuthenticError, BadDataError."""
     roster = roster_of(station)
     job = open_job(octets, roster.point_of)
     if not roster.has(job.signer, "keeper"):
-        raise PolicyRefused(
+        raise PolicyError(
             f"{roster.name_of(job.signer)} signed this job but is not a keeper.", hint="Ask a keeper for a job."
         )
     if job.registry != roster.registry:
-        raise PolicyRefused("This job belongs to another registry.")
+        raise PolicyError("This job belongs to another registry.")
     return job
 
 
 def kept_job(station: Station, row: JobRow) -> Job:
-    """A job that was taken, whoever is a keeper today; NotAuthentic where the roster knows its signer no more."""
+    """A job that was taken, whoever is a keeper today; NotAuthenticError where the roster knows its signer no more."""
     roster = station.plant.roster
     job = open_job(row.octets, roster.point_of if roster is not None else lambda kid: None)
     return replace(job, hash=row.hash)
 
 
 def take_job(station: Station, octets: bytes) -> Job:
-    """Read a job and keep it: its id means this document from now on. Raises PolicyRefused where it means another."""
+    """Read a job and keep it: its id means this document from now on. Raises PolicyError where it means another."""
     job = read_job(station, octets)
     with station.durable("job"):
         station.plant.line.add_job(JobRow(job.id, job.hash, job.octets))
         kept = station.plant.line.job(job.id)
         if kept is None or kept.hash != job.hash:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"A different job with the ID {job.id} is already known here.",
                 hint="Ask the keeper for a job with a new ID.",
             )
@@ -80,7 +80,7 @@ def take_job(station: Station, octets: bytes) -> Job:
 def find_job(station: Station, text: str) -> Job:
     """The job of a file, or one that is kept here, by its id or the first digits of it.
 
-    Raises NotFound, and what :func:`take_job` raises.
+    Raises NotFoundError, and what :func:`take_job` raises.
     """
     path = Path(text)
     if path.is_file():
@@ -93,38 +93,38 @@ def take_received(station: Station) -> None:
     for row, octets in parcels.received(station, "job"):
         try:
             take_job(station, octets)
-        except RosterExpired:
+        except RosterExpiredError:
             return  # nothing begins now; a renewed roster decides
-        except (BadData, NotAuthentic, PolicyRefused) as error:
+        except (BadDataError, NotAuthenticError, PolicyError) as error:
             station.notice(f"A received job was rejected: {error.message}")
         with station.durable("job"):
             station.plant.parcels.drop_parcel(row.id, "in")
 
 
 def job_id(station: Station, text: str) -> str:
-    """The whole id of a job that is kept here, from its first digits; raises NotFound."""
+    """The whole id of a job that is kept here, from its first digits; raises NotFoundError."""
     return job_row(station, text).id
 
 
 def job_row(station: Station, text: str) -> JobRow:
-    """A job that is kept here, by its id or the first digits of it; raises NotFound."""
+    """A job that is kept here, by its id or the first digits of it; raises NotFoundError."""
     take_received(station)
     if is_form("random_id", text.lower()):
         rows = [row for row in [station.plant.line.job(text.lower())] if row is not None]
     else:
         rows = [row for row in station.plant.line.jobs() if len(text) >= 4 and row.id.startswith(text.lower())]
     if len(rows) > 1:
-        raise NotFound(
+        raise NotFoundError(
             f"{len(rows)} jobs have an ID that begins with {text}.",
             hint="Give more digits; see: teds-provision job list",
         )
     if not rows:
-        raise NotFound(f"There is no job {text}, and no file with that name.", hint="See: teds-provision job list")
+        raise NotFoundError(f"There is no job {text}, and no file with that name.", hint="See: teds-provision job list")
     return rows[0]
 
 
 def require_open(station: Station, job: Job, *, for_station: str | None = None) -> None:
-    """Raise PolicyRefused where a station may not work on the job now: too early, over, closed here, not for it.
+    """Raise PolicyError where a station may not work on the job now: too early, over, closed here, not for it.
 
     ``for_station``: its fingerprint, this one's where None is named.
     """
@@ -132,13 +132,13 @@ def require_open(station: Station, job: Job, *, for_station: str | None = None) 
     why = "it is closed here" if row is not None and row.state == CLOSED else None
     why = why or job.why_not(now_of(roster_of(station)), for_station or station.identity.fingerprint)
     if why is not None:
-        raise PolicyRefused(f"The job “{job.title}” cannot be worked on: {why}.", hint="Ask the keeper for a new job.")
+        raise PolicyError(f"The job “{job.title}” cannot be worked on: {why}.", hint="Ask the keeper for a new job.")
 
 
 def require_adopted(station: Station) -> None:
-    """Raise PolicyRefused where a backup rebuilt this home and it does not know yet which units it gave since."""
+    """Raise PolicyError where a backup rebuilt this home and it does not know yet which units it gave since."""
     if station.plant.restored:
-        raise PolicyRefused(
+        raise PolicyError(
             "This home was restored from a backup, and only its own pages show which units it has assigned since.",
             hint="To get them: teds-provision registry sync",
         )
@@ -155,10 +155,10 @@ def close_job(station: Station, job: Job) -> None:
 
 
 def profile_file(station: Station, job: Job) -> Path:
-    """The file of the job's profile; raises NotFound, and PolicyRefused where it is not the one that the job names."""
+    """The file of the job's profile; raises NotFoundError, and PolicyError if it is not the one that the job names."""
     path = find_profile(job.profile, default_folders(station.home))
     if digest_of_file(path) != job.profile_sha256:
-        raise PolicyRefused(
+        raise PolicyError(
             f"Profile {job.profile} is not the one in the job: {path} has a different SHA-256.",
             hint=f"Copy the job's profile to {station.home / 'profiles'}.",
         )
@@ -166,5 +166,5 @@ def profile_file(station: Station, job: Job) -> Path:
 
 
 def digest_of_file(path: Path) -> str:
-    """SHA-256 of a small file, 64 hex digits; raises NotFound, BadData."""
+    """SHA-256 of a small file, 64 hex digits; raises NotFoundError, BadDataError."""
     return hashlib.sha256(read_limited(path, _MAX_PROFILE_OCTETS, "file")).hexdigest()

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import NotFound, OtherKey, PolicyRefused, TedsProvisionError
+from teds_provision.errors import KeyMismatchError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.plant.asking import Office, Wanted, by_office
 from teds_provision.plant.evidence import TOOL, make_folder, sign_evidence
@@ -24,7 +24,7 @@ from teds_provision.protocol.plant.job import WORTH, Job
 from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.station import Station
 from teds_provision.steps.batch_sheet import BoardResult
-from teds_provision.steps.board_type import WrongBoard
+from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, Prepared, Proposal, prepare
 from teds_provision.steps.identify import Identified
 from teds_provision.steps.provision import Provisioned
@@ -45,7 +45,7 @@ class LineRun:
 
     ``order``: what every board gets where there is no job. ``calibrations`` is a folder with a file ``UUID.*`` for each
     board, or one file for a job whose rule is ``one``. Everything that can be refused before a tap is refused when this
-    is made: raises PolicyRefused, NotFound, BadData.
+    is made: raises PolicyError, NotFoundError, BadDataError.
     """
 
     station: Station
@@ -69,7 +69,7 @@ class LineRun:
         self._require_open()
         roster = self.station.plant.roster
         if not self.only_verify and roster is not None and not roster.has(self._own, "line"):
-            raise PolicyRefused(
+            raise PolicyError(
                 "This station may not key new boards: it does not have the role 'line' in the roster.",
                 hint="Ask the owner for it: teds-provision registry role NAME line",
             )
@@ -116,7 +116,7 @@ class LineRun:
     # -- what a board gets -----------------------------------------------------------------------------------------
 
     def order(self, who: Identified) -> Prepared:
-        """What this board gets; raises PolicyRefused (not in the job, its calibration), OtherKey."""
+        """What this board gets; raises PolicyError (not in the job, its calibration), KeyMismatchError."""
         job = self.job
         if self.scans is not None:
             self.scans.require(who)
@@ -128,9 +128,9 @@ class LineRun:
         if job.boards:
             listed = job.boards.get(who.uuid)
             if listed is None:
-                raise PolicyRefused(f"Board {who.uuid.hex()} is not on the job's list.", hint="Set it aside.")
+                raise PolicyError(f"Board {who.uuid.hex()} is not on the job's list.", hint="Set it aside.")
             if not same_key(listed, who.fingerprint):
-                raise OtherKey(
+                raise KeyMismatchError(
                     f"Board {who.uuid.hex()} holds the key {who.fingerprint[:32]}; the job says {listed[:32]}.",
                     hint="It may be another board under the same UUID. Set it aside.",
                 )
@@ -140,7 +140,7 @@ class LineRun:
         digest = digest_of_file(path)
         wanted = job.calibration.wants(who.uuid)
         if wanted is not None and digest != wanted:
-            raise PolicyRefused(f"The calibration {path} is not the one the job specifies for {who.uuid.hex()}.")
+            raise PolicyError(f"The calibration {path} is not the one the job specifies for {who.uuid.hex()}.")
         order = replace(self.order_of_all, calibration=path, drop_calibration=False)
         one_for_all = job.calibration.rule == "one"
         prepared = self._with_digest(
@@ -153,12 +153,12 @@ class LineRun:
     def _with_digest(self, calibration: Path | None, uuid: bytes, read: Callable[[], Prepared]) -> Prepared:
         """What ``read`` gives, and note the digest of the calibration's file that evidence of this board names.
 
-        Raises PolicyRefused where the file changed meanwhile: a bench writes calibrations beside the line.
+        Raises PolicyError where the file changed meanwhile: a bench writes calibrations beside the line.
         """
         digest = digest_of_file(calibration) if calibration is not None and calibration.is_file() else None
         prepared = read()
         if calibration is not None and digest_of_file(calibration) != digest:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"The calibration {calibration} changed while it was being read.", hint="Tap the board again."
             )
         if digest is not None:
@@ -174,7 +174,7 @@ class LineRun:
             return self._common[calibration]
 
     def _read(self, order: BuildOrder, uuid: bytes | None = None) -> Prepared:
-        """What an order names; raises PolicyRefused where the profile's file was changed since the run began.
+        """What an order names; raises PolicyError where the profile's file was changed since the run began.
 
         The digest that evidence names must be of what was read, and files are edited beside a run of many hours.
         """
@@ -192,13 +192,15 @@ class LineRun:
             return self._common_calibration()
         folder = self.calibrations
         if folder is None or not folder.is_dir():
-            raise NotFound(
+            raise NotFoundError(
                 "This job requires a calibration for each board.", hint="Give their directory: --calibrations DIR"
             )
         found = sorted(path for path in folder.glob(f"{uuid.hex()}.*") if path.is_file())
         if len(found) != 1:
             there = "no file" if not found else f"{len(found)} files"
-            raise NotFound(f"There is {there} {uuid.hex()}.* in {folder}.", hint="Copy this board's calibration there.")
+            raise NotFoundError(
+                f"There is {there} {uuid.hex()}.* in {folder}.", hint="Copy this board's calibration there."
+            )
         return found[0]
 
     def _common_calibration(self) -> Path:
@@ -209,7 +211,7 @@ class LineRun:
         for path in files:
             if path.is_file() and digest_of_file(path) == self.job.calibration.sha256:
                 return path
-        raise NotFound(
+        raise NotFoundError(
             f"The job's calibration (SHA-256 {self.job.calibration.sha256}) was not found.",
             hint="Give its file or directory: --calibrations PATH",
         )
@@ -221,14 +223,14 @@ class LineRun:
         for number, one in (prepared.calibrations or {}).items():
             if one.date is None or not now - timedelta(days=days) <= one.date <= now + timedelta(days=1):
                 when = "has no date" if one.date is None else f"is dated {one.date:%Y-%m-%d}"
-                raise PolicyRefused(
+                raise PolicyError(
                     f"The calibration {path} of channel {number} {when}; the job allows at most {days} days."
                 )
 
     # -- units -----------------------------------------------------------------------------------------------------
 
     def take(self, node: Conversation, who: Identified, prepared: Prepared, entry: WhitelistEntry | None) -> LineUnit:
-        """Take the board's unit, durably, or count a further attempt; raises PolicyRefused where none is left."""
+        """Take the board's unit, durably, or count a further attempt; raises PolicyError where none is left."""
         job, begun = self.job, utc_now()
         held = entry if entry is not None else who.whitelisted
         assurance = "tap" if node.tapped else held.assurance if held is not None else "uuid"
@@ -242,7 +244,7 @@ class LineRun:
                 self._units_as_json[who.uuid] = {"job": job.id, "attempt": mine + 1}
             return LineUnit(self, prepared, tables.unit(job.id, who.uuid), mine + 1, assurance, begun)
         if WORTH.get(assurance, 0) < WORTH[job.assurance]:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"The job requires assurance '{job.assurance}'; board {who.uuid.hex()} was identified by"
                 f" '{assurance}'.",
                 hint="Tap it on the NFC reader." if job.assurance == "tap" else "Connect it to a wired bus, or tap it.",
@@ -268,7 +270,7 @@ class LineRun:
         given, _, greatest = tables.count_units(job.id)
         allotment = job.stations[self._own] if job.count is not None else len(job.boards)
         if given >= allotment:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"All {allotment} units of the job “{job.title}” for this station are assigned: {uuid.hex()} is"
                 " one too many.",
                 hint="Lay it aside, or ask the keeper for another job.",
@@ -342,14 +344,14 @@ class Scans:
             self._notice(f"Waiting for board {found[0].hex()}.")
 
     def require(self, who: Identified) -> None:
-        """Raise PolicyRefused where no label was scanned, WrongBoard where another board's was."""
+        """Raise PolicyError where no label was scanned, WrongBoardError where another board's was."""
         with self._turn:
             expected = self._expected
         if expected is None:
-            raise PolicyRefused(f"Scan the label of board {who.uuid.hex()} first.", hint="Then tap it again.")
+            raise PolicyError(f"Scan the label of board {who.uuid.hex()} first.", hint="Then tap it again.")
         uuid, key = expected
         if uuid != who.uuid or (key is not None and not same_key(key, who.fingerprint)):
-            raise WrongBoard(
+            raise WrongBoardError(
                 f"The scanned label belongs to board {uuid.hex()}, but this is board {who.uuid.hex()}.",
                 hint="Use the board with that label, or scan the label of this board.",
             )
@@ -378,7 +380,7 @@ class LineUnit:
         if job is None or job.office in (None, station.identity.fingerprint):
             return None
         if self.run.office is None:
-            raise PolicyRefused(
+            raise PolicyError(
                 "An office signs for this job, but this station has no way to reach it.",
                 hint="Give a transfer folder: --files DIR",
             )

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused, RosterExpired, TedsProvisionError
+from teds_provision.errors import BadDataError, NotFoundError, PolicyError, RosterExpiredError, TedsProvisionError
 from teds_provision.plant import scram
 from teds_provision.plant.folding import now, recount, require_roster
 from teds_provision.plant.post import Post
@@ -43,7 +43,7 @@ def request(station: Station) -> bytes:
 def found_roster(station: Station, post: Post, octets: bytes | None) -> Roster:
     """The best roster that names this station, of a file or of what carries; one that has expired is refused here.
 
-    Raises NotFound, PolicyRefused.
+    Raises NotFoundError, PolicyError.
     """
     found = [] if octets is None else [open_roster(octets, station.ca)]
     held = station.plant.roster
@@ -59,19 +59,19 @@ def found_roster(station: Station, post: Post, octets: bytes | None) -> Roster:
         found.append(held)
     mine = [roster for roster in found if roster.member(station.fingerprint) is not None]
     if not mine:
-        raise NotFound(
+        raise NotFoundError(
             f"No roster in {post.where} that this owner's CA signed names this station.",
             hint="Send the owner a request (registry request --output FILE); the owner then runs: registry add"
             " FILE --role …",
         )
     registries = {roster.registry for roster in mine}
     if len(registries) > 1:
-        raise PolicyRefused(
+        raise PolicyError(
             f"{post.where} contains rosters of {len(registries)} registries.", hint="Choose one: --roster FILE"
         )
     best = max(mine, key=lambda one: (one.version, one.hash))
     if best.expires <= now():
-        raise RosterExpired(
+        raise RosterExpiredError(
             f"The roster of {best.name} expired on {best.expires:%Y-%m-%d}.",
             hint="Ask its owner to renew it: registry renew",
         )
@@ -104,7 +104,7 @@ def vouchable(station: Station, uuids: Sequence[bytes] | None) -> list[tuple[byt
             continue
         try:
             shown = security.decode(octets)
-        except BadData:
+        except BadDataError:
             continue
         if shown.station_key is None:
             continue
@@ -119,7 +119,7 @@ def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
     """Say as a keeper that these datasheets are good; returns how many were not said before."""
     roster = require_roster(station)
     if not roster.has(station.fingerprint, "keeper"):
-        raise PolicyRefused("Only a keeper can vouch for datasheets.", hint="See: registry status")
+        raise PolicyError("Only a keeper can vouch for datasheets.", hint="See: registry status")
     fresh = 0
     with station.transaction():
         for uuid, digest, _ in found:
@@ -148,7 +148,7 @@ def accept(station: Station, of: str, hash: str | None, post: Post | None) -> tu
 def branch(station: Station, of: str, hash: str | None, post: Post | None) -> tuple[int, str]:
     """Return the branch that :func:`accept` takes: number and H of its first page.
 
-    An earlier choice can be changed: name the other branch by its ``hash``. Raises NotFound, PolicyRefused.
+    An earlier choice can be changed: name the other branch by its ``hash``. Raises NotFoundError, PolicyError.
     """
     roster = require_roster(station)
     tables = station.plant.tables
@@ -161,7 +161,9 @@ def branch(station: Station, of: str, hash: str | None, post: Post | None) -> tu
     n = next((n for n in partings if len(by_number[n]) > 1 and _among(by_number[n], hash)), 0)
     n = n or next((n for n in partings if len(by_number[n]) > 1), 0)
     if not n:
-        raise NotFound(f"{roster.name_of(of)} has only one history here.", hint="See: teds-provision registry status")
+        raise NotFoundError(
+            f"{roster.name_of(of)} has only one history here.", hint="See: teds-provision registry status"
+        )
     branches = by_number[n]
     wanted = _among(branches, hash)
     if hash is None and post is not None and not post.everybody:
@@ -169,7 +171,7 @@ def branch(station: Station, of: str, hash: str | None, post: Post | None) -> tu
         wanted = [one for one in branches if n in shown and hash_of(shown[n].octets) == one]
     if len(wanted) != 1:
         listed = ", ".join(one[:16] for one in branches)
-        raise PolicyRefused(
+        raise PolicyError(
             f"Page {n} of {roster.name_of(of)} exists here twice: {listed}.", hint="Choose one: --page HASH"
         )
     return n, wanted[0]

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, TedsProvisionError
 from teds_provision.plant.asking import Inbox, name_of, send
 from teds_provision.plant.jobs import (
     digest_of_file,
@@ -48,7 +48,7 @@ MOST_JUMP: Final = 65_535
 _MAX_CALIBRATION: Final = 1 << 20
 
 
-class _Refused(Exception):
+class _RefusedError(Exception):
     """The office signs nothing: one word of the contract, and why."""
 
     def __init__(self, word: str, why: str) -> None:
@@ -61,18 +61,18 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
 
     ``jobs``: only these ids (None: every job that is kept here). ``jump``: a person takes any sequence. A datasheet,
     its unit, its sequence and the ``signed`` event are durable before the answer is given; the same request (H) gets
-    the same answer again. Raises StoreFailure, VaultFailure and PolicyRefused (this station is no office now).
+    the same answer again. Raises StoreError, VaultError and PolicyError (this station is no office now).
     """
     roster = roster_of(station)
     if not roster.has(station.identity.fingerprint, "sign"):
-        raise PolicyRefused(
+        raise PolicyError(
             "This station may not sign datasheets: it does not have the role 'sign' in the roster.",
             hint="Ask the owner for it: teds-provision registry role NAME sign",
         )
     require_adopted(station)
     try:
         request = open_request(octets, roster.point_of)
-    except (BadData, NotAuthentic):
+    except (BadDataError, NotAuthenticError):
         return None
     if request.to != station.identity.fingerprint:
         return None
@@ -88,7 +88,7 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
         return kept.answer
     try:
         return _signed(station, request, jobs, jump=jump)
-    except _Refused as refused:
+    except _RefusedError as refused:
         with station.durable("signer"):
             told = {"by": request.signer, "job": request.job, "why": refused.why}
             station.audit("sign-request", request.uuid, refused.word, **told)
@@ -130,16 +130,18 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
     job = _job_of(station, request, jobs)
     revoked = station.policy.revocation(request.uuid)
     if revoked is not None:
-        raise _Refused("revoked", f"the node was revoked: {revoked.why}")
+        raise _RefusedError("revoked", f"the node was revoked: {revoked.why}")
     _require_its_key(station, job, request)
     if not node_key_good(request.uuid, request.point, request.key_signature):
-        raise _Refused("proof", "field 102 does not sign this key for this UUID")
+        raise _RefusedError("proof", "field 102 does not sign this key for this UUID")
     if not verify(request.point, prove_message(request.uuid, request.challenge()), request.proof):
-        raise _Refused("proof", "the board did not sign this request")
+        raise _RefusedError("proof", "the board did not sign this request")
     _require_room(station, job, request)
     known = station.nodes.get(request.uuid)
     if not jump and request.sequence > (known.sequence if known is not None else 0) + MOST_JUMP:
-        raise _Refused("sequence", f"sequence {request.sequence} is more than {MOST_JUMP} ahead of the one known here")
+        raise _RefusedError(
+            "sequence", f"sequence {request.sequence} is more than {MOST_JUMP} ahead of the one known here"
+        )
     image = _built(station, job, request)
     with station.durable("signer"):
         meanwhile = station.plant.line.sign_request(request.hash, "in")
@@ -173,16 +175,16 @@ def _signed(station: Station, request: SignRequest, jobs: Collection[str] | None
 def _job_of(station: Station, request: SignRequest, jobs: Collection[str] | None) -> Job:
     row = station.plant.line.job(request.job)
     if row is None or (jobs is not None and request.job not in jobs):
-        raise _Refused("job", "this office is not working on that job")
+        raise _RefusedError("job", "this office is not working on that job")
     try:
         job = read_job(station, row.octets)
         require_open(station, job, for_station=request.signer)
     except TedsProvisionError as error:
-        raise _Refused("job", error.message) from error
+        raise _RefusedError("job", error.message) from error
     if job.office != station.identity.fingerprint:
-        raise _Refused("job", "the job names another office")
+        raise _RefusedError("job", "the job names another office")
     if job.boards and request.uuid not in job.boards:
-        raise _Refused("job", "the board is not on the job's list")
+        raise _RefusedError("job", "the board is not on the job's list")
     return job
 
 
@@ -193,11 +195,11 @@ def _require_its_key(station: Station, job: Job, request: SignRequest) -> None:
     pinned = entry.fingerprint if entry is not None else None
     for known, where in ((listed, "the job lists"), (pinned, "this office knows")):
         if known is not None and not same_key(known, own):
-            raise _Refused("other-key", f"{where} the board with another key")
+            raise _RefusedError("other-key", f"{where} the board with another key")
     try:
         station.pins.check(request.uuid, request.point)
-    except PolicyRefused as error:
-        raise _Refused("other-key", error.message) from error
+    except PolicyError as error:
+        raise _RefusedError("other-key", error.message) from error
 
 
 def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
@@ -207,13 +209,13 @@ def _require_room(station: Station, job: Job, request: SignRequest) -> UnitRow:
     if kept is None:
         given, _, greatest = tables.count_units(job.id)
         if given >= job.total:
-            raise _Refused("full", f"all {job.total} units of the job are assigned")
+            raise _RefusedError("full", f"all {job.total} units of the job are assigned")
         return UnitRow(job.id, request.uuid, greatest + 1, utc_now())
     answers = sum(row.sequence is not None for row in tables.sign_requests(job.id, request.uuid, "in"))
     if station.identity.fingerprint not in job.stations:
         answers = max(answers, kept.attempts)  # pages told a home that a backup rebuilt; it has no requests of since
     if answers >= MOST_ANSWERS:
-        raise _Refused("full", f"the unit already has {MOST_ANSWERS} answers")
+        raise _RefusedError("full", f"the unit already has {MOST_ANSWERS} answers")
     return replace(kept, attempts=answers + 1)
 
 
@@ -225,18 +227,18 @@ def _built(station: Station, job: Job, request: SignRequest) -> Image:
         check_name(request.name)
         built = profile.build(request.uuid, calibration=calibrations, name=request.name)
     except TedsProvisionError as error:
-        raise _Refused("differs", error.message) from error
+        raise _RefusedError("differs", error.message) from error
     sent = request.image.unsigned_blocks()
     blocks = {**built.blocks, **{block: sent[block] for block in job.read_only if block in sent}}
     image = Image(request.uuid, blocks)
     try:
         guard(station, image, None, None, calibrations, profile, record=False)
-    except PolicyRefused as error:
-        raise _Refused("guard", error.message) from error
+    except PolicyError as error:
+        raise _RefusedError("guard", error.message) from error
     wrong = sorted(block for block in sent.keys() | blocks.keys() if sent.get(block) != blocks.get(block))
     if wrong:
         named = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in wrong[:5])
-        raise _Refused("differs", f"this office would build it differently: {named}")
+        raise _RefusedError("differs", f"this office would build it differently: {named}")
     _require_name(job, request)
     return image
 
@@ -249,26 +251,26 @@ def _require_name(job: Job, request: SignRequest) -> None:
         pattern = pattern.replace(re.escape(f"{{{field}}}"), what)
     pattern = re.sub(r"\\\{unit(?::0[1-9])?\\\}", r"[0-9]{1,10}", pattern)
     if request.name is None or not re.fullmatch(pattern, request.name):
-        raise _Refused("differs", f"the name {request.name!r} does not follow the job's pattern")
+        raise _RefusedError("differs", f"the name {request.name!r} does not follow the job's pattern")
 
 
 def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int, Calibration]:
     octets, rule = request.calibration, job.calibration
     if rule.rule == "none":
         if octets is not None:
-            raise _Refused("job", "the job does not allow a calibration")
+            raise _RefusedError("job", "the job does not allow a calibration")
         return {}
     if octets is None or len(octets) > _MAX_CALIBRATION:
-        raise _Refused("job", "the job requires a calibration, and the request has none")
+        raise _RefusedError("job", "the job requires a calibration, and the request has none")
     wanted = rule.wants(request.uuid)
     if rule.rule != "any" and hashlib.sha256(octets).hexdigest() != wanted:
-        raise _Refused("job", "the calibration is not the one the job specifies")
+        raise _RefusedError("job", "the calibration is not the one the job specifies")
     found = read_calibrations(*_text_of(octets), profile)
     if rule.rule == "any":
         days = timedelta(days=rule.max_age_days or 0)
         now = datetime.now(UTC)
         if any(one.date is None or not now - days <= one.date <= now + timedelta(days=1) for one in found.values()):
-            raise _Refused("job", f"the calibration is older than {days.days} days, or has no date")
+            raise _RefusedError("job", f"the calibration is older than {days.days} days, or has no date")
     return found
 
 
@@ -277,7 +279,7 @@ def _text_of(octets: bytes) -> tuple[str, str]:
     try:
         text = octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise BadData("The calibration is not UTF-8 text.") from error
+        raise BadDataError("The calibration is not UTF-8 text.") from error
     if text.lstrip()[:1] in ("{", "["):
         return text, "calibration.json"
     try:
@@ -293,7 +295,7 @@ def _profile(station: Station, job: Job) -> Profile:
     state = seen.st_mtime_ns, seen.st_ino, seen.st_size
     profile = _loaded(str(path), state, int(time.monotonic()), station.home)
     if digest_of_file(path) != job.profile_sha256:
-        raise PolicyRefused(f"The profile {path} changed while it was being read.")
+        raise PolicyError(f"The profile {path} changed while it was being read.")
     return profile
 
 

@@ -13,7 +13,7 @@ from shlex import quote
 from typing import Any
 from uuid import uuid4
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, PolicyError, UsageError
 from teds_provision.plant.backlog import Told, backlog
 from teds_provision.plant.folding import now, put_roster, require_roster
 from teds_provision.protocol.handover.strict_json import load_exact
@@ -44,19 +44,19 @@ def _to_the_second(moment: datetime) -> datetime:
 
 
 def draft_first(station: Station, name: str, days: timedelta = USUAL) -> Roster:
-    """Roster 1 of a new registry, with this station alone; raises PolicyRefused where one was joined."""
+    """Roster 1 of a new registry, with this station alone; raises PolicyError where one was joined."""
     if station.plant.joined is not None:
-        raise PolicyRefused("This station already belongs to a registry.", hint="See: teds-provision registry status")
+        raise PolicyError("This station already belongs to a registry.", hint="See: teds-provision registry status")
     own = Member(station.name, station.point, station.identity.signature, frozenset(FIRST_ROLES))
     moment = _to_the_second(now())
     return Roster(str(uuid4()), name, 1, "", moment, moment + days, (own,))
 
 
 def signed(station: Station, draft: Roster) -> Roster:
-    """A draft, signed by the CA; raises NotFound where its key is not here, BadData for what no reader takes."""
+    """A draft, signed by the CA; raises NotFoundError if its key is not here, BadDataError for what no reader takes."""
     ca = station.vault.ca()
     if ca is None or ca.point != station.ca:
-        raise NotFound(
+        raise NotFoundError(
             "The CA key is not in this vault.",
             hint="Add --draft FILE, then sign the draft on the station with the CA key: registry sign FILE",
         )
@@ -66,7 +66,7 @@ def signed(station: Station, draft: Roster) -> Roster:
 def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[Told]) -> int:
     """Belong to a registry from now on, and tell what the store says already; returns how many events that made."""
     if roster.member(station.fingerprint) is None:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The roster of {roster.name} does not name this station.",
             hint="Send its owner a request (registry request --output FILE); the owner then runs: registry add"
             " FILE --role …",
@@ -105,16 +105,16 @@ def following(station: Station, **change: Any) -> Roster:
 
 
 def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Roster:
-    """Draft a roster with one member more; raises PolicyRefused for a key of another CA or one that was removed."""
+    """Draft a roster with one member more; raises PolicyError for a key of another CA or one that was removed."""
     own = require_roster(station)
     if not verify(station.ca, station_key_message(request.point), request.certificate):
-        raise PolicyRefused(
+        raise PolicyError(
             f"Station {request.name} is not certified by this owner's CA and cannot join.",
             hint="A station without nodes can be set up again: init --request, trust ca sign, init --certificate",
         )
     there = own.by_key.get(request.fingerprint)
     if isinstance(there, Removed):
-        raise PolicyRefused(
+        raise PolicyError(
             f"{there.name} was removed with this key, and a removed key cannot return.",
             hint="Create a new station on that machine: init in another --home",
         )
@@ -122,9 +122,9 @@ def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Ros
     if there is not None:
         if replace(there, signed=None) == member:
             return following(station)
-        raise PolicyRefused(f"{there.name} is already a member.", hint="Change its roles: registry role")
+        raise PolicyError(f"{there.name} is already a member.", hint="Change its roles: registry role")
     if any(one.name == request.name for one in own.members):
-        raise PolicyRefused(f"There is already a member called {request.name!r}.", hint="Choose another name: --name")
+        raise PolicyError(f"There is already a member called {request.name!r}.", hint="Choose another name: --name")
     return following(station, members=(*own.members, member))
 
 
@@ -133,7 +133,7 @@ def with_roles(station: Station, name: str, roles: frozenset[Role], last: Place 
     own = require_roster(station)
     member = require_member(own, name)
     if "keeper" in member.roles and "keeper" not in roles:
-        raise PolicyRefused(
+        raise PolicyError(
             f"{member.name} is a keeper, and that is taken by a removal alone: else its bans would end in silence.",
             hint=f"registry remove {quote(member.name)} --retired",
         )
@@ -158,7 +158,7 @@ def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
     member = require_member(own, name)
     chain = station.plant.tables.chain(member.fingerprint)
     if last is None and why != "retired":
-        raise UsageFailure(
+        raise UsageError(
             f"Which is the last page of {member.name} that you trust?",
             hint="Add --last N; registry log lists its pages.",
         )
@@ -172,13 +172,13 @@ def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
 
 
 def page_place(station: Station, of: str, n: int) -> Place:
-    """Number and H of a page that counts here; raises NotFound."""
+    """Number and H of a page that counts here; raises NotFoundError."""
     if n == 0:
         return NOWHERE
     chain = station.plant.tables.chain(of)
     found = [hash for number, hash, _ in station.plant.tables.page_names(chain.chain) if number == n]
     if not found or n > chain.counted[0]:
-        raise NotFound(f"Page {n} of that station is missing here or does not count.", hint="See: registry status")
+        raise NotFoundError(f"Page {n} of that station is missing here or does not count.", hint="See: registry status")
     for number, hash, previous in station.plant.tables.page_names(chain.chain):
         if number == n + 1 and len(found) > 1 and previous in found:
             return n, previous
@@ -193,7 +193,7 @@ def shared(station: Station, share: Share) -> Roster:
     for to in share.to:
         member = own.member(to)
         if member is None or "base" not in member.roles:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"{own.name_of(to)} does not have the role 'base', so it cannot receive keys.", hint="registry role"
             )
     return following(station, share=(*(one for one in own.share if one.what != share.what), share))
@@ -211,11 +211,11 @@ def renewed(station: Station, days: timedelta) -> Roster:
 
 
 def require_member(roster: Roster, name: str) -> Member:
-    """A member by name or fingerprint; raises NotFound."""
+    """A member by name or fingerprint; raises NotFoundError."""
     found = roster.named(name)
     if not isinstance(found, Member):
         known = ", ".join(one.name for one in roster.members)
-        raise NotFound(f"{name!r} is not a member of {roster.name}.", hint=f"Members: {known}.")
+        raise NotFoundError(f"{name!r} is not a member of {roster.name}.", hint=f"Members: {known}.")
     return found
 
 
@@ -232,10 +232,12 @@ def write_draft(draft: Roster) -> bytes:
 
 
 def read_draft(octets: bytes, ca: bytes) -> Roster:
-    """A draft out of a file; raises BadData."""
+    """A draft out of a file; raises BadDataError."""
     draft = read_roster(load_exact(octets, "The draft"), ca)
     if json.loads(payload(draft.unsigned())) != json.loads(octets):
-        raise BadData("The draft was written by a newer version of teds-provision.", hint="Sign it with that version.")
+        raise BadDataError(
+            "The draft was written by a newer version of teds-provision.", hint="Sign it with that version."
+        )
     return draft
 
 

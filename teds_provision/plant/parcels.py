@@ -16,7 +16,7 @@ from datetime import UTC, datetime, timedelta
 from itertools import chain
 from typing import Final
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.handover import incoming, outgoing, pending
 from teds_provision.plant.post import SMALL, Parcel, Post
 from teds_provision.protocol.handover import jose
@@ -108,7 +108,7 @@ class _Reader:
             try:
                 plan = incoming.plan_import(self.station, octets, self.now)
             except TedsProvisionError as error:
-                if isinstance(error, incoming.NothingTaken):
+                if isinstance(error, incoming.NothingImportedError):
                     self._refuse(error)
                 self.station.plant.parcels.drop_parcel(row.id, "in")
                 return True
@@ -138,7 +138,7 @@ class _Reader:
         with self.station.lock(_COMMAND):
             try:
                 plan = incoming.plan_import(self.station, parcel.octets, self.now)
-            except incoming.NothingTaken as error:
+            except incoming.NothingImportedError as error:
                 self._refuse(error)
                 return True
             row = self._row(parcel, "bundle")
@@ -239,7 +239,7 @@ class _Reader:
             tables.put_parcel(row, parcel.octets)
         return False
 
-    def _refuse(self, error: incoming.NothingTaken) -> None:
+    def _refuse(self, error: incoming.NothingImportedError) -> None:
         """Say on the next page that nothing of a bundle was taken: it is never sent again for these keys."""
         with self.station.transaction():
             for one in error.nodes:
@@ -249,7 +249,7 @@ class _Reader:
 
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
         """What nobody can use is thrown away and told; it would lie there until it expires."""
-        if not isinstance(error, (BadData, NotAuthentic, NotFound, PolicyRefused)):
+        if not isinstance(error, (BadDataError, NotAuthenticError, NotFoundError, PolicyError)):
             raise error
         with self.station.durable(_COMMAND):
             self.station.plant.tables.put_alarm(Alarm("parcel", parcel.sender, 0, error.message))
@@ -344,7 +344,7 @@ def _send(station: Station, roster: Roster, post: Post) -> int:
             continue  # a removed station gets nothing; a move to it is a person's to take back
         try:
             post.send(Parcel(row.id, row.peer, tables.parcel_document(row.id, "out"), row.expires, station.fingerprint))
-        except PolicyRefused:
+        except PolicyError:
             break  # too much waits there: the rest goes with the next sync
         with station.durable(_COMMAND):
             if row.kind == "bundle":
@@ -369,7 +369,7 @@ def _expire(station: Station, now: datetime) -> None:
             if handover is not None and handover.mode == "move" and handover.state == pending.OPEN:
                 nodes = tuple(bytes.fromhex(one) for one in pending.Notes.from_json(handover.nodes).uuids)
                 order = outgoing.ExportOrder((row.peer,), nodes, "move")
-                with suppress(PolicyRefused, NotFound):  # revoked or forgotten since: `handover undo` says so
+                with suppress(PolicyError, NotFoundError):  # revoked or forgotten since: `handover undo` says so
                     send_export(station, outgoing.plan_export(station, order, now), now)
 
 

@@ -1,8 +1,8 @@
 """How pages, rosters and parcels travel: a folder (a stick, a share), or PostgreSQL. A post office decides nothing.
 
 Whoever carries can withhold, repeat and put in junk, and no more: what it gives is octets, and every reader checks who
-signed them. So a post never raises because of what lies there; it raises LinkFailure where it cannot be reached and
-PolicyRefused where it lets nobody in.
+signed them. So a post never raises because of what lies there; it raises LinkError where it cannot be reached and
+PolicyError where it lets nobody in.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Returned(Protocol):
         """The pages that were offered; one that is gone is left out."""
 
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
-        """Hand in pages (number, octets) of a station. Raises PolicyRefused."""
+        """Hand in pages (number, octets) of a station. Raises PolicyError."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Post(Protocol):
         """The pages of a station above a number, ascending; a folder gives all that it has, several of one number."""
 
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
-        """Put a page there; the same again changes nothing. Raises Fork where another one has its place for good."""
+        """Put a page there; the same again changes nothing. Raises ForkError if another one has its place for good."""
 
     def parcels(self, to: str) -> Iterator[Parcel]:
         """What lies there for a station."""
@@ -123,7 +123,7 @@ class Post(Protocol):
         """
 
     def send(self, parcel: Parcel) -> None:
-        """Put a parcel there; the same id again changes nothing. Raises PolicyRefused where no more is taken."""
+        """Put a parcel there; the same id again changes nothing. Raises PolicyError where no more is taken."""
 
     def drop(self, parcel: str, to: str) -> None:
         """Throw a parcel away; one that is gone is no error."""

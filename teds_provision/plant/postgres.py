@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from teds_provision.errors import (
-    Fork,
-    NotMember,
-    PolicyRefused,
-    RegistryFailure,
-    StoreFailure,
+    ForkError,
+    NotMemberError,
+    PolicyError,
+    RegistryError,
+    StoreError,
     TedsProvisionError,
-    UsageFailure,
+    UsageError,
 )
 from teds_provision.lazy import how_to_install, late
 from teds_provision.plant import schema, scram
@@ -132,32 +132,32 @@ select what from (values
 
 
 def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
-    """What libpq is told for a registry's URL; raises UsageFailure (2) where the URL says more than where it is.
+    """What libpq is told for a registry's URL; raises UsageError (2) where the URL says more than where it is.
 
     ``postgresql://HOST[:PORT]/DATABASE[?sslrootcert=FILE]``; without the file libpq's own place for root certificates
     counts. Whoever could write ``sslmode`` or a user into it would decide whom this station trusts.
     """
     parts = urlsplit(url)
     if parts.scheme not in ("postgresql", "postgres"):
-        raise UsageFailure("Give the registry as postgresql://HOST/DATABASE, or use --files DIR.")
+        raise UsageError("Give the registry as postgresql://HOST/DATABASE, or use --files DIR.")
     if parts.password is not None or "password" in parts.query:
-        raise UsageFailure(
+        raise UsageError(
             "The URL of a registry must not contain a password.",
             hint="The station logs in with its own key: registry request --output FILE",
         )
     if parts.username is not None:
-        raise UsageFailure("The URL of a registry must not contain a user: each station logs in as itself.")
+        raise UsageError("The URL of a registry must not contain a user: each station logs in as itself.")
     require_driver()
     told: dict[str, Any]
     try:
         told = psycopg.conninfo.conninfo_to_dict(url)
     except psycopg.ProgrammingError as error:
-        raise UsageFailure(f"PostgreSQL's driver rejects this URL: {_words(error)}") from error
+        raise UsageError(f"PostgreSQL's driver rejects this URL: {_words(error)}") from error
     unknown = sorted(set(told) - _FROM_URL)
     if unknown:
-        raise UsageFailure(f"The URL of a registry may not set {', '.join(unknown)}.", hint="Remove it.")
+        raise UsageError(f"The URL of a registry may not set {', '.join(unknown)}.", hint="Remove it.")
     if not told.get("host") or not told.get("dbname"):
-        raise UsageFailure("The URL of a registry needs a host and a database: postgresql://HOST/DATABASE")
+        raise UsageError("The URL of a registry needs a host and a database: postgresql://HOST/DATABASE")
     return told | {
         "user": schema.role_of(fingerprint),
         "password": scram.password(secret),
@@ -178,11 +178,11 @@ def parameters(url: str, fingerprint: str, secret: bytes) -> dict[str, Any]:
 
 
 def require_driver() -> None:
-    """Raise UsageFailure where psycopg is missing."""
+    """Raise UsageError where psycopg is missing."""
     try:
         _ = psycopg.conninfo
     except ImportError as error:
-        raise UsageFailure(
+        raise UsageError(
             "A registry on PostgreSQL needs psycopg, which is not installed.", hint=how_to_install("registry")
         ) from error
 
@@ -191,8 +191,8 @@ class Registry:
     """One login at the database, connected at its first use and again after a failure.
 
     Several threads may use it (the readers of a line do): one at a time, as a login has four connections for all that
-    its station runs. Every method raises RegistryFailure (5: not reached, login refused, no answer), NotMember (6),
-    PolicyRefused (6: full), Fork (4), StoreFailure (7: schema, gap).
+    its station runs. Every method raises RegistryError (5: not reached, login refused, no answer), NotMemberError (6),
+    PolicyError (6: full), ForkError (4), StoreError (7: schema, gap).
     """
 
     def __init__(self, told: Mapping[str, Any], patience: float = STATEMENT + _GRACE) -> None:
@@ -223,11 +223,11 @@ class Registry:
                 rows = self._rows(_LOOK_1, ())
         meta = next((row for row in rows if row[0] == "meta"), None)
         if meta is None:
-            raise StoreFailure(
+            raise StoreError(
                 "The database does not contain a registry.", hint="Ask its administrator to run: registry sql | psql"
             )
         if meta[2] > schema.VERSION:
-            raise StoreFailure(
+            raise StoreError(
                 f"The database has schema {meta[2]}; this program knows {schema.VERSION}.",
                 hint="Use a newer version of teds-provision.",
             )
@@ -284,7 +284,7 @@ class Registry:
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
         """Hand in pages (number, octets) of a station that is no open member: one round trip, one transaction.
 
-        Raises AuthorIsMember when it is one by now, PolicyRefused beyond a member's limit.
+        Raises AuthorIsMemberError when it is one by now, PolicyError beyond a member's limit.
         """
         with self._connected() as connection, connection.pipeline():
             for n, octets in pages:
@@ -308,7 +308,7 @@ class Registry:
         """Leave a parcel for a station; the same id again changes nothing."""
         try:
             self._rows("select registry.send(%s, %s, %s, %s)", (parcel, bytes.fromhex(to), octets, until))
-        except _AlreadyThere:
+        except _DuplicateParcelError:
             return
 
     def parcel(self, parcel: str) -> bytes | None:
@@ -340,7 +340,7 @@ class Registry:
         A login may change its own time-outs, so the server's settings alone end nothing. Does nothing in a database
         whose schema has no such function yet.
         """
-        with suppress(StoreFailure):
+        with suppress(StoreError):
             self._rows("select registry.sweep()", ())
 
     def listen(self) -> None:
@@ -516,7 +516,7 @@ class ReturnedPages:
         return self._post._registry.offered(offers)
 
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
-        """Hand in pages of a station. Raises AuthorIsMember, PolicyRefused."""
+        """Hand in pages of a station. Raises AuthorIsMemberError, PolicyError."""
         self._post._registry.restore(author, pages)
 
 
@@ -556,15 +556,15 @@ def _shut(connection: psycopg.Connection[Any]) -> None:
         end.shutdown(socket.SHUT_RDWR)
 
 
-class AuthorIsMember(PolicyRefused):
+class AuthorIsMemberError(PolicyError):
     """The author of a page is an open member, who appends its pages itself."""
 
 
-class _NoSchemaError(StoreFailure):
+class _NoSchemaError(StoreError):
     """A table or function of the schema is missing."""
 
 
-class _AlreadyThere(TedsProvisionError):
+class _DuplicateParcelError(TedsProvisionError):
     """A parcel with this ID already exists."""
 
 
@@ -573,36 +573,36 @@ def _failure(error: psycopg.Error, *, late: bool) -> TedsProvisionError:
     state, words = error.sqlstate, _words(error)
     match state:
         case "TE001":
-            return NotMember(
+            return NotMemberError(
                 "The database does not list this station's login as open: it was closed, or its row was lost.",
                 hint="At a keeper, with FILE from registry request --output FILE: registry sql --member FILE | psql",
             )
         case "TE002":
-            return Fork(f"The registry rejected a page: {words}", hint="See: registry status")
+            return ForkError(f"The registry rejected a page: {words}", hint="See: registry status")
         case "TE003":
-            return StoreFailure(f"The registry rejected a page: {words}", hint="Run it again: registry sync")
+            return StoreError(f"The registry rejected a page: {words}", hint="Run it again: registry sync")
         case "TE004":
-            return PolicyRefused(
+            return PolicyError(
                 f"The registry accepts no more from this station: {words}.", hint="A later sync sends the rest."
             )
         case "23505":
-            return _AlreadyThere("A parcel with this ID already exists.")
+            return _DuplicateParcelError("A parcel with this ID already exists.")
         case "53100" | "53200":
-            return RegistryFailure(f"The database is full: {words}", hint="Its administrator must free some space.")
+            return RegistryError(f"The database is full: {words}", hint="Its administrator must free some space.")
         case _ if state in _NO_SCHEMA:
             return _NoSchemaError(
                 "The database does not contain a registry.", hint="Ask its administrator to run: registry sql | psql"
             )
         case "TE006":
-            return AuthorIsMember("The author of these pages is an open member, who appends them itself.")
+            return AuthorIsMemberError("The author of these pages is an open member, who appends them itself.")
         case "42501":
-            return StoreFailure(
+            return StoreError(
                 f"The database does not allow a member to do this: {words}",
                 hint="Ask its administrator to run again: registry sql | psql",
             )
     if late:
-        return RegistryFailure("The registry did not answer in time.", hint="All other work can continue without it.")
-    return RegistryFailure(f"Cannot use the registry: {words}", hint="All other work can continue without it.")
+        return RegistryError("The registry did not answer in time.", hint="All other work can continue without it.")
+    return RegistryError(f"Cannot use the registry: {words}", hint="All other work can continue without it.")
 
 
 def _words(error: BaseException) -> str:

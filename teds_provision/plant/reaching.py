@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
 
-from teds_provision.errors import NotMember, PolicyRefused
+from teds_provision.errors import NotMemberError, PolicyError
 from teds_provision.plant import postgres
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.membership import FILES
@@ -26,7 +26,7 @@ def post_of(station: Station) -> Post | None:
 def database(station: Station, url: str) -> postgres.PostgresPost:
     """The registry at a URL, by the login that this station's request named (the vault opens); not connected yet.
 
-    Raises UsageFailure (the URL, the driver), NotMember (no request was ever made).
+    Raises UsageError (the URL, the driver), NotMemberError (no request was ever made).
     """
     return postgres.PostgresPost(postgres.Registry(_login(station, url)), postgres.where_of(url), station.fingerprint)
 
@@ -62,16 +62,16 @@ def absolute(url: str) -> str:
 
 
 def require_registry(post: Post, registry: str) -> None:
-    """Raise PolicyRefused where a database is of another registry than the roster that is to be joined."""
+    """Raise PolicyError where a database is of another registry than the roster that is to be joined."""
     there = post.registry()
     if there != registry:
-        raise PolicyRefused(f"{post.where} belongs to another registry ({there}) than the roster ({registry}).")
+        raise PolicyError(f"{post.where} belongs to another registry ({there}) than the roster ({registry}).")
 
 
 def _login(station: Station, url: str) -> dict[str, object]:
     kept = station.plant.login()
     if kept is None:
-        raise NotMember(
+        raise NotMemberError(
             "This station has no database login yet.",
             hint="To get one: registry request --output FILE; the database's administrator then runs: registry"
             " sql --member FILE | psql",

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
 from typing import Final
 
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyError
 from teds_provision.plant.fetching import note_waiting, read_pages, take_carried
 from teds_provision.plant.folding import alarm, counted_places, octets_of
 from teds_provision.plant.post import Carried, Offer, Returned
@@ -140,7 +140,7 @@ def hand_in(station: Station, database: Returned, roster: Roster) -> tuple[int, 
             while batch := list(islice(lacking, _AT_ONCE)):
                 database.restore(author, batch)
                 handed_in += len(batch)
-        except PolicyRefused as error:
+        except PolicyError as error:
             refused.append(f"the registry does not take all pages of {name}: {error.message}")
     return handed_in, refused
 

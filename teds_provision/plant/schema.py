@@ -12,7 +12,7 @@ from importlib.resources import files
 from typing import Final
 from uuid import UUID
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.plant.scram import is_verifier
 
 VERSION: Final = 2
@@ -23,9 +23,9 @@ _FINGERPRINT = re.compile(r"[0-9a-f]{64}")
 
 
 def role_of(fingerprint: str) -> str:
-    """The login role of a station; raises BadData for what is no fingerprint of 64 digits."""
+    """The login role of a station; raises BadDataError for what is no fingerprint of 64 digits."""
     if not _FINGERPRINT.fullmatch(fingerprint):
-        raise BadData("A station's login needs all 64 digits of its fingerprint.")
+        raise BadDataError("A station's login needs all 64 digits of its fingerprint.")
     return f"teds_{fingerprint[:16]}"
 
 
@@ -40,10 +40,12 @@ def registry_sql(registry: str, removed: Iterable[str] = ()) -> str:
 
 
 def member_sql(fingerprint: str, verifier: str) -> str:
-    """The login of one station; run again it gives it the password of a newer request. Raises BadData."""
+    """The login of one station; run again it gives it the password of a newer request. Raises BadDataError."""
     role = role_of(fingerprint)
     if not is_verifier(verifier):
-        raise BadData("The request's login is not a SCRAM-SHA-256 verifier.", hint="Create it again: registry request")
+        raise BadDataError(
+            "The request's login is not a SCRAM-SHA-256 verifier.", hint="Create it again: registry request"
+        )
     return f"""\
 begin;
 set local lock_timeout = '500ms';
@@ -89,7 +91,7 @@ select {end};
 def mend_sql(fingerprint: str, first: int) -> str:
     """Take off the rows of a station from number ``first`` on, which its key did not sign."""
     if first < 1:
-        raise BadData("Page numbers start at 1.")
+        raise BadDataError("Page numbers start at 1.")
     station = f"'\\x{role_of(fingerprint) and fingerprint}'"
     before = f"(select hash from registry.page p where p.station = {station} and p.n = {first - 1})"
     return f"""\

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final
 
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.plant.folding import AT_ONCE, counted_places, heads_digest, now, require_roster, views
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
@@ -138,11 +138,11 @@ def log(
 def resolve(station: Station, text: str) -> bytes:
     """Return the UUID that ``text`` means, looking in the own store first, then at what the plant's stations report.
 
-    Raises NotFound, or UsageFailure if several nodes fit.
+    Raises NotFoundError, or UsageError if several nodes fit.
     """
     try:
         return station.nodes.resolve(text)
-    except NotFound:
+    except NotFoundError:
         roster = station.plant.roster
         if roster is None:
             raise
@@ -156,7 +156,7 @@ def resolve(station: Station, text: str) -> bytes:
         if not found:
             raise
     if len(found) > 1:
-        raise UsageFailure(
+        raise UsageError(
             f"{text!r} matches {len(found)} nodes: {', '.join(found[:5])}.", hint="Give more digits of the UUID."
         )
     return bytes.fromhex(found[0])

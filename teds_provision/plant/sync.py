@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from shlex import quote
 from typing import Final, NoReturn
 
-from teds_provision.errors import Fork, NotAuthentic, NotMember, PolicyRefused
+from teds_provision.errors import ForkError, NotAuthenticError, NotMemberError, PolicyError
 from teds_provision.plant import fetching, leaving, parcels, returned
 from teds_provision.plant.folding import (
     alarm,
@@ -63,7 +63,7 @@ class Synced:
 
 @contextmanager
 def alone(station: Station) -> Iterator[None]:
-    """One sync at a time in a home: a second waits 10 s, then StoreLocked."""
+    """One sync at a time in a home: a second waits 10 s, then StoreLockedError."""
     lock = StoreLock(station.home, command="registry sync", notice=station.notice, file=LOCK_FILE)
     with lock:
         yield
@@ -72,8 +72,8 @@ def alone(station: Station) -> Iterator[None]:
 def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
     """Bring this station and what carries to the same state, as far as signatures go.
 
-    ``connected``: it is what the station joined by; how far that came is remembered. Raises LinkFailure, NotMember,
-    Fork, PolicyRefused.
+    ``connected``: it is what the station joined by; how far that came is remembered. Raises LinkError, NotMemberError,
+    Fork, PolicyError.
     """
     station.unlock()
     with alone(station):
@@ -82,7 +82,7 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
         roster = require_roster(station)
         if roster.member(station.fingerprint) is None:
             apply_claims(station)
-            raise NotMember(
+            raise NotMemberError(
                 f"This station was removed from {roster.name} (roster {roster.version}).",
                 hint="A removed key cannot return: create a new station (init) and have it added.",
             )
@@ -121,7 +121,7 @@ def _rosters(station: Station, post: Post, done: Synced) -> list[tuple[Roster, s
     """Take the best roster that lies there, and post one's own."""
     joined = station.plant.joined
     if joined is not None and post.registry() not in (None, joined.registry):
-        raise PolicyRefused(
+        raise PolicyError(
             f"{post.where} belongs to another registry ({post.registry()}).",
             hint="Use the one that this station joined.",
         )
@@ -205,7 +205,7 @@ def _own_pages(station: Station, post: Post, roster: Roster, done: Synced, above
             junk[0],
             f"{post.where} has pages that this station's key did not sign",
         )
-        raise NotAuthentic(
+        raise NotAuthenticError(
             f"{post.where} has pages of this station that its key did not sign, from number {junk[0]} on.",
             hint=f"To delete them there: registry sql --mend {quote(roster.name_of(station.fingerprint))} {junk[0]}",
         )
@@ -215,11 +215,11 @@ def _own_pages(station: Station, post: Post, roster: Roster, done: Synced, above
 
 
 def _stop_at_fork(station: Station, post: Post, new: Sequence[Page]) -> NoReturn:
-    """Raise Fork: another home writes, or has written, under this station's key."""
+    """Raise ForkError: another home writes, or has written, under this station's key."""
     homes = ", ".join(sorted({page.home or "unknown" for page in new}))
     first = min(page.n for page in new)
     alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
-    raise Fork(
+    raise ForkError(
         f"{post.where} has pages under this station's key that are not of this home, from number {first} on"
         f" (home {homes}; here {station.plant.home}): a disk image was restored, or a copy of this home is in use.",
         hint="Find out who has a copy; if in doubt, have this station removed. Then: teds-provision registry resume",
@@ -227,10 +227,13 @@ def _stop_at_fork(station: Station, post: Post, new: Sequence[Page]) -> NoReturn
 
 
 def _require_resumed(station: Station) -> None:
-    """Raise Fork where one was found before and no person has decided: a folder that shows less of it ends nothing."""
+    """Raise ForkError if one was found before and no person has decided.
+
+    A folder that shows less of it ends nothing.
+    """
     found = [one for one in station.plant.tables.alarms() if one.code == "fork" and one.about == station.fingerprint]
     if found:
-        raise Fork(
+        raise ForkError(
             f"Pages under this station's key that this home did not write were found, from number {found[0].n}"
             " on, and the decision is still open.",
             hint="Find out who has a copy; if in doubt, have this station removed. Then: teds-provision"
@@ -308,7 +311,7 @@ def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None
     newest = max({own_chain(station).counted[0]} | there)
     for who, about, n, _ in station.plant.tables.heads():
         if about == station.fingerprint and n > newest and roster.member(who) is not None:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"This home was restored from a backup. {roster.name_of(who)} has seen its page {n}, but the"
                 f" last one here is {newest}.",
                 hint=f"Get the missing pages: registry sync --files DIR that {roster.name_of(who)} filled; or"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import BadData, NotAuthentic, TedsProvisionError
+from teds_provision.errors import BadDataError, NotAuthenticError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import same_key
@@ -41,7 +41,10 @@ class Grounds:
 
     @classmethod
     def of(cls, ca: bytes, pins: Path | None = None, roster: Path | None = None) -> Grounds:
-        """Read ``pins``, a whitelist file, and a roster that this CA signed; raises NotFound, NotAuthentic, BadData."""
+        """Read ``pins``, a whitelist file, and a roster that this CA signed.
+
+        Raises NotFoundError, NotAuthenticError, BadDataError.
+        """
         listed = None if pins is None else {one.uuid: one.fingerprint or "" for one in whitelist.read_whitelist(pins)}
         named = None if roster is None else open_roster(read_limited(roster, ROSTER.most, "roster"), ca)
         return cls(ca, listed, named)
@@ -76,7 +79,7 @@ def _wrong_members(evidence: Evidence, roster: Roster) -> Iterator[str]:
         return
     try:
         shown = security.decode(evidence.teds)
-    except BadData:
+    except BadDataError:
         return  # told already
     signer = fingerprint(shown.station_key) if shown.station_key is not None else ""
     if signer != station:
@@ -113,7 +116,7 @@ class JudgedEvidence:
         """0, 4 (not authentic), 3 (no such file), 8 (unreadable)."""
         if self.error is not None:
             return self.error.exit_code
-        return NotAuthentic.exit_code if self.faults else 0
+        return NotAuthenticError.exit_code if self.faults else 0
 
     @property
     def word(self) -> str:
@@ -238,6 +241,6 @@ def judge_files(grounds: Grounds, paths: Sequence[Path]) -> list[JudgedEvidence]
 
 def _read(path: Path) -> Ready | TedsProvisionError:
     try:
-        return codec.ready(codec.read(read_limited(path, codec.MAX_OCTETS, "evidence", failure=BadData)))
+        return codec.ready(codec.read(read_limited(path, codec.MAX_OCTETS, "evidence", failure=BadDataError)))
     except TedsProvisionError as error:
         return error

@@ -94,7 +94,7 @@ class StationYield:
 def attempts_of(station: Station, job: str, files: Iterable[bytes] = ()) -> list[Attempt]:
     """Every attempt that is known of a job: own evidence, evidence of others (``files``), and the pages of others.
 
-    A file that is no evidence of this job raises BadData, or is passed over.
+    A file that is no evidence of this job raises BadDataError, or is passed over.
     """
     found: dict[tuple[str, bytes, int], Attempt] = {}
     known: set[str] = set()

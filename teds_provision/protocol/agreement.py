@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from teds_provision.errors import BadData, Garbled, NotAuthentic, OtherKey, PolicyRefused
+from teds_provision.errors import BadDataError, GarbledError, KeyMismatchError, NotAuthenticError, PolicyError
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import (
     POINT_OCTETS,
@@ -125,24 +125,25 @@ class AgreedKey:
         return key_id(self.key)
 
 
-class OtherTranscript(NotAuthentic):
+class TranscriptMismatchError(NotAuthenticError):
     """A wrong tagN: the node's Security TEDS changed meanwhile, or the reply was disturbed. It accuses nobody."""
 
 
 def fit_to_agree(teds: bytes, uuid: bytes, pinned: str | None) -> SecurityTeds:
     """What a node's Security TEDS must be before a Request is made: canonical, this profile's values, its own key.
 
-    ``pinned`` is the fingerprint that the whitelist holds, None where this contact pins. Raises NotCanonical, BadData
-    (another ProfileVersion, SessionSuite or KeyAgreement, by name), OtherKey, NotAuthentic (field 102).
+    ``pinned`` is the fingerprint that the whitelist holds, None where this contact pins. Raises NotCanonicalError,
+    BadDataError (another ProfileVersion, SessionSuite or KeyAgreement, by name), KeyMismatchError, NotAuthenticError
+    (field 102).
     """
     shown = security.decode(teds)
     if other := security.other_wire(shown):
-        raise BadData(f"This node speaks {other}.", hint="It needs firmware of this version of the profile.")
+        raise BadDataError(f"This node speaks {other}.", hint="It needs firmware of this version of the profile.")
     node = shown.node_key
     if pinned is not None and not same_key(pinned, fingerprint(node)):
         raise other_key(pinned, node)
     if not node_key_good(uuid, node, shown.node_key_signature):
-        raise NotAuthentic("The node's key is not signed for this UUID (field 102): it belongs to another node.")
+        raise NotAuthenticError("The node's key is not signed for this UUID (field 102): it belongs to another node.")
     return shown
 
 
@@ -166,35 +167,35 @@ class StationAgreement:
 
         ``teds`` is the node's Security TEDS, read before on this link (in a session: in it); ``pinned`` as in
         :func:`fit_to_agree`; ``epoch`` that of the current key, 0 for none. Raises what :func:`fit_to_agree` raises,
-        Garbled (length), NotAuthentic (En, sigN), OtherTranscript (tagN), PolicyRefused (epoch).
+        Garbled (length), NotAuthenticError (En, sigN), TranscriptMismatchError (tagN), PolicyError (epoch).
         """
         shown = fit_to_agree(teds, self._uuid, pinned)
         node, station = shown.node_key, self._credentials.key
         if node in (station.point, self._one_time.point):
-            raise NotAuthentic("The key that the node shows is this station's own.")
+            raise NotAuthenticError("The key that the node shows is this station's own.")
         if len(reply) != REPLY_OCTETS:
-            raise Garbled(f"The reply to Request has {len(reply)} octets, not {REPLY_OCTETS}.")
+            raise GarbledError(f"The reply to Request has {len(reply)} octets, not {REPLY_OCTETS}.")
         nonce, reply = reply[:NONCE_OCTETS], reply[NONCE_OCTETS:]
         offered, one_time = int.from_bytes(reply[:4], "big"), reply[4 : 4 + POINT_OCTETS]
         tag, signature = reply[4 + POINT_OCTETS : -SIGNATURE_OCTETS], reply[-SIGNATURE_OCTETS:]
         if not good_one_time(one_time, self._one_time.point, station.point, node):
-            raise NotAuthentic(
+            raise NotAuthenticError(
                 "The node's one-time key in its reply to Request is not a valid point, or is no one-time key."
             )
         script = transcript(self._payload, nonce, offered, one_time, self._uuid, node, teds)
         derived = derive(self._one_time.ecdh(one_time) + station.ecdh(one_time), nonce, script)
         if not hmac.compare_digest(derived.node_tag, tag):
-            raise OtherTranscript(
+            raise TranscriptMismatchError(
                 "The node's confirmation tag (tagN) is wrong: it made it over another Request or Security TEDS.",
                 hint="A disturbed link does this, or a node with another owner's hand on it: try again at the reader.",
             )
         if not verify(node, agreement_message(script), signature):
-            raise NotAuthentic(
+            raise NotAuthenticError(
                 "The node's signature on the agreement (sigN) is wrong: it does not hold the key that it shows.",
                 hint="This may be a copied tag, or somebody answers in its place. Do not use it.",
             )
         if offered <= epoch:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"The node offers key epoch {offered}; this station already holds epoch {epoch}.",
                 hint="The node may be a copy or was restored; take it to the bench and reset it by hand.",
             )
@@ -202,9 +203,9 @@ class StationAgreement:
         return AgreedKey(derived.key, offered, node, confirm, unsigned=not shown.signed)
 
 
-def other_key(pinned: str, node: bytes) -> OtherKey:
+def other_key(pinned: str, node: bytes) -> KeyMismatchError:
     """The error for a known UUID that comes with another key."""
-    return OtherKey(
+    return KeyMismatchError(
         f"This UUID is known with key {pinned[:16]}, the node shows {fingerprint(node)[:16]}.",
         hint="It may be a clone. If the board was replaced on purpose: whitelist remove UUID, then whitelist it anew.",
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import Verify, is_point, station_key_message, verify
 from teds_provision.teds.codec import frame, security
@@ -64,7 +64,7 @@ def passes_own_check(block: BlockId, teds: bytes) -> bool:
     """Length and Checksum are right and the TEDSID's class is the access code."""
     try:
         return frame.teds_class(frame.unframe(teds)) == block[1]
-    except BadData:
+    except BadDataError:
         return False
 
 
@@ -115,5 +115,5 @@ def meta_names(teds: bytes, uuid: bytes) -> bool:
             return True
         width = block[5] if len(block) > 5 else 1
         return any(part.type == UUID_FIELD and part.value == uuid for part in frame.tuples(block, width=width or 1))
-    except BadData:
+    except BadDataError:
         return False

@@ -11,11 +11,11 @@ from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, BlockId
 
 
-class FlashFailure(Exception):
+class FlashError(Exception):
     """Raised by a :class:`Flash` whose commit did not happen; the old state stands (reason 11)."""
 
 
-class ChipFailure(Exception):
+class ChipError(Exception):
     """Raised by a node's random source, key or one-time key that does not work: nothing was done (reason 11)."""
 
 
@@ -75,4 +75,4 @@ class FlashMemory(Protocol):
         """Return the state as it is."""
 
     def commit(self, state: Flash) -> None:
-        """Replace the state durably in one transaction; raises FlashFailure."""
+        """Replace the state durably in one transaction; raises FlashError."""

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, decode_dss_signature, encode_dss_signature
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 
 POINT_OCTETS = 65
 SIGNATURE_OCTETS = 64
@@ -58,10 +58,10 @@ class SoftwareKey:
 
     @classmethod
     def from_secret(cls, octets: bytes) -> SoftwareKey:
-        """Make the key of a 32-octet scalar as :meth:`secret` gives it; raises BadData."""
+        """Make the key of a 32-octet scalar as :meth:`secret` gives it; raises BadDataError."""
         value = int.from_bytes(octets, "big")
         if len(octets) != 32 or not 0 < value < GROUP_ORDER:
-            raise BadData("A P-256 private key is 32 octets between 1 and the group order.")
+            raise BadDataError("A P-256 private key is 32 octets between 1 and the group order.")
         return cls(value)
 
     def secret(self) -> bytes:
@@ -100,20 +100,20 @@ def normalise_signature(raw: bytes) -> bytes:
 
 @lru_cache(maxsize=256)  # stations, CAs and the node at hand are asked for again and again, and a check costs 25 µs
 def public_key(point: bytes) -> ec.EllipticCurvePublicKey:
-    """Read a 65-octet point strictly: uncompressed, on the curve, not infinity. Raises BadData."""
+    """Read a 65-octet point strictly: uncompressed, on the curve, not infinity. Raises BadDataError."""
     if len(point) != POINT_OCTETS or point[0] != 0x04:
-        raise BadData("A public key is an uncompressed P-256 point of 65 octets that starts with 04.")
+        raise BadDataError("A public key is an uncompressed P-256 point of 65 octets that starts with 04.")
     try:
         return ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), point)
     except ValueError as error:
-        raise BadData("A public key is not a point of the curve P-256.") from error
+        raise BadDataError("A public key is not a point of the curve P-256.") from error
 
 
 def is_point(point: bytes) -> bool:
     """Say whether 65 octets are a valid uncompressed P-256 point."""
     try:
         public_key(point)
-    except BadData:
+    except BadDataError:
         return False
     return True
 
@@ -133,7 +133,7 @@ def verify(point: bytes, message: bytes, signature: bytes) -> bool:
         return False
     try:
         public_key(point).verify(encode_dss_signature(r, s), hashlib.sha256(message).digest(), _OF_DIGEST)
-    except (InvalidSignature, BadData):
+    except (InvalidSignature, BadDataError):
         return False
     return True
 
@@ -149,17 +149,19 @@ def to_pem(point: bytes) -> str:
 
 
 def from_pem(text: bytes) -> bytes:
-    """Point (65 octets) of a P-256 public key in PEM; raises BadData, by name for private and foreign keys."""
+    """Point (65 octets) of a P-256 public key in PEM; raises BadDataError, by name for private and foreign keys."""
     if b"PRIVATE KEY" in text:
-        raise BadData("This file holds a private key where a public one belongs.")
+        raise BadDataError("This file holds a private key where a public one belongs.")
     try:
         key = load_pem_public_key(text)
     except UnsupportedAlgorithm as error:
-        raise BadData("This is no P-256 key: its kind is not known here; stations and CAs have P-256 keys.") from error
+        raise BadDataError(
+            "This is no P-256 key: its kind is not known here; stations and CAs have P-256 keys."
+        ) from error
     except ValueError as error:
-        raise BadData("This file holds no public key in PEM form.") from error
+        raise BadDataError("This file holds no public key in PEM form.") from error
     if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
-        raise BadData("This is not a P-256 key; stations and CAs have P-256 keys.")
+        raise BadDataError("This is not a P-256 key; stations and CAs have P-256 keys.")
     return key.public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
 
 

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from teds_provision.errors import Garbled, NotAuthentic
+from teds_provision.errors import GarbledError, NotAuthenticError
 from teds_provision.protocol.agreement import good_one_time, key_id
 from teds_provision.protocol.keys import POINT_OCTETS, PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
@@ -112,27 +112,27 @@ class StationSession:
         return security_command(Function.OPEN)
 
     def open(self, counter: bytes) -> Command:
-        """Return the Open to send for the node's c; raises Garbled where c has not 8 octets."""
+        """Return the Open to send for the node's c; raises GarbledError where c has not 8 octets."""
         assert self._one_time is not None, "open() after accept()"
         if len(counter) != COUNTER_OCTETS:
-            raise Garbled(f"The node's counter for Open has {len(counter)} octets, not {COUNTER_OCTETS}.")
+            raise GarbledError(f"The node's counter for Open has {len(counter)} octets, not {COUNTER_OCTETS}.")
         self.c, station = counter, self._one_time.point
         mac = open_mac(self._key, self._uuid, counter, station)
         return security_command(Function.OPEN, key_id(self._key) + station + mac)
 
     def accept(self, payload: bytes) -> None:
-        """Check the reply to Open; raises Garbled or NotAuthentic (the node does not hold the key)."""
+        """Check the reply to Open; raises GarbledError or NotAuthenticError (the node does not hold the key)."""
         assert self._one_time is not None, "accept() twice"
         if len(payload) != OPEN_REPLY_OCTETS:
-            raise Garbled(f"The reply to Open has {len(payload)} octets, not {OPEN_REPLY_OCTETS}.")
+            raise GarbledError(f"The reply to Open has {len(payload)} octets, not {OPEN_REPLY_OCTETS}.")
         node, station = payload[:POINT_OCTETS], self._one_time.point
         if not good_one_time(node, station, *self._statics):
-            raise NotAuthentic(
+            raise NotAuthenticError(
                 "The node's one-time key in its reply to Open is not a valid point, or is no one-time key."
             )
         keys = SessionKeys.derive(self._key, self._uuid, self._one_time.ecdh(node), station, node)
         if not hmac.compare_digest(keys.node_tag, payload[POINT_OCTETS:]):
-            raise NotAuthentic("The node's tag on Open is wrong: it does not hold the key.")
+            raise NotAuthenticError("The node's tag on Open is wrong: it does not hold the key.")
         self._keys, self._one_time = keys, None
 
     @property
@@ -151,7 +151,7 @@ class StationSession:
         """Seal one inner command under the next counter; another ``counter`` (u32) is for trying a node out."""
         assert self._keys is not None, "seal() before a good accept()"
         if counter is None and self._counter >= LAST_COUNTER:
-            raise Garbled("This session has used up its counters; open a new one.")
+            raise GarbledError("This session has used up its counters; open a new one.")
         self._counter = self._counter + 1 if counter is None else counter
         return security_command(Function.SEALED, _seal(self._keys.to_node, self._counter, command.encode()))
 
@@ -162,16 +162,16 @@ class StationSession:
         return security_command(Function.SEALED, _seal_padded(self._keys.to_node, self._counter, padded))
 
     def unseal(self, payload: bytes) -> Reply:
-        """Open the sealed reply to the last command; raises Garbled or NotAuthentic."""
+        """Open the sealed reply to the last command; raises GarbledError or NotAuthenticError."""
         assert self._keys is not None, "unseal() before a good accept()"
         if len(payload) < SEALED_HEAD_OCTETS + BLOCK_OCTETS or int.from_bytes(payload[:4], "big") != self._counter:
-            raise NotAuthentic("A sealed reply does not belong to the command that was sent.")
+            raise NotAuthenticError("A sealed reply does not belong to the command that was sent.")
         padded = _decrypt(self._keys.to_station, payload)
         if padded is None:
-            raise NotAuthentic("The tag of a sealed reply is wrong.")
+            raise NotAuthenticError("The tag of a sealed reply is wrong.")
         inner = unpad(padded)
         if inner is None:
-            raise NotAuthentic(
+            raise NotAuthenticError(
                 "The padding of a sealed reply is wrong; its tag is right.",
                 hint="The node's firmware is at fault, not its key: PKCS #7 adds 1 to 16 octets, a whole block where"
                 " the reply is a multiple of 16. Run: teds-provision node check",

@@ -12,7 +12,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Final
 
-from teds_provision.errors import Frozen, NotFound, UsageFailure
+from teds_provision.errors import FrozenError, NotFoundError, UsageError
 from teds_provision.files import open_lock
 from teds_provision.station.plant import Plant
 from teds_provision.store import Store
@@ -53,13 +53,13 @@ class Groups:
         return self._store.groups()
 
     def get(self, name: str) -> Group:
-        """One group; raises NotFound."""
+        """One group; raises NotFoundError."""
         found = self._store.group(name)
         if found is None:
             known = [group.name for group in self.all()]
             more = ", …" if len(known) > _SHOWN else ""
             hint = f"Groups: {', '.join(known[:_SHOWN])}{more}." if known else f"To create it: {_CREATE}"
-            raise NotFound(f"There is no group {name!r}.", hint=hint)
+            raise NotFoundError(f"There is no group {name!r}.", hint=hint)
         return found
 
     def find(self, name: str) -> Group | None:
@@ -67,17 +67,15 @@ class Groups:
         return self._store.group(name)
 
     def create(self, name: str, uuids: Sequence[bytes]) -> Group:
-        """Make a group, or give the one that is there back where it has the same members; raises UsageFailure."""
+        """Make a group, or give the one that is there back where it has the same members; raises UsageError."""
         if not is_valid_name(name):
-            raise UsageFailure(
+            raise UsageError(
                 f"{name!r} is not a valid group name.",
                 hint="Use up to 64 characters, not only hex digits or dots, and not 'all', which means every node.",
             )
         present = self._store.group(name)
         if present is not None and set(present.uuids) != set(uuids):
-            raise UsageFailure(
-                f"Group {name!r} already exists.", hint=f"Add nodes to it: group add {quote(name)} UUID …"
-            )
+            raise UsageError(f"Group {name!r} already exists.", hint=f"Add nodes to it: group add {quote(name)} UUID …")
         if present is None:
             with self._store.together():
                 self._store.put_group(Group(name, tuple(dict.fromkeys(uuids))))
@@ -85,7 +83,7 @@ class Groups:
         return self.get(name)
 
     def add(self, name: str, uuids: Iterable[bytes]) -> Group:
-        """Add nodes; raises NotFound, Frozen while it is measured."""
+        """Add nodes; raises NotFoundError, FrozenError while it is measured."""
         self.get(name)
         with self.frozen(name), self._store.together():
             there, added = self.get(name).uuids, list(dict.fromkeys(uuids))
@@ -94,7 +92,7 @@ class Groups:
         return self.get(name)
 
     def remove(self, name: str, uuids: Iterable[bytes]) -> Group:
-        """Take nodes out; raises NotFound, Frozen while it is measured."""
+        """Take nodes out; raises NotFoundError, FrozenError while it is measured."""
         self.get(name)
         with self.frozen(name), self._store.together():
             there, gone = self.get(name).uuids, list(dict.fromkeys(uuids))
@@ -103,7 +101,7 @@ class Groups:
         return self.get(name)
 
     def delete(self, name: str) -> bool:
-        """Delete a group; False where there is none. Raises Frozen while it is measured."""
+        """Delete a group; False where there is none. Raises FrozenError while it is measured."""
         if self.find(name) is None:
             return False
         with self.frozen(name), self._store.together():
@@ -136,7 +134,7 @@ class Groups:
 
     @contextmanager
     def frozen(self, name: str) -> Iterator[None]:
-        """Hold a group as it is; raises Frozen where another process does."""
+        """Hold a group as it is; raises FrozenError where another process does."""
         digest = hashlib.sha256(
             name.encode()
         ).hexdigest()  # 64 characters of any script are more than a file name takes
@@ -146,7 +144,7 @@ class Groups:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise Frozen(
+                raise FrozenError(
                     f"Group {name!r} is being measured and cannot be changed now.", hint="End that measurement first."
                 ) from None
             yield

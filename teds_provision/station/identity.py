@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
 from teds_provision.store import StationRecord, Store
@@ -54,14 +54,16 @@ class StationIdentity:
     def _facts(self) -> StationRecord:
         facts = self._store.facts()
         if facts is None:
-            raise NotFound(
+            raise NotFoundError(
                 f"There is no base station in {self._store.home} yet.", hint="To create one: teds-provision init"
             )
         return facts
 
     def _required(self, value: bytes | None) -> bytes:
         if value is None:
-            raise NotFound(f"init was not finished in {self._store.home}.", hint="To finish it: teds-provision init")
+            raise NotFoundError(
+                f"init was not finished in {self._store.home}.", hint="To finish it: teds-provision init"
+            )
         return value
 
     @property
@@ -122,10 +124,10 @@ class StationIdentity:
     # -- certificates ----------------------------------------------------------------------------------------------
 
     def certify(self, point: bytes) -> bytes:
-        """SIG104 of this owner's CA over another station's key; raises NotFound where the CA key is not here."""
+        """SIG104 of this owner's CA over another station's key; raises NotFoundError where the CA key is not here."""
         ca = self._vault().ca()
         if ca is None or ca.point != self.ca:
-            raise NotFound("The CA key is not in this vault.", hint="Run this on the station that has the CA key.")
+            raise NotFoundError("The CA key is not in this vault.", hint="Run this on the station that has the CA key.")
         return ca.sign(keys.station_key_message(point))
 
     def certificate(self, ca: bytes, point: bytes) -> bytes | None:
@@ -138,20 +140,20 @@ class StationIdentity:
         return self._store.certificate(keys.fingerprint(ca), keys.fingerprint(point))
 
     def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
-        """Keep a SIG104; raises NotAuthentic where it does not verify."""
+        """Keep a SIG104; raises NotAuthenticError where it does not verify."""
         if not keys.verify(ca, keys.station_key_message(point), signature):
-            raise NotAuthentic(
+            raise NotAuthenticError(
                 f"The CA {keys.fingerprint(ca)[:16]} did not sign the station {keys.fingerprint(point)[:16]}."
             )
         if self.certificate(ca, point) is None:
             self._store.put_certificate(keys.fingerprint(ca), keys.fingerprint(point), signature)
 
     def signature_under(self, ca: bytes) -> bytes:
-        """SIG104 of ``ca`` over this station's key; raises PolicyRefused where there is none."""
+        """SIG104 of ``ca`` over this station's key; raises PolicyError where there is none."""
         facts = self._facts
         signature = self._certificate(facts, ca, self._required(facts.point))
         if signature is None:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"This station is not certified by the CA {keys.fingerprint(ca)[:16]}.",
                 hint="Have it signed on the station with that CA key: teds-provision trust ca sign REQUEST",
             )

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from teds_provision import files
-from teds_provision.errors import NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import NotFoundError, TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install
 
 if TYPE_CHECKING:
@@ -65,10 +65,10 @@ class Label:
 
 
 def label_of(station: Station, uuid: bytes) -> Label:
-    """The label of a node whose key is pinned; raises NotFound where it is not."""
+    """The label of a node whose key is pinned; raises NotFoundError where it is not."""
     pinned = station.pins.pinned(uuid)
     if pinned is None or len(pinned) != _FINGERPRINT_DIGITS:
-        raise NotFound(
+        raise NotFoundError(
             f"The key of node {uuid.hex()} is not known here.", hint="Tap it once: teds-provision identify --add"
         )
     entry, node = station.pins.entry(uuid), station.nodes.get(uuid)
@@ -103,13 +103,13 @@ _TABLES: Final = tuple(_table(layout, letters) for layout, letters in _LAYOUTS.i
 
 
 def write_label(label: Label, path: Path) -> None:
-    """Write the label as SVG or PNG, by the suffix; raises UsageFailure (another one).
+    """Write the label as SVG or PNG, by the suffix; raises UsageError (another one).
 
     Raises TedsProvisionError where segno, or for a PNG Pillow, is missing.
     """
     suffix = path.suffix.lower()
     if suffix not in (".svg", ".png"):
-        raise UsageFailure(f"Labels are written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
+        raise UsageError(f"Labels are written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
     rows = _modules(label.text)
     octets = _svg(label, rows).encode() if suffix == ".svg" else _png(label, rows)
     files.write_whole(path, octets, mode=0o644)

@@ -17,10 +17,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from teds_provision.errors import Frozen, NotFound, PolicyRefused, StoreFailure, UsageFailure
+from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, UsageError
 from teds_provision.station.groups import Groups
 from teds_provision.store import Store
-from teds_provision.store.lock import Mark, MarkTaken, OwnerLock
+from teds_provision.store.lock import Mark, OwnerLock, UsageLockTakenError
 from teds_provision.store.records import COMMAND, DetectionMode, KeptMeasurement
 
 FOLDER = "measuring"  # of the home: who measures what now
@@ -58,7 +58,7 @@ class Measurements:
         """Return every one that is kept, oldest first; removes those of dead commands."""
         kept = self._store.measurements()
         dead = {one.id for one in kept if self._is_of_dead_command(one)}
-        with suppress(StoreFailure):  # a full disk hides no list; the next reader tries again
+        with suppress(StoreError):  # a full disk hides no list; the next reader tries again
             for measurement_id in dead:
                 self._store.remove_measurement(measurement_id)
         return [one for one in kept if one.id not in dead]
@@ -75,10 +75,10 @@ class Measurements:
         return not measurement.lasting and not OwnerLock(self._home, measurement.id).is_taken
 
     def get(self, measurement_id: str) -> KeptMeasurement:
-        """One of them; raises NotFound."""
+        """One of them; raises NotFoundError."""
         found = self._store.measurement(measurement_id)
         if found is None:
-            raise NotFound(
+            raise NotFoundError(
                 f"There is no measurement {measurement_id!r}.",
                 hint=f"Measurements: {', '.join(one.id for one in self.all()) or 'none'}.",
             )
@@ -94,11 +94,14 @@ class Measurements:
         return None if found is None else replace(found, id="", owner=COMMAND, pid=None, started=None)
 
     def nodes_of(self, measurement: KeptMeasurement) -> tuple[bytes, ...]:
-        """UUIDs of its nodes, 10 octets each; raises NotFound where its group is gone."""
+        """UUIDs of its nodes, 10 octets each; raises NotFoundError where its group is gone."""
         return measurement.uuids if measurement.group is None else self._groups.get(measurement.group).uuids
 
     def keep(self, measurement: KeptMeasurement) -> KeptMeasurement:
-        """Keep it, durable when this returns; one with id "" gets one. Raises NotFound (its group), BadData."""
+        """Keep it, durable when this returns; one with id "" gets one.
+
+        Raises NotFoundError (its group), BadDataError.
+        """
         if measurement.group is not None:
             self._groups.get(measurement.group)
         kept = measurement if measurement.id else replace(measurement, id=secrets.token_hex(4))
@@ -110,7 +113,7 @@ class Measurements:
         """Keep a measurement of this process while the block runs, with its process ID and start.
 
         Its lock is taken before the row exists and released after the row is gone, so a row without a taken lock is
-        always that of a dead command. Raises NotFound (its group).
+        always that of a dead command. Raises NotFoundError (its group).
         """
         owned = replace(measurement, id=secrets.token_hex(8), owner=COMMAND, pid=os.getpid(), started=_process_start())
         with OwnerLock(self._home, owned.id):
@@ -184,7 +187,7 @@ class Measurements:
     def running(self, uuids: Iterable[bytes], *, group: str | None = None, what: str = "measure") -> Iterator[None]:
         """Hold these nodes (and their group) as they are while they are measured.
 
-        The marks are locks of the system: they go with the process, however that ends. Raises PolicyRefused where the
+        The marks are locks of the system: they go with the process, however that ends. Raises PolicyError where the
         group is being measured already, or one of the nodes is being renamed.
         """
         with ExitStack() as stack:
@@ -193,8 +196,8 @@ class Measurements:
             for uuid in sorted(set(uuids)):
                 try:
                     stack.enter_context(self._mark(uuid, what))
-                except MarkTaken as taken:
-                    raise PolicyRefused(f"Node {uuid.hex()} is in use by {taken.holder}.", hint="Try again.") from taken
+                except UsageLockTakenError as taken:
+                    raise PolicyError(f"Node {uuid.hex()} is in use by {taken.holder}.", hint="Try again.") from taken
             yield
 
     def is_running(self, uuid: bytes) -> bool:
@@ -239,10 +242,10 @@ class Measurements:
     def set_frame(self, uuid: bytes, channel: int, frame: str | None) -> None:
         """Give values of a channel (0: of the whole node) this frame; None: the profile's.
 
-        It counts from the next session on. Raises Frozen while the node is measured.
+        It counts from the next session on. Raises FrozenError while the node is measured.
         """
         if self.is_running(uuid):
-            raise Frozen(
+            raise FrozenError(
                 f"Node {uuid.hex()} is being measured, so its frames cannot be changed now.",
                 hint="End that measurement first.",
             )
@@ -254,11 +257,11 @@ class Measurements:
     def rename(self, uuid: bytes, channel: int, name: str | None) -> None:
         """Publish a channel (0: the node's part) under this name from the next measurement on; None: as it was made.
 
-        The caller has checked that it can be a topic. Raises Frozen while the node is measured, UsageFailure
+        The caller has checked that it can be a topic. Raises FrozenError while the node is measured, UsageError
         where another one has the name.
         """
         if self.is_running(uuid):
-            raise Frozen(
+            raise FrozenError(
                 f"Node {uuid.hex()} is being measured, so its names cannot be changed now.",
                 hint="End that measurement first.",
             )
@@ -267,7 +270,7 @@ class Measurements:
             return
         for (other, number), taken in self.names.items():
             if taken == name and (other, number) != (uuid, channel):
-                raise UsageFailure(
+                raise UsageError(
                     f"{name!r} is the name of channel {number} of node {other.hex()} already.",
                     hint="Choose another name.",
                 )

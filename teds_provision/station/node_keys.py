@@ -8,12 +8,12 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import (
-    NoKeyring,
-    UnknownMaster,
-    VaultChanged,
-    VaultFailure,
-    VaultLocked,
-    WrongPassphrase,
+    KeyringUnavailableError,
+    UnknownMasterKeyError,
+    VaultChangedError,
+    VaultError,
+    VaultLockedError,
+    WrongPassphraseError,
 )
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant import Plant
@@ -87,15 +87,15 @@ class NodeKeys:
     def unwrapped(self, uuid: bytes) -> Iterator[NodeKey]:
         """Every key held for a node, in the order of trying: newest pending first, the active one last.
 
-        One that cannot be unwrapped does not hide the others; VaultFailure comes after the last.
+        One that cannot be unwrapped does not hide the others; VaultError comes after the last.
         """
-        damaged: VaultFailure | None = None
+        damaged: VaultError | None = None
         for record in self._store.keys(uuid):
             try:
                 key = self.unwrap(record)
-            except (WrongPassphrase, NoKeyring, VaultLocked):
+            except (WrongPassphraseError, KeyringUnavailableError, VaultLockedError):
                 raise
-            except VaultFailure as failure:
+            except VaultError as failure:
                 damaged = failure
                 continue
             yield NodeKey(record, key)
@@ -155,20 +155,20 @@ class NodeKeys:
         """Return a link key in the clear.
 
         A record that was read before another command changed the master key is read again, and so is the vault. Raises
-        VaultFailure where it is damaged or of another vault.
+        VaultError where it is damaged or of another vault.
         """
         try:
             return self._unwrapped(record, self._vault())
-        except UnknownMaster:  # of the vault as it was a moment ago, or of a record as old as that
+        except UnknownMasterKeyError:  # of the vault as it was a moment ago, or of a record as old as that
             vault = self._reopened()
         there = (held for held in self._store.keys(record.uuid) if held.key_id == record.key_id)
         fresh = next(there, record)
         try:
             return self._unwrapped(fresh, vault)
-        except UnknownMaster:
+        except UnknownMasterKeyError:
             if self._identity.master in vault.masters():  # lost for good, and not only to a look at an earlier moment
                 raise
-        raise VaultChanged("Another command has just changed the master key.", hint="Run this again.")
+        raise VaultChangedError("Another command has just changed the master key.", hint="Run this again.")
 
     def _unwrapped(self, record: KeyRecord, vault: Vault) -> bytes:
         context = node_key_context(self._store.id, record.uuid, record.epoch, record.slot)
@@ -197,7 +197,7 @@ class NodeKeys:
     def promote(self, uuid: bytes, key_id: str) -> None:
         """Make a key the active one after a good Open under it; its CA is then the one that the node keeps.
 
-        Raises NotFound for a key that is not held.
+        Raises NotFoundError for a key that is not held.
         """
         with self._store.together():
             record = next((held for held in self._store.keys(uuid) if held.key_id == key_id), None)

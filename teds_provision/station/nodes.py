@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import BadData, StoreFailure
+from teds_provision.errors import BadDataError, StoreError
 from teds_provision.lazy import late
 from teds_provision.station.plant import Plant
 from teds_provision.station.seals import Seals
@@ -66,7 +66,7 @@ class Nodes:
         return self._store.node(uuid)
 
     def put(self, record: NodeRecord) -> None:
-        """Add or replace a node. Epoch and sequence never go back; raises OtherKey for another identity key."""
+        """Add or replace a node. Epoch and sequence never go back; raises KeyMismatchError for another identity key."""
         present = self._store.node(record.uuid)
         self._store.put_node(replace(record, point_mac=self._seal(record.uuid, record.point, present)))
 
@@ -97,7 +97,7 @@ class Nodes:
         A hint: nobody waits for the disk or fails because of it; what is forgotten is seen again in the next session.
         """
         if place and self._store.last_places([uuid]).get(uuid) != place:
-            with suppress(StoreFailure), self._store.transaction(later=True):
+            with suppress(StoreError), self._store.transaction(later=True):
                 self._store.put_last_place(uuid, place)
 
     def last_places(self, uuids: Sequence[bytes]) -> dict[bytes, str]:
@@ -105,7 +105,7 @@ class Nodes:
         return {uuid: place for page in pages(uuids) for uuid, place in self._store.last_places(page).items()}
 
     def resolve(self, text: str) -> bytes:
-        """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFound, UsageFailure."""
+        """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFoundError, UsageError."""
         return self._store.resolve(text)
 
     def beginning_with(self, text: str, most: int) -> list[tuple[str, str]]:
@@ -226,7 +226,7 @@ def is_whole(image: Image) -> bool:
         return True
     try:
         return security.decode(image.security).signed_blocks.keys() <= image.blocks.keys()
-    except BadData:
+    except BadDataError:
         return True  # not of this profile: it lists nothing
 
 

@@ -26,7 +26,7 @@ time; a service that looks at each would fill the disk with its audit log."""
 class Pins:
     """The whitelist, and the key of each UUID: by the whitelist, else from the first proven contact.
 
-    With an open vault every row that is used has to carry this station's seal: StoreChanged otherwise.
+    With an open vault every row that is used has to carry this station's seal: StoreChangedError otherwise.
     """
 
     def __init__(self, store: Store, keys: NodeKeys, seals: Seals, plant: Plant) -> None:
@@ -68,7 +68,7 @@ class Pins:
         return pins
 
     def check(self, uuid: bytes, point: bytes) -> None:
-        """Raise OtherKey where this UUID is known with another key than ``point``."""
+        """Raise KeyMismatchError where this UUID is known with another key than ``point``."""
         pinned = self.pinned(uuid)
         if pinned is not None and not same_key(pinned, keys.fingerprint(point)):
             self._record(uuid, keys.fingerprint(point), pinned)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import PolicyRefused, StoreChanged, StoreFailure
+from teds_provision.errors import PolicyError, StoreChangedError, StoreError
 from teds_provision.files import read_limited, write_whole
 from teds_provision.lazy import late
 from teds_provision.station.identity import StationIdentity
@@ -65,7 +65,7 @@ class SignerRules:
         )
 
 
-class Conflict(PolicyRefused):
+class PlantConflictError(PolicyError):
     """Stations of the plant say different things of a node."""
 
     code = "conflict"
@@ -102,7 +102,7 @@ class Plant:
 
     @property
     def roster(self) -> roster.Roster | None:
-        """The roster that counts, None where none was joined. Raises StoreChanged where another program put it there.
+        """The roster that counts, None if none was joined. Raises StoreChangedError if another program put it there.
 
         It is the CA's word, whatever became of the row; the seal tells one that was put back.
         """
@@ -110,7 +110,7 @@ class Plant:
         if record is None or row is None:
             return None
         if not self._seals.noted("roster", row.hash, row.mac):
-            raise StoreChanged(
+            raise StoreChangedError(
                 "The roster in the store was changed by another program and is not trusted.",
                 hint="To get it again: teds-provision registry sync",
             )
@@ -119,13 +119,13 @@ class Plant:
         return self._read[1]
 
     def require_role(self, role: Role, what: str, hint: str) -> None:
-        """Raise PolicyRefused where a plant was joined and its roster does not give this station a role."""
+        """Raise PolicyError where a plant was joined and its roster does not give this station a role."""
         held = self.roster
         if held is not None and not held.has(self._identity.fingerprint, role):
-            raise PolicyRefused(f"This station does not have the role {role} in {held.name}, so it {what}.", hint=hint)
+            raise PolicyError(f"This station does not have the role {role} in {held.name}, so it {what}.", hint=hint)
 
     def require_undisputed(self, uuid: bytes) -> None:
-        """Raise Conflict where stations know two keys of a node that this one would key for the first time.
+        """Raise PlantConflictError where stations know two keys of a node that this one would key for the first time.
 
         Until a keeper pins one, or a person does here.
         """
@@ -135,7 +135,7 @@ class Plant:
         own_word = entry is not None and entry.fingerprint is not None and entry.assurance != "registry"
         disputed = next((why for _, name, why in self.tables.conflicts(uuid) if name == "two keys"), None)
         if disputed is not None and not own_word and not self._store.keys(uuid):
-            raise Conflict(
+            raise PlantConflictError(
                 f"The plant's stations know two keys for node {uuid.hex()}: {disputed}.",
                 hint=f"A keeper must pin one of them, or you do: whitelist add {uuid.hex()} --fingerprint F",
             )
@@ -208,13 +208,13 @@ class Plant:
 
     @property
     def home(self) -> str:
-        """16 digits that tell this home from a copy of it; made where they are missing. Raises StoreFailure."""
+        """16 digits that tell this home from a copy of it; made where they are missing. Raises StoreError."""
         path = self._store.home / HOME_FILE
         if not path.exists():
             new_home(self._store.home)
         digits = read_limited(path, 64, "name of a home").decode("ascii", "replace").strip()
         if not document.is_form("digits", digits):
-            raise StoreFailure(f"{path} is damaged.", hint="Remove it; the next registry sync creates a new one.")
+            raise StoreError(f"{path} is damaged.", hint="Remove it; the next registry sync creates a new one.")
         return digits
 
     @property

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import NotWhitelisted, PolicyRefused
+from teds_provision.errors import NotWhitelistedError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.identity import StationIdentity
@@ -75,14 +75,14 @@ class Policy:
         return self._plant.signer_rules()
 
     def trust(self, record: TrustRecord) -> None:
-        """Trust a key under a name (the vault opens); PolicyRefused if the name stands for another key or role."""
+        """Trust a key under a name (the vault opens); PolicyError if the name stands for another key or role."""
         self._seals.require()
         with self._store.transaction():
             self._store.put_trust(self._seals.trust(record))
             self._store.renew_ca(record.fingerprint)
 
     def distrust(self, name_or_fingerprint: str) -> bool:
-        """Trust a key no more (the vault opens); False if none fits, raises UsageFailure if several do."""
+        """Trust a key no more (the vault opens); False if none fits, raises UsageError if several do."""
         self._seals.require()
         return self._store.remove_trust(name_or_fingerprint)
 
@@ -178,42 +178,42 @@ class Policy:
         self._store.remove_tombstones(uuids)
 
     def require_whitelisted(self, uuid: bytes, *, returning: bool = False) -> WhitelistEntry:
-        """Return the whitelist entry; raises NotWhitelisted, or PolicyRefused for a revoked node or one given away.
+        """Return the whitelist entry; raises NotWhitelistedError, or PolicyError for a revoked node or one given away.
 
         ``returning``: a node given away may come back here, if a key agreement shows that it was reset.
         """
         entry = self._pins.entry(uuid)
         revoked = self.denied(uuid, entry.fingerprint if entry is not None else None)
         if revoked is not None:
-            raise PolicyRefused(
+            raise PolicyError(
                 f"Node {uuid.hex()} was revoked: {revoked.why}.",
                 hint=f"If that was a mistake: teds-provision revoke --lift {uuid.hex()}",
             )
         if not returning:
             self.require_not_given_away(uuid)
         if entry is None:
-            raise NotWhitelisted(
+            raise NotWhitelistedError(
                 f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"
             )
         return entry
 
     def require_not_restored(self, uuid: bytes) -> None:
-        """Raise PolicyRefused for a node whose key came back from a backup: it may have been given away since."""
+        """Raise PolicyError for a node whose key came back from a backup: it may have been given away since."""
         if self._keys.restored(uuid):
-            raise PolicyRefused(
+            raise PolicyError(
                 f"The key of node {uuid.hex()} was {self._keys.rotation_due(uuid)}.",
                 hint=f"Tap it (with any command), or confirm that it is still yours: agree {uuid.hex()} --rotate --yes",
             )
 
     def require_not_given_away(self, uuid: bytes) -> None:
-        """Raise PolicyRefused for a node that was moved to another station: its key is used no more."""
+        """Raise PolicyError for a node that was moved to another station: its key is used no more."""
         tombstone = self.tombstone(uuid)
         if tombstone is None:
             return
         row = self._store.handover(tombstone.handover_id, "out")
         undo = f"Use it there, or: teds-provision handover undo {tombstone.handover_id}"
         back = "Use it there, or have it handed back (export-keys there, import-keys here)."
-        raise PolicyRefused(
+        raise PolicyError(
             f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key is no longer used here.",
             hint=undo if row is not None and row.state == "open" else back,
         )

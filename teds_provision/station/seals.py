@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import StoreChanged, VaultFailure
+from teds_provision.errors import StoreChangedError, VaultError
 from teds_provision.store import ExportFacts, NodeRecord, StationRecord, Store, TrustRecord, WhitelistEntry
 
 if TYPE_CHECKING:
@@ -87,7 +87,10 @@ class Seals:
     # -- checking --------------------------------------------------------------------------------------------------
 
     def check_entry(self, entry: WhitelistEntry | None) -> WhitelistEntry | None:
-        """Return a whitelist entry; raises StoreChanged where its seal does not hold. Unchecked with a closed vault."""
+        """Return a whitelist entry.
+
+        Raises StoreChangedError if its seal does not hold. Unchecked with a closed vault.
+        """
         if entry is not None and self.active and not self._holds(entry.mac, "whitelist", _entry(entry)):
             raise changed(
                 [f"the whitelist entry of {entry.uuid.hex()}"], "Remove it from the whitelist and add it again."
@@ -95,14 +98,14 @@ class Seals:
         return entry
 
     def check_point(self, node: NodeRecord | ExportFacts) -> None:
-        """Raise StoreChanged where a node's sealed identity key was changed."""
+        """Raise StoreChangedError where a node's sealed identity key was changed."""
         bad = node.point is not None and node.point_mac is not None
         if bad and self.active and not self._holds(node.point_mac, "node", (node.uuid, node.point)):
             remove = f"teds-provision whitelist remove {node.uuid.hex()}, then tap the node."
             raise changed([f"the key of node {node.uuid.hex()}"], remove)
 
     def check_ca(self, uuid: bytes, ca: bytes, mac: bytes | None) -> None:
-        """Raise StoreChanged where the CA that a node keeps is not the one that this station noted."""
+        """Raise StoreChangedError where the CA that a node keeps is not the one that this station noted."""
         if self.active and not self._holds(mac, "ca", (uuid, ca)):
             raise changed(
                 [f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree on a new key."
@@ -170,14 +173,14 @@ class Seals:
             return False
         try:
             key = masters.unwrap(facts.seal_key, context=self._context())
-        except VaultFailure:
+        except VaultError:
             return False
         return hmac.compare_digest(_keyed(key).digest(), self._keyed.digest())
 
     def unlocked(self, vault: Vault) -> None:
         """The vault has opened: look at the station's own facts and at trust.
 
-        Raises StoreChanged where the station's own key or CA is not what this station sealed, VaultFailure.
+        Raises StoreChangedError where the station's own key or CA is not what this station sealed, VaultError.
         """
         facts = self._store.facts()
         if facts is None:
@@ -252,7 +255,7 @@ def _trust(record: TrustRecord) -> _Values:
     return (record.name, record.role, record.point, record.fingerprint)
 
 
-def changed(what: list[str], cure: str) -> StoreChanged:
+def changed(what: list[str], cure: str) -> StoreChangedError:
     """The error for rows that another program changed."""
     shown = ", ".join(what[:_SHOWN]) + (f" and {len(what) - _SHOWN} more" if len(what) > _SHOWN else "")
-    return StoreChanged(f"{shown} in the store was changed by another program and is not trusted.", hint=cure)
+    return StoreChangedError(f"{shown} in the store was changed by another program and is not trusted.", hint=cure)

@@ -28,7 +28,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from teds_provision import vault as vaults
-from teds_provision.errors import NoPassphrase, NotFound, UnknownMaster, VaultChanged, VaultFailure, VaultLocked
+from teds_provision.errors import (
+    NoPassphraseError,
+    NotFoundError,
+    UnknownMasterKeyError,
+    VaultChangedError,
+    VaultError,
+    VaultLockedError,
+)
 from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
 from teds_provision.station.identity import DEFAULT_NAME, StationIdentity
@@ -117,7 +124,7 @@ class Station:
         self.released: Callable[[bytes, str], AbstractContextManager[object]] = lambda uuid, command: nullcontext()
         """``with station.released(uuid, "write"):`` nobody of this home measures the node for the length of the block.
 
-        A command that writes enters it before it speaks to the node. Raises PolicyRefused where a running `ncap` does
+        A command that writes enters it before it speaks to the node. Raises PolicyError where a running `ncap` does
         not let the node go; where none runs, or in that process itself, there is nothing to do.
         """
         self.use_agent = True
@@ -136,7 +143,7 @@ class Station:
 
     @classmethod
     def open(cls, home: Path, *, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> Station:
-        """Open the station of ``home``; raises NotFound where init was never finished.
+        """Open the station of ``home``; raises NotFoundError where init was never finished.
 
         ``ask`` gives a passphrase when the vault opens, ``tell`` gets what the user has to know then.
         """
@@ -203,7 +210,7 @@ class Station:
         return self._vault
 
     def adopt(self, vault: Vault) -> None:
-        """Use a vault that is open; raises StoreChanged where the store does not go with it any more."""
+        """Use a vault that is open; raises StoreChangedError where the store does not go with it any more."""
         self._vault = vault  # the seals below are made and checked with it
         try:
             self._look_at_seals(vault)
@@ -214,7 +221,9 @@ class Station:
     def _look_at_seals(self, vault: Vault) -> None:
         try:
             self.seals.unlocked(vault)
-        except UnknownMaster:  # between the opening of the vault and this look another command changed the master key
+        except (
+            UnknownMasterKeyError
+        ):  # between the opening of the vault and this look another command changed the master key
             if not vault.refresh():
                 raise
             self.seals.unlocked(vault)
@@ -226,20 +235,20 @@ class Station:
     def _reopened(self) -> Vault:
         """Read the master keys again after another command has changed them. No person is asked: the store may be held.
 
-        Raises VaultLocked if the vault has another passphrase by now and ``unlock`` does not hold it open.
+        Raises VaultLockedError if the vault has another passphrase by now and ``unlock`` does not hold it open.
         """
         with self._opening:
             vault = self._opened()
             try:
                 vault.reread()
                 return vault
-            except VaultChanged as changed:
+            except VaultChangedError as changed:
                 if self.identity.master in vault.masters():  # handed over by the command that made it
                     return vault
                 try:
                     opened = vaults.open_vault(self.home, self.id, self.identity.keystore, _ask_no_one, use_agent=True)
-                except VaultFailure:
-                    raise VaultLocked(
+                except VaultError:
+                    raise VaultLockedError(
                         "The vault's passphrase and master key were changed by another command.",
                         hint="To let a running ncap continue: teds-provision unlock. Start any other command again.",
                     ) from changed
@@ -247,7 +256,7 @@ class Station:
                 return opened
 
     def current_vault(self) -> Vault:
-        """Return the vault with the master key that wraps now; raises VaultLocked, VaultFailure."""
+        """Return the vault with the master key that wraps now; raises VaultLockedError, VaultError."""
         vault = self._opened()
         return vault if self.identity.master in vault.masters() else self._reopened()
 
@@ -390,17 +399,17 @@ class Station:
 
 
 def _ask_no_one(_prompt: str, _confirm: bool) -> str:
-    raise NoPassphrase("The vault's passphrase is needed.", hint="teds-provision unlock")
+    raise NoPassphraseError("The vault's passphrase is needed.", hint="teds-provision unlock")
 
 
-def not_initialised(home: Path) -> NotFound:
+def not_initialised(home: Path) -> NotFoundError:
     """The error for a home without a station."""
-    return NotFound(f"There is no base station in {home} yet.", hint="To create one: teds-provision init")
+    return NotFoundError(f"There is no base station in {home} yet.", hint="To create one: teds-provision init")
 
 
-def not_certified() -> NotFound:
+def not_certified() -> NotFoundError:
     """The error for a station that asked for a certificate and has none yet."""
-    return NotFound(
+    return NotFoundError(
         "This station is waiting for its CA's certificate.",
         hint="To install it: teds-provision init --certificate CERT",
     )
@@ -439,7 +448,7 @@ def initialise(
             vault, why = vaults.create_vault(home, station.id, keystore, known, tell=tell_once, **more)
             key, ca = vault.identity(), vault.ca()
             if ca is None:
-                raise NotFound(
+                raise NotFoundError(
                     "The vault does not contain a CA key.", hint="Choose another keystore, or import the CA key."
                 )
             station.adopt(vault)
@@ -472,7 +481,7 @@ class Rewrapped:
 def rewrap(station: Station) -> Rewrapped:
     """Wrap every link key under a new master key; the caller holds the StoreLock and has unlocked the vault.
 
-    Raises VaultFailure and its leaves, StoreFailure; the same command carries on.
+    Raises VaultError and its leaves, StoreError; the same command carries on.
     """
     vault, identity = station.vault, station.identity
     vault.refresh()
@@ -488,7 +497,7 @@ def rewrap(station: Station) -> Rewrapped:
         context = node_key_context(station.id, record.uuid, record.epoch, record.slot)
         try:
             key = vault.unwrap(record.wrapped, context=context)
-        except VaultFailure:  # lost before this run: no reason to keep an old master key for the others
+        except VaultError:  # lost before this run: no reason to keep an old master key for the others
             damaged += 1
             return record.wrapped
         return vault.wrap(key, context=context)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.sanitize import printable
@@ -60,7 +60,7 @@ Adopt = Callable[[Brought], None]
 """Asked before a board's own datasheet is signed; raises where the answer is no."""
 
 
-class NotAdopted(PolicyRefused):
+class NotAdoptedError(PolicyError):
     """A board's own datasheet was not signed; ``brought`` is what it says, and what was found."""
 
     code = "not-adopted"
@@ -71,8 +71,8 @@ class NotAdopted(PolicyRefused):
 
 
 def nobody_adopts(brought: Brought) -> None:
-    """The answer where nobody can be asked: no. Raises NotAdopted."""
-    raise NotAdopted(
+    """The answer where nobody can be asked: no. Raises NotAdoptedError."""
+    raise NotAdoptedError(
         f"Node {brought.image.uuid.hex()} brought its own datasheet, and nobody has approved signing it.",
         brought,
         hint="Check it, then add --yes; or write your own datasheet: --profile.",
@@ -82,7 +82,7 @@ def nobody_adopts(brought: Brought) -> None:
 def brought_by(station: Station, image: Image, *, name: str | None = None) -> Brought:
     """What the TEDS on a board say, judged; ``name`` goes before the one that it gives itself.
 
-    Raises BadData (no datasheet, damaged or hostile TEDS, another node's), PolicyRefused (another node's name).
+    Raises BadDataError (no datasheet, damaged or hostile TEDS, another node's), PolicyError (another node's name).
     """
     blocks = dict(image.unsigned_blocks())
     if name is not None:
@@ -95,7 +95,7 @@ def brought_by(station: Station, image: Image, *, name: str | None = None) -> Br
     found = Image(image.uuid, blocks)
     sheet = Sheet.of(found)
     if not sheet.channels:
-        raise BadData(
+        raise BadDataError(
             f"Node {uuid} has no datasheet of its own: no TransducerChannel TEDS.",
             hint="To write one: provision --profile P.",
         )
@@ -124,12 +124,12 @@ def _wrong_with(sheet: Sheet, blocks: Mapping[BlockId, bytes]) -> tuple[list[str
 
 
 def require_a_reason(station: Station, brought: Brought, reason: str | None) -> None:
-    """Raise NotAdopted where something is wrong with it and nobody said why it is right; that reason is logged."""
+    """Raise NotAdoptedError where something is wrong with it and nobody said why it is right; that reason is logged."""
     if not brought.errors:
         return
     if reason is None:
         more = f" (and {len(brought.errors) - 1} more)" if len(brought.errors) > 1 else ""
-        raise NotAdopted(
+        raise NotAdoptedError(
             f"The board's own datasheet is refused: {brought.errors[0].rstrip('.')}{more}.",
             brought,
             hint='Write your own: --profile. Or, if it is correct, give a reason: --accept-calibration "why".',
@@ -145,14 +145,14 @@ def _require_own_name(station: Station, uuid: bytes, name: str) -> None:
     if len(digits) >= _PREFIX and not set(digits) - set("0123456789abcdef"):
         others += [one.uuid for one in station.nodes.all() if one.uuid.hex().startswith(digits) and one.uuid != uuid]
     if others:
-        raise PolicyRefused(
+        raise PolicyError(
             f"Node {uuid.hex()} calls itself {name!r}, but node {others[0].hex()} already has that name.",
             hint="Choose another name: --name NAME.",
         )
 
 
-def _refused(uuid: str, why: str) -> BadData:
-    return BadData(
+def _refused(uuid: str, why: str) -> BadDataError:
+    return BadDataError(
         f"The datasheet that node {uuid} brought cannot be signed: {why}.",
         hint="Write your own: provision --profile P.",
     )

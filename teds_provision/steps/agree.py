@@ -9,8 +9,16 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from teds_provision.errors import BadData, Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
-from teds_provision.protocol.agreement import AgreedKey, OtherTranscript, StationAgreement, fit_to_agree
+from teds_provision.errors import (
+    BadDataError,
+    GarbledError,
+    LinkError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    PolicyError,
+)
+from teds_provision.protocol.agreement import AgreedKey, StationAgreement, TranscriptMismatchError, fit_to_agree
 from teds_provision.protocol.datasheet import signature_good, station_signature_good
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, reset_message, verify
@@ -20,7 +28,7 @@ from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.identify import Identified
 from teds_provision.steps.read import read_block, read_identity
 from teds_provision.store import KeyRecord, WhitelistEntry, utc_now
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 
@@ -44,8 +52,8 @@ def open_session(station: Station, node: Conversation, *, word: bool = False) ->
 
     The key that worked becomes the active one and the others go, but for a newer one whose Confirm may still be on its
     way (:meth:`NodeKeys.outdated`): that is the only thing that ever deletes a key.
-    ``word``: a person said that this node may be used although its key came back from a backup. Raises PolicyRefused
-    for a node that was moved away, or that is neither tapped nor vouched for then; LinkFailure.
+    ``word``: a person said that this node may be used although its key came back from a backup. Raises PolicyError
+    for a node that was moved away, or that is neither tapped nor vouched for then; LinkError.
     """
     station.policy.require_not_given_away(node.uuid)
     if not (node.tapped or word):
@@ -55,11 +63,11 @@ def open_session(station: Station, node: Conversation, *, word: bool = False) ->
     for held in station.keys.unwrapped(node.uuid):
         try:
             node.open(held.key, statics=statics)
-        except NodeRefused as refusal:
+        except NodeRefusedError as refusal:
             if refusal.reason in (Reason.UNKNOWN_KEY, Reason.WRONG_STATE):
                 continue
             raise
-        except NotAuthentic:
+        except NotAuthenticError:
             continue
         return _take_up(station, node, held)
     return None
@@ -122,26 +130,26 @@ def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
         return held
     try:
         _agree_anew(station, node, entry, station.keys.ca_of(node.uuid), read_block(node, SECURITY))
-    except SessionLost as lost:
+    except SessionLostError as lost:
         raise lost.cause from lost
     return next(iter(station.keys.unwrapped(node.uuid)))
 
 
 def require_session(station: Station, node: Conversation) -> NodeKey:
-    """Open a session or say why there is none: given away, no key held (PolicyRefused), or the node has another."""
+    """Open a session or say why there is none: given away, no key held (PolicyError), or the node has another."""
     station.policy.require_not_given_away(node.uuid)
     held = session_if_keyed(station, node)
     if held is not None:
         return held
     if not station.keys.held(node.uuid):
-        raise PolicyRefused(
+        raise PolicyError(
             f"This station holds no key of node {node.uuid.hex()}.",
             hint=f"Tap it and agree on one: teds-provision agree {node.uuid.hex()}",
         )
     raise unknown_key(station, node)
 
 
-def unknown_key(station: Station, node: Conversation) -> PolicyRefused:
+def unknown_key(station: Station, node: Conversation) -> PolicyError:
     """The error where every key held here was answered with "unknown key" (16), which anyone on the link can say.
 
     The operator decides what that means, never the tool (profile, section 2).
@@ -150,11 +158,11 @@ def unknown_key(station: Station, node: Conversation) -> PolicyRefused:
     elsewhere = agreed_elsewhere(station, node)
     said = "it answers that it knows none of the keys held here"
     if elsewhere:
-        return PolicyRefused(
+        return PolicyError(
             f"No session with node {uuid}: {said}; {elsewhere}.",
             hint=f"Use it at that station, or have the key handed over. To take it over, tap it: agree {uuid} --rotate",
         )
-    return PolicyRefused(
+    return PolicyError(
         f"No session with node {uuid}: {said}. That answer is unsigned and proves nothing.",
         hint=f"Try it on the reader. If it was reset or its key was rotated elsewhere, tap it: agree {uuid} --rotate",
     )
@@ -174,7 +182,7 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
     try:
         octets = read_block(node, SECURITY)
         shown = security.decode(octets)
-    except (BadData, NodeRefused, LinkFailure):
+    except (BadDataError, NodeRefusedError, LinkError):
         return hint
     if shown.station_key not in (None, station.point) and signature_good(shown, octets, node.uuid):
         names = {record.point: record.name for record in station.policy.trusted("station")}
@@ -202,14 +210,14 @@ def agree(
     ours: whoever holds the present one is locked out (Figure 5 of the paper). None: ``rotate`` itself is that word.
     ``newcomer`` is the whitelist entry that is made together with the first key: a board of another owner refuses, and
     never comes onto the list. On a link that loses messages an agreement begins anew, five times at most.
-    Raises NotWhitelisted, OtherKey, PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same
-    call carries on.
+    Raises NotWhitelistedError, KeyMismatchError, PolicyError, NodeRefusedError, NotAuthenticError, LinkError; whatever
+    is cut, the same call carries on.
     """
     again, word = 0, _Word(rotate, take_over)
     while True:
         try:
             return _agree(station, node, who, rotate=rotate, newcomer=newcomer, word=word, again=again > 0)
-        except (NodeSilent, Garbled):
+        except (NodeSilentError, GarbledError):
             again += 1
             if again == _BEGINNINGS or not node.lives():
                 raise
@@ -256,7 +264,7 @@ class _Word:
     given: bool = False
 
     def require(self, station: Station, node: Conversation) -> None:
-        """Raise PolicyRefused, or what the question raises, where nobody gives it."""
+        """Raise PolicyError, or what the question raises, where nobody gives it."""
         if self.given:
             return
         if station.keys.held(node.uuid) and not self.rotate:
@@ -272,9 +280,9 @@ class _Word:
         self.given = True
 
 
-def must_take_over(uuid: bytes) -> PolicyRefused:
+def must_take_over(uuid: bytes) -> PolicyError:
     """The error where a node has another station's key, and nobody said that it is to be taken over."""
-    return PolicyRefused(
+    return PolicyError(
         f"Node {uuid.hex()} has a key that this station does not hold; a new key would lock out the current holder.",
         hint=f"Have the key handed over (export-keys there), or take the node over: agree {uuid.hex()} --rotate --yes",
     )
@@ -296,14 +304,14 @@ def _new_key(
         # outside a session what the identification read stands: on this link, a moment ago
         teds = read_block(node, SECURITY) if node.sealed else who.security_teds
         return _agree_anew(station, node, pinned, ca, teds, returning=returning, only_new=new and not demanded)
-    except NodeRefused as refusal:
+    except NodeRefusedError as refusal:
         # Identify may have been answered while the node was still storing the key of a run that was cut off
         late = refusal.reason == Reason.NOT_PERMITTED and new and not demanded
         held = open_session(station, node) if late else None
         if held is None:
             raise
         return Agreed(held.record.epoch, held.record.key_id, fresh=True)
-    except SessionLost as lost:
+    except SessionLostError as lost:
         raise lost.cause from lost
 
 
@@ -336,7 +344,7 @@ def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> Whit
         return replace(entry, fingerprint=who.fingerprint, assurance="tap")
     if who.state == NodeState.FACTORY and node.wired:
         return replace(entry, fingerprint=who.fingerprint, assurance="bus")
-    raise PolicyRefused(
+    raise PolicyError(
         f"Node {node.uuid.hex()} is whitelisted by UUID only; its key can only be pinned by tap.",
         hint="Tap it once (--via nfc), or add the fingerprint: whitelist add UUID --fingerprint F.",
     )
@@ -361,10 +369,12 @@ def _agree_anew(
     uuid = node.uuid
     try:
         agreed = _request(station, node, entry, ca, teds)
-    except OtherTranscript:  # the TEDS has changed since it was read, or the reply was disturbed: once more, then no
+    except (
+        TranscriptMismatchError
+    ):  # the TEDS has changed since it was read, or the reply was disturbed: once more, then no
         again = read_block(node, SECURITY)
         if fit_to_agree(again, uuid, entry.fingerprint).node_key != fit_to_agree(teds, uuid, None).node_key:
-            raise NotAuthentic(
+            raise NotAuthenticError(
                 "The node presented two different keys.",
                 hint="Either two boards are answering, or the tag is a copy. Check before you continue.",
             ) from None
@@ -387,7 +397,7 @@ def _agree_anew(
     node.open(agreed.key, statics=(station.point, agreed.node))
     identity = read_identity(node)
     if identity.epoch != agreed.epoch:  # a datasheet for the one would never fit the other
-        raise NotAuthentic(
+        raise NotAuthenticError(
             f"The node offered key epoch {agreed.epoch} but reports {identity.epoch} in its session.",
             hint="Its firmware counts epochs incorrectly; node check shows the rule.",
         )
@@ -440,8 +450,8 @@ class ResetReceipt:
 def reset_node(station: Station, node: Conversation, who: Identified) -> ResetReceipt:
     """Reset in a session; a node that is in factory state already gives the same proof plainly.
 
-    The keys held for it are deleted only after the proof was verified. Raises PolicyRefused without a key,
-    NotAuthentic where the proof is wrong.
+    The keys held for it are deleted only after the proof was verified. Raises PolicyError without a key,
+    NotAuthenticError where the proof is wrong.
     """
     if who.state != NodeState.FACTORY:
         require_session(station, node)
@@ -459,17 +469,17 @@ def reset_node(station: Station, node: Conversation, who: Identified) -> ResetRe
 def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
     """Send Reset: in a session it resets, in factory state it changes nothing; either way the node signs its state.
 
-    A node that has a key refuses it plainly (NodeRefused). Raises NotAuthentic where the signature is wrong.
+    A node that has a key refuses it plainly (NodeRefusedError). Raises NotAuthenticError where the signature is wrong.
     """
     epoch = read_identity(node).epoch
     challenge = os.urandom(CHALLENGE_OCTETS)
     command = security_command(Function.RESET, challenge)
     try:
         proof = node.send(command, "the reset")
-    except SessionLost:  # its reply was lost and the session with it: in factory state it gives the proof again
+    except SessionLostError:  # its reply was lost and the session with it: in factory state it gives the proof again
         node.forget()
         proof = node.plain(command, "the proof of its reset")
     node.forget()
     if not verify(point, reset_message(node.uuid, epoch, challenge), proof):
-        raise NotAuthentic("The node's reset receipt is not valid; its keys are kept here.")
+        raise NotAuthenticError("The node's reset receipt is not valid; its keys are kept here.")
     return ResetReceipt(epoch, challenge, proof)

@@ -15,12 +15,12 @@ from typing import Final
 
 from teds_provision import __version__
 from teds_provision.errors import (
-    NotWhitelisted,
-    OtherKey,
-    PolicyRefused,
+    KeyMismatchError,
+    NotWhitelistedError,
+    PolicyError,
     TedsProvisionError,
-    UsageFailure,
-    VaultLocked,
+    UsageError,
+    VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
@@ -39,7 +39,7 @@ from teds_provision.steps.batch_sheet import (
     worse,
     write_report,
 )
-from teds_provision.steps.board_type import Retype, WrongBoard, differences
+from teds_provision.steps.board_type import Retype, WrongBoardError, differences
 from teds_provision.steps.build import (
     BuildOrder,
     Confirm,
@@ -57,7 +57,7 @@ from teds_provision.steps.provision import Accept, ProductionLine, Provisioned, 
 from teds_provision.steps.read import survey
 from teds_provision.steps.reading import verdict_of
 from teds_provision.steps.write import Low, wait_for_charge
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.meeting import IdleStop, meet, onward, refuse_twins, watch_nodes, without_twins
 from teds_provision.talk.progress import OfNode, Reporter
 from teds_provision.teds.codec.model import AccessCode
@@ -126,7 +126,7 @@ class ProvisionPlan:
 class Boards:
     """One run of ``provision``. Everything that was ordered is read, fitted and guarded when this is made.
 
-    Raises UsageFailure, NotFound, BadData, PolicyRefused before any node is waited for.
+    Raises UsageError, NotFoundError, BadDataError, PolicyError before any node is waited for.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Boards:
         return (*self.prepared.warnings, *rows)
 
     def unlock(self) -> None:
-        """Open the vault (a passphrase may be asked for), unless nothing is left to do; raises StoreFailure."""
+        """Open the vault (a passphrase may be asked for), unless nothing is left to do; raises StoreError."""
         if self.progress is None or self.progress.open:
             self._station.unlock()
 
@@ -257,7 +257,7 @@ class Boards:
                     with Conversation(contact, notice=self._reporter.notice) as node:
                         yield self._plan_for(node)
                     continue
-                except SessionLost as lost:
+                except SessionLostError as lost:
                     error = lost.cause
                 except TedsProvisionError as failure:
                     error = failure
@@ -327,7 +327,7 @@ class Boards:
     def _on_the_bus(self, port: Port) -> tuple[list[Contact], list[Contact]]:
         """All that answer, and those of them that are meant."""
         if not port.capabilities.many:
-            raise UsageFailure(
+            raise UsageError(
                 "--all needs a bus: a reader sees one node at a time.",
                 hint="Use --watch to provision boards one tap after the other.",
             )
@@ -362,11 +362,11 @@ class Boards:
             pool.shutdown(cancel_futures=True)
 
     def _require_known(self, found: list[Contact]) -> None:
-        """Raise NotWhitelisted where none of the nodes that answered is one of ours: nothing done is not all done."""
+        """Raise NotWhitelistedError if none of the nodes that answered is one of ours: nothing done is not all done."""
         if self.progress is not None or any(self._station.pins.entry(one.identity.uuid) is not None for one in found):
             return
         uuids = [one.identity.uuid.hex() for one in found]
-        raise NotWhitelisted(
+        raise NotWhitelistedError(
             f"{len(uuids)} node{'s' if len(uuids) > 1 else ''} answered, but none is on the whitelist: "
             f"{', '.join(uuids[:_SHOWN])}{', …' if len(uuids) > _SHOWN else ''}.",
             hint=f"Add them (teds-provision whitelist add {uuids[0]}), or list them in a sheet: --batch FILE.",
@@ -404,18 +404,18 @@ class Boards:
             with Conversation(contact, notice=told.notice) as node:
                 done = self._provision(node, questions, told)
             error = self._lacks_calibration(uuid, done.image)
-        except VaultLocked:  # of the whole command, and of no board
+        except VaultLockedError:  # of the whole command, and of no board
             raise
         except TedsProvisionError as failure:
             error = failure
-        except SessionLost as lost:
+        except SessionLostError as lost:
             error = lost.cause
         row = self._rows.pop(uuid, None)
         return BoardResult(uuid, time.monotonic() - began, done, error, row.number if row is not None else None, place)
 
     # -- both ------------------------------------------------------------------------------------------------------
 
-    def _lacks_calibration(self, uuid: bytes, image: Image) -> PolicyRefused | None:
+    def _lacks_calibration(self, uuid: bytes, image: Image) -> PolicyError | None:
         """Why this board is not finished although its datasheet is authentic: its type requires a calibration."""
         record = self._station.nodes.get(uuid)
         profile = self.prepared.profile
@@ -426,7 +426,7 @@ class Boards:
         missing = [str(number) for number in required if (number, AccessCode.CALIBRATION) not in image.blocks]
         if profile is None or not missing:
             return None
-        return PolicyRefused(
+        return PolicyError(
             f"Board {uuid.hex()} has no calibration of channel {', '.join(missing)}, which its type requires.",
             hint=f"Calibrate it: teds-provision provision {uuid.hex()} --calibration FILE; for many: --batch SHEET.",
         )
@@ -456,7 +456,9 @@ class Boards:
         )
 
     def _for(self, who: Identified) -> Prepared:
-        """What this board gets; raises PolicyRefused (the sheet does not know it, its name is another's), OtherKey.
+        """What this board gets.
+
+        Raises PolicyError (the sheet does not know it, its name is another's), KeyMismatchError.
 
         Whoever is refused here has not taken a row.
         """
@@ -468,10 +470,10 @@ class Boards:
             busy = {row.number for uuid, row in self._rows.items() if uuid != who.uuid}
             row = self.progress.row_for(who.uuid, who.fingerprint, busy=busy)
             if row is None:
-                raise PolicyRefused(f"The sheet has no row left for board {who.uuid.hex()}.", hint="Set it aside.")
+                raise PolicyError(f"The sheet has no row left for board {who.uuid.hex()}.", hint="Set it aside.")
             self._rows[who.uuid] = row
             if row.fingerprint is not None and not who.fingerprint.startswith(row.fingerprint):
-                raise OtherKey(
+                raise KeyMismatchError(
                     f"Board {who.uuid.hex()} holds the key {who.fingerprint[:32]}; row {row.number} of the sheet "
                     f"says {row.fingerprint[:32]}.",
                     hint="Compare this board's label; it may be another board with the same UUID.",
@@ -488,7 +490,7 @@ class Boards:
         self._boards.append(board)
         if self.progress is not None and board.row is not None:
             row = self.row(board.row)
-            if isinstance(board.error, WrongBoard) and row.by_order:
+            if isinstance(board.error, WrongBoardError) and row.by_order:
                 self.progress.not_this_board(row, board)
             else:
                 self.progress.note(row, board)
@@ -500,7 +502,7 @@ def _progress(station: Station, request: ProvisionRequest, order: BuildOrder) ->
         return None
     sheet = read_sheet(station, request.sheet, order)
     if request.everyone and any(row.by_order for row in sheet.rows):
-        raise UsageFailure(
+        raise UsageError(
             "On a bus, rows cannot follow the order of taps.", hint="Give each row its uuid or fingerprint."
         )
     return Progress(station.home, sheet, lambda row, uuid: _has_it_already(station, row, uuid))
@@ -521,15 +523,15 @@ def _has_it_already(station: Station, row: SheetRow, uuid: bytes) -> bool:
 
 def _require_consistent(request: ProvisionRequest, links: LinkSettings) -> None:
     if request.node is not None and request.several:
-        raise UsageFailure(
+        raise UsageError(
             "A single node cannot be combined with --all, --watch or --batch.",
             hint="Give either the node or one of these options.",
         )
     if request.everyone and request.watch:
-        raise UsageFailure(
+        raise UsageError(
             "--all provisions the nodes that are on the bus now, --watch those that arrive.", hint="Use one of them."
         )
     if request.report is not None and request.sheet is None:
-        raise UsageFailure("--report requires a sheet.", hint="Add --batch FILE.")
+        raise UsageError("--report requires a sheet.", hint="Add --batch FILE.")
     if len(links.places) > 1 and not (request.watch or request.sheet is not None):
-        raise UsageFailure("Several readers require --watch.", hint="Add --watch, or give one reader.")
+        raise UsageError("Several readers require --watch.", hint="Add --watch, or give one reader.")

@@ -26,14 +26,14 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from teds_provision.errors import (
-    BadData,
-    NodeBusy,
-    NoNode,
-    NotAuthentic,
-    NotFound,
-    PolicyRefused,
+    BadDataError,
+    NodeBusyError,
+    NoNodeError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
     TedsProvisionError,
-    UsageFailure,
+    UsageError,
 )
 from teds_provision.files import SHARED, open_lock, private_folder, read_limited, write_whole
 from teds_provision.station.label import read_label
@@ -46,7 +46,7 @@ from teds_provision.store import utc_now
 Result = Literal["passed", "failed", "skipped"]
 
 
-class Declined(PolicyRefused):
+class DeclinedError(PolicyError):
     """A person said no: nothing was changed."""
 
     code = "declined"
@@ -78,7 +78,7 @@ class BoardResult:
     @property
     def result(self) -> Result:
         """``passed``: provisioned and authentic; ``skipped``: somebody said no."""
-        if isinstance(self.error, Declined):
+        if isinstance(self.error, DeclinedError):
             return "skipped"
         return "failed" if self.failure is not None else "passed"
 
@@ -104,10 +104,10 @@ class BatchTotals:
         if not self.failed and not self.skipped:
             return None
         told = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."
-        if isinstance(self.worst, NoNode):  # told nowhere else: no board came whose error it would be
+        if isinstance(self.worst, NoNodeError):  # told nowhere else: no board came whose error it would be
             told = f"{told} {self.worst.message}"
-        kind = type(self.worst) if self.worst is not None else PolicyRefused
-        known = kind if kind.__init__ is TedsProvisionError.__init__ else PolicyRefused
+        kind = type(self.worst) if self.worst is not None else PolicyError
+        known = kind if kind.__init__ is TedsProvisionError.__init__ else PolicyError
         return known(told, hint="Run the same command again to continue with the rest.")
 
 
@@ -119,9 +119,9 @@ def worse(one: TedsProvisionError | None, other: TedsProvisionError | None) -> T
 
 
 def _weight(error: TedsProvisionError) -> int:
-    if isinstance(error, NotAuthentic):
+    if isinstance(error, NotAuthenticError):
         return 3
-    return 2 if isinstance(error, PolicyRefused) and not isinstance(error, Declined) else 1
+    return 2 if isinstance(error, PolicyError) and not isinstance(error, DeclinedError) else 1
 
 
 # -- reading the sheet -------------------------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ class BatchSheet:
 def read_sheet(station: Station, path: Path, order: BuildOrder) -> BatchSheet:
     """Read a sheet, and read, fit and guard all that it names; ``order`` is what rows get that leave it out.
 
-    Raises NotFound (no such file), BadData with every line that is wrong.
+    Raises NotFoundError (no such file), BadDataError with every line that is wrong.
     """
     reading = _Reading(station, path, order)
     reading.read(read_limited(path, MAX_SHEET_OCTETS, "sheet of boards"))
@@ -202,9 +202,13 @@ def read_sheet(station: Station, path: Path, order: BuildOrder) -> BatchSheet:
         mistakes = [f"{path.name}:{_numbers(lines)}: {why}" for why, lines in reading.mistakes.items()]
         shown = "; ".join(mistakes[:_SHOWN])
         more = f"; and {len(mistakes) - _SHOWN} more" if len(mistakes) > _SHOWN else ""
-        raise BadData(f"{shown}{more}.", hint="Nothing was provisioned. Fix the sheet and run the same command again.")
+        raise BadDataError(
+            f"{shown}{more}.", hint="Nothing was provisioned. Fix the sheet and run the same command again."
+        )
     if not reading.rows:
-        raise BadData(f"{path} has no rows.", hint=f"It needs a header ({', '.join(COLUMNS)}) and one line per board.")
+        raise BadDataError(
+            f"{path} has no rows.", hint=f"It needs a header ({', '.join(COLUMNS)}) and one line per board."
+        )
     return BatchSheet(path, tuple(reading.rows))
 
 
@@ -380,7 +384,7 @@ class Progress:
     def _read_progress(self) -> dict[str, Any]:
         try:
             told = json.loads(read_limited(self._path, _MAX_OCTETS, "progress of a sheet", follow=False))
-        except (NotFound, ValueError):
+        except (NotFoundError, ValueError):
             return {}
         rows = told.get("rows") if isinstance(told, dict) else None
         return rows if isinstance(rows, dict) else {}
@@ -426,7 +430,7 @@ class Progress:
     def save(self, *changed: SheetRow) -> None:
         """Put these rows (all, where none is named) onto the disk, beside what another run of this sheet put there.
 
-        Raises StoreFailure.
+        Raises StoreError.
         """
         with self._alone():
             self._read_again(but={row.number for row in changed or self.sheet.rows})
@@ -495,7 +499,7 @@ class Progress:
     def take(self, row: SheetRow, uuid: bytes) -> None:
         """Note that this board is the row's, before anything is done with it.
 
-        Raises NodeBusy where another run of this sheet has given the row to another board meanwhile.
+        Raises NodeBusyError where another run of this sheet has given the row to another board meanwhile.
         """
         before = self.rows[row.number].uuid
         if before == uuid.hex():
@@ -504,7 +508,7 @@ class Progress:
             self._read_again()
             attempted = self.rows[row.number]
             if row.by_order and attempted.uuid not in (before, uuid.hex()):
-                raise NodeBusy(
+                raise NodeBusyError(
                     f"Row {row.number} was assigned to board {attempted.uuid} by another run of this sheet.",
                     hint="Tap this board again to use the next row.",
                 )
@@ -545,7 +549,7 @@ class Progress:
         """Note that no board came for the rows that were not tried, if there are any; ``how``: was tapped, answered."""
         if self.untried:
             missed = ", ".join(str(row.number) for row in self.untried[:10])
-            self.worst = worse(self.worst, NoNode(f"No board {how} for row {missed}."))
+            self.worst = worse(self.worst, NoNodeError(f"No board {how} for row {missed}."))
 
     def totals(self) -> BatchTotals:
         """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""
@@ -598,13 +602,18 @@ class About:
 
 
 def check_report(path: Path | None) -> None:
-    """Raise UsageFailure for a report of an unknown form, NotFound without a folder to lie in, before the first tap."""
+    """Raise UsageError for a report of an unknown form, NotFoundError without a folder to lie in.
+
+    Before the first tap.
+    """
     if path is None:
         return
     if path.suffix.lower() not in (".csv", ".html", ".htm"):
-        raise UsageFailure(f"{path.name} is neither CSV nor HTML.", hint="Name it FILE.csv or FILE.html.")
+        raise UsageError(f"{path.name} is neither CSV nor HTML.", hint="Name it FILE.csv or FILE.html.")
     if not path.parent.is_dir():
-        raise NotFound(f"There is no folder {path.parent} for the report.", hint="Create it, or choose another path.")
+        raise NotFoundError(
+            f"There is no folder {path.parent} for the report.", hint="Create it, or choose another path."
+        )
 
 
 def write_report(path: Path, progress: Progress, about: About) -> None:

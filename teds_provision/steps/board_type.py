@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
-from teds_provision.errors import BadData, NodeRefused, PolicyRefused
+from teds_provision.errors import BadDataError, NodeRefusedError, PolicyError
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import (
     DIGEST_OCTETS,
@@ -30,7 +30,7 @@ from teds_provision.protocol.operation.commands import (
 )
 from teds_provision.station.station import Station
 from teds_provision.steps.read import list_blocks, read_block
-from teds_provision.talk.conversation import Conversation, SessionLost, is_busy
+from teds_provision.talk.conversation import Conversation, SessionLostError, is_busy
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import ChannelKind
@@ -44,7 +44,7 @@ _LEASE: Final = 5
 _ROOM: Final = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
 
 
-class WrongBoard(PolicyRefused):
+class WrongBoardError(PolicyError):
     """The board is of another type than what it would be given; ``differences`` says in what, a sentence each."""
 
     code = "wrong-board"
@@ -59,9 +59,9 @@ Retype = Callable[[bytes, tuple[str, ...]], None]
 
 
 def refuse(uuid: bytes, differences: tuple[str, ...]) -> None:
-    """The answer where nobody can be asked: no. Raises WrongBoard."""
+    """The answer where nobody can be asked: no. Raises WrongBoardError."""
     more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
-    raise WrongBoard(
+    raise WrongBoardError(
         f"Board {uuid.hex()} is of a different type: {differences[0].rstrip('.')}{more}. Nothing was written.",
         differences,
         hint="Use the right board or the right profile. To change the board's type: --retype",
@@ -189,7 +189,7 @@ def shown_by(node: Conversation, channels: Collection[int]) -> dict[BlockId, byt
 def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead_man: int | None = None) -> None:
     """Claim a channel (0: every sensor); ``digest`` is that of the Security TEDS, ``lease`` in s, ``dead_man`` in ms.
 
-    Raises NodeRefused; what 6 and 23 mean here is said in words of their own.
+    Raises NodeRefusedError; what 6 and 23 mean here is said in words of their own.
     """
     named = f"channel {channel}" if channel else "any sensor"
     try:
@@ -197,12 +197,12 @@ def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead
             Operate(channel, digest[:DIGEST_OCTETS], lease, dead_man).command(),
             f"to measure with {named}" if channel else "to measure",
         )
-    except NodeRefused as refusal:
+    except NodeRefusedError as refusal:
         said = next((said for reason, said in _OF_OPERATE.items() if reason == refusal.reason), None)
         if said is None:
             raise
         words = f"{said[0].format(named)} (reason {refusal.reason})."
-        raise NodeRefused(words, reason=refusal.reason, hint=said[1]) from None
+        raise NodeRefusedError(words, reason=refusal.reason, hint=said[1]) from None
 
 
 _OF_OPERATE: Final = {
@@ -237,18 +237,18 @@ def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = No
 
     ``shown`` are the units in which people see the values of channels, where the profile names one. Nothing stays
     claimed. Sensors that another session claims are left alone. A session that the node lost meanwhile (who measures
-    it opened another one, its bus was cut) is opened anew, once. Raises WrongBoard with the channel that does not bear
-    it, NodeRefused, LinkFailure.
+    it opened another one, its bus was cut) is opened anew, once. Raises WrongBoardError with the channel that does not
+    bear it, NodeRefusedError, LinkError.
     """
     try:
         return _borne(node, image, shown)
-    except SessionLost as lost:
+    except SessionLostError as lost:
         if is_busy(lost.cause):
             raise lost.cause from lost
     node.reopen()
     try:
         return _borne(node, image, shown)
-    except SessionLost as lost:
+    except SessionLostError as lost:
         raise lost.cause from lost
 
 
@@ -261,7 +261,7 @@ def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) ->
         return Borne(found)
     try:
         samples = tuple(_read(node, sheet, sensors, digest))
-    except (NodeRefused, BadData) as error:  # busy, a fault: the datasheet stands, and a person is told
+    except (NodeRefusedError, BadDataError) as error:  # busy, a fault: the datasheet stands, and a person is told
         return Borne(found, warnings=(f"No reading was taken: {error.message}",))
     bad = [str(one["channel"]) for one in samples if not one["valid"]]
     warnings = (f"The reading of channel {', '.join(bad)} is invalid.",) if bad else ()
@@ -271,11 +271,11 @@ def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) ->
 def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
     try:
         operate(node, channel.number, digest, lease=0, dead_man=FIRST_DEAD_MAN if channel.actuator else None)
-    except NodeRefused as refusal:
+    except NodeRefusedError as refusal:
         if refusal.reason == Reason.OUT_OF_RANGE:
             return True
         if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):  # 4: a sensor there where an actuator is meant
-            raise WrongBoard(
+            raise WrongBoardError(
                 f"Channel {channel.number} ({channel.name or 'no name'}) of the board does not match this"
                 " datasheet: its hardware is of a different kind, or delivers values in a different format.",
                 hint="The board is of a different type. Provision it with the profile of its own type.",

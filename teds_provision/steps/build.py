@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from teds_provision import teds
-from teds_provision.errors import BadData, CalibrationMisfit, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, CalibrationMisfitError, NotFoundError, PolicyError, UsageError
 from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.sanitize import printable
@@ -112,14 +112,14 @@ class Composed:
 
 
 def for_several(order: BuildOrder) -> BuildOrder:
-    """The order, if it can be meant for more than one node; raises UsageFailure where all would be made equal."""
+    """The order, if it can be meant for more than one node; raises UsageError where all would be made equal."""
     if order.name is not None and not order.has_pattern:
-        raise UsageFailure(
+        raise UsageError(
             f"Every node would get the name {order.name!r}.",
             hint="Use {uuid} or {n} in --name, or list the boards in a sheet: --batch FILE.",
         )
     if order.calibration is not None:
-        raise UsageFailure(
+        raise UsageError(
             f"Every node would get the calibration {order.calibration}: it belongs to one sensor.",
             hint="List the boards in a sheet: --batch FILE.",
         )
@@ -129,19 +129,19 @@ def for_several(order: BuildOrder) -> BuildOrder:
 def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> Prepared:
     """Read, fit and guard what an order names; ``uuid`` is the node that is meant, None where any may come.
 
-    Changes nothing. Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (the guard).
+    Changes nothing. Raises UsageError (no profile known), NotFoundError, BadDataError, PolicyError (the guard).
     """
     check_name(order.name)
     if order.adopt:
         if order.profile is not None or order.calibration is not None or order.drop_calibration:
-            raise UsageFailure(
+            raise UsageError(
                 "--adopt signs the datasheet that the board brought, so it takes no profile or calibration.",
                 hint="Omit --profile and --calibration.",
             )
         return Prepared(order)
     wanted = _absolute_profile(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
     if order.calibration is not None and not order.calibration.is_file():
-        raise NotFound(f"There is no calibration file {order.calibration}.")
+        raise NotFoundError(f"There is no calibration file {order.calibration}.")
     if wanted is None:
         if uuid is not None and not order.names_nothing:
             raise no_profile(uuid)
@@ -157,7 +157,7 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
 
 
 def named_for(station: Station, uuid: bytes, prepared: Prepared, *, keep: bool = False) -> Prepared:
-    """The order with the name that this node gets; raises PolicyRefused where another node has it.
+    """The order with the name that this node gets; raises PolicyError where another node has it.
 
     ``keep``: a numbered name is kept for this node at once, as others may ask for theirs at the same time.
     """
@@ -182,10 +182,10 @@ def _named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
 
 
 def require_free_name(station: Station, uuid: bytes, name: str) -> None:
-    """Raise PolicyRefused where another node has this name."""
+    """Raise PolicyError where another node has this name."""
     others = [other for other in station.nodes.all_named(name) if other != uuid]
     if others:
-        raise PolicyRefused(
+        raise PolicyError(
             f"Node {others[0].hex()} already has the name {name!r}.",
             hint="Choose another name; {uuid} or {n} in --name makes names unique.",
         )
@@ -223,7 +223,7 @@ def compose(
     """Compose a node's TEDS; ``has`` is where calibrations come from that the order does not bring or drop.
 
     ``name`` is the one to keep where the order names none; ``as_known``: else the one that this station knows.
-    Raises UsageFailure (no profile known), BadData.
+    Raises UsageError (no profile known), BadDataError.
     """
     order = prepared.order
     wanted = _absolute_profile(order.profile) or _known_profile(station, uuid)
@@ -283,7 +283,7 @@ def _kept_calibrations(
 ) -> tuple[dict[int, Calibration], tuple[str, ...]]:
     """The calibrations that the node has and the order does not drop, and a warning where there are any.
 
-    Raises CalibrationMisfit where one was made for another channel than the profile's.
+    Raises CalibrationMisfitError where one was made for another channel than the profile's.
     """
     if order.drop_calibration or has is None:
         return {}, ()
@@ -300,13 +300,13 @@ def _kept_calibrations(
 
 
 def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile: Profile | None = None) -> None:
-    """Raise CalibrationMisfit where a calibration of ``has`` was made for another channel than ``new`` describes."""
+    """Raise CalibrationMisfitError if a calibration of ``has`` was made for another channel than ``new`` describes."""
     for number, one in kept.items():
         had, now = described(number, has.blocks), described(number, new.blocks)
         own = profile.channel(number) if profile is not None else None
         why = guarding.misfit(one, had, now, own)
         if why:
-            raise CalibrationMisfit(
+            raise CalibrationMisfitError(
                 f"The calibration of channel {number} that the node has does not fit: {why}.",
                 hint="Give this channel a calibration (--calibration FILE), or drop the existing one"
                 " (--no-calibration).",
@@ -328,7 +328,7 @@ def own_name(station: Station, image: Image, before: str | None) -> str | None:
         return None
     try:
         common = _load(station, before).tim_name if before is not None else None
-    except (BadData, NotFound):
+    except (BadDataError, NotFoundError):
         common = None
     return None if found == common else printable(found)
 
@@ -356,7 +356,7 @@ def guard(
     errors = [_finding_text(finding) for finding in findings if finding.severity == "error"]
     if errors and accepted is None:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise PolicyRefused(
+        raise PolicyError(
             f"The calibration is refused: {errors[0]}{more}.",
             hint='Fix it; or, if it is correct, give a reason: --accept-calibration "why".',
         )
@@ -412,17 +412,22 @@ def _finding_text(finding: GuardFinding) -> str:
 
 
 def check_name(name: str | None) -> None:
-    """Raise UsageFailure for a name that fits into no TEDS or is not shown whole, BadData for one that is no text."""
+    """Raise UsageError for a name that fits into no TEDS or is not shown whole.
+
+    BadDataError for one that is no text.
+    """
     if name is None:
         return
     try:
         octets = len(name.encode())
     except UnicodeEncodeError as error:  # an argument in another encoding than the terminal's
-        raise BadData("The name of the node is not valid text.", hint="Give it in the terminal's encoding.") from error
+        raise BadDataError(
+            "The name of the node is not valid text.", hint="Give it in the terminal's encoding."
+        ) from error
     if not 1 <= octets <= NAME_OCTETS:
-        raise UsageFailure(f"A name has 1 to {NAME_OCTETS} octets of UTF-8, this one {octets}.")
+        raise UsageError(f"A name has 1 to {NAME_OCTETS} octets of UTF-8, this one {octets}.")
     if not name.isprintable():
-        raise UsageFailure(f"A name is one line of printable characters, not {name!r}.")
+        raise UsageError(f"A name is one line of printable characters, not {name!r}.")
 
 
 def _known_profile(station: Station, uuid: bytes) -> str | None:
@@ -430,9 +435,9 @@ def _known_profile(station: Station, uuid: bytes) -> str | None:
     return record.profile if record is not None else None
 
 
-def no_profile(uuid: bytes) -> UsageFailure:
+def no_profile(uuid: bytes) -> UsageError:
     """The error for a node of which nobody said what it is."""
-    return UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
+    return UsageError(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
 
 
 def _load(station: Station, wanted: str) -> Profile:
@@ -455,7 +460,7 @@ def _built_of(
     return profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
 
 
-__all__ = ["BuildOrder", "Built", "NotNamed", "Proposal", "build", "propose"]
+__all__ = ["BuildOrder", "Built", "Proposal", "UnrequestedChangeError", "build", "propose"]
 
 
 @dataclass(frozen=True)
@@ -468,7 +473,7 @@ class Built:
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
 
 
-class NotNamed(PolicyRefused):
+class UnrequestedChangeError(PolicyError):
     """A node's datasheet would change in what this command did not name, and nobody said yes; ``changes`` says what."""
 
     code = "not-named"
@@ -483,10 +488,10 @@ Confirm = Callable[[bytes, tuple[Change, ...]], None]
 
 
 def nobody(uuid: bytes, changes: tuple[Change, ...]) -> None:
-    """The answer where nobody can be asked: no. Raises NotNamed with the changes."""
+    """The answer where nobody can be asked: no. Raises UnrequestedChangeError with the changes."""
     shown = " ".join(change.text for change in changes[:3])
     more = f" And {len(changes) - 3} more." if len(changes) > 3 else ""
-    raise NotNamed(
+    raise UnrequestedChangeError(
         f"Node {uuid.hex()} has a different datasheet, and this command does not name what would change: {shown}{more}",
         changes,
         hint="Name it (--profile, --name, --calibration), or drop the draft: teds-provision draft drop UUID.",
@@ -508,8 +513,9 @@ def build(
     Where the order brings no calibration, that of an earlier run that never came to write is taken, else the one that
     the node was last read to have (``has``: another one's). ``keep_draft`` False changes nothing (dry run).
 
-    ``retype`` is asked where the board, as it was last read, is of another type. Raises NotFound (profile, file),
-    BadData (profile or calibration with errors), WrongBoard, PolicyRefused (a calibration that the guard refuses).
+    ``retype`` is asked where the board, as it was last read, is of another type. Raises NotFoundError (profile, file),
+    BadDataError (profile or calibration with errors), WrongBoardError, PolicyError (a calibration that the guard
+    refuses).
     """
     prepared = named_for(station, uuid, prepare(station, order, uuid))
     has = has or known_image(station, uuid)
@@ -526,7 +532,7 @@ def build(
     )
     try:
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
-    except NotFound:
+    except NotFoundError:
         warnings += ("The node's key is not known yet: the Security TEDS is added once it is identified.",)
     built = Built(image, plan.profile.name, merged(warnings), plan.calibrations)
     if not keep_draft:
@@ -566,7 +572,8 @@ class Proposal:
 def propose(station: Station, prepared: Prepared, present: Survey, *, record: bool = True) -> Proposal:
     """Say what a node that was just read is to have. ``record`` False: for a dry run, without a trace in the log.
 
-    Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (a calibration that the guard refuses).
+    Raises UsageError (no profile known), NotFoundError, BadDataError, PolicyError (a calibration that the guard
+    refuses).
     """
     has = present.image
     with station.reading():
@@ -626,7 +633,7 @@ def _mended(station: Station, prepared: Prepared, present: Survey) -> Proposal |
     octets, uuid = present.image.security, present.image.uuid
     try:
         shown = security.decode(octets) if octets is not None else None
-    except BadData:
+    except BadDataError:
         shown = None
     if octets is None or shown is None or not shown.signed or not prepared.order.names_nothing:
         return None
@@ -711,5 +718,5 @@ def _sequence(image: Image | None) -> int:
     octets = image.security if image is not None else None
     try:
         return security.decode(octets).sequence if octets is not None else -1
-    except BadData:
+    except BadDataError:
         return -1

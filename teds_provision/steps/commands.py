@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Final, Literal
 
 from teds_provision.errors import (
-    BadData,
-    Garbled,
-    NodeRefused,
-    NodeSilent,
-    NotFound,
-    PolicyRefused,
+    BadDataError,
+    GarbledError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotFoundError,
+    PolicyError,
     TedsProvisionError,
-    Unproven,
-    UsageFailure,
+    UnprovenError,
+    UsageError,
 )
 from teds_provision.files import read_limited
 from teds_provision.links import LINKS, LinkSettings, Notice
@@ -43,7 +43,7 @@ from teds_provision.steps.verify import Verified, known_of, require_authentic, s
 from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
 from teds_provision.steps.write import Low, Written, wait_for_charge, write
 from teds_provision.store import DatasheetRecord, Draft
-from teds_provision.talk.conversation import HEARD, Conversation, SessionLost
+from teds_provision.talk.conversation import HEARD, Conversation, SessionLostError
 from teds_provision.talk.meeting import Arrival, meet, meet_everyone, watch_nodes
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.codec import security
@@ -63,7 +63,7 @@ class Visit:
     who: Identified
 
     def session(self) -> None:
-        """Open a session under the key that is held; raises PolicyRefused where there is none."""
+        """Open a session under the key that is held; raises PolicyError where there is none."""
         require_session(self.station, self.node)
 
 
@@ -81,8 +81,8 @@ def at_node(
 
     The vault is opened before anyone is waited for: always, where a key of this node is held, or never. Another
     command of this station that works on the same node is waited for. ``writes`` is the command that writes to the
-    node: a running `ncap` of this home that measures it lets it go meanwhile. Raises NoReader, NoNode after
-    ``links.timeout`` seconds, OtherKey, NotAuthentic, LinkFailure; PolicyRefused where the node is not let go.
+    node: a running `ncap` of this home that measures it lets it go meanwhile. Raises NoReaderError, NoNodeError after
+    ``links.timeout`` seconds, KeyMismatchError, NotAuthenticError, LinkError; PolicyError where the node is not let go.
     """
 
     def before() -> None:
@@ -98,34 +98,34 @@ def at_node(
 
 
 def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
-    """The image of a file, or the UUID that ``text`` names; raises NotFound which says what of the two it is not.
+    """The image of a file, or the UUID that ``text`` names; raises NotFoundError which says what of the two it is not.
 
     Of both the file, but with ``node`` the node.
     """
     path = Path(text)
     if node:
-        with suppress(NotFound):
+        with suppress(NotFoundError):
             return station.nodes.resolve(text)
     if path.is_file():
         return read_image_file(path)
     try:
         return station.nodes.resolve(text)
-    except NotFound:
+    except NotFoundError:
         if path.is_dir():
-            raise NotFound(f"{text} is a folder, and no node has that name.") from None
+            raise NotFoundError(f"{text} is a folder, and no node has that name.") from None
         if path.exists():
-            raise NotFound(f"{text} is not a regular file, and no node has that name.") from None
+            raise NotFoundError(f"{text} is not a regular file, and no node has that name.") from None
         if path.suffix or len(path.parts) > 1:
-            raise NotFound(f"There is no file {text}, and no node with that name.") from None
+            raise NotFoundError(f"There is no file {text}, and no node with that name.") from None
         raise
 
 
 def read_image_file(path: Path) -> Image:
-    """Read an image file; raises NotFound, BadData (of KeyAgreement 1 too, by name)."""
+    """Read an image file; raises NotFoundError, BadDataError (of KeyAgreement 1 too, by name)."""
     try:
         image = Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
-    except BadData as error:
-        raise BadData(
+    except BadDataError as error:
+        raise BadDataError(
             f"{path} is not a TEDS image: {error.message}", hint=error.hint or "Images come from build, sign and read."
         ) from error
     return security.require_our_wire(image)
@@ -290,25 +290,25 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
 
     Its reply still leaves from the old address; the node is met at the new one from then on. A board that moves at once
     loses that reply: where none comes over the bus, who is at the new address is asked before wiring is spoken of.
-    Raises NodeRefused (3: neither tapped nor in a session; 17: written less than 10 s ago), OtherKey, LinkFailure,
-    UsageFailure for a node without CAN.
+    Raises NodeRefusedError (3: neither tapped nor in a session; 17: written less than 10 s ago), KeyMismatchError,
+    LinkError, UsageError for a node without CAN.
     """
     if not node.identity.can_address:
-        raise UsageFailure("This node has no CAN, so it has no CAN address.", hint="Nothing needs to be set.")
+        raise UsageError("This node has no CAN, so it has no CAN address.", hint="Nothing needs to be set.")
     if node.identity.can_address == address:
         return False
     open_session(station, node)
     try:
         node.send(security_command(Function.SET_CAN_ADDRESS, bytes([address])), "the new CAN address")
-    except SessionLost as lost:
+    except SessionLostError as lost:
         raise lost.cause from lost
-    except (NodeSilent, Garbled):
+    except (NodeSilentError, GarbledError):
         if not _is_at(node, address):
             raise
     if node.contact.address is not None:
         node.forget()  # a link is one pair of addresses: this session ended with the old one
     elif node.sealed and read_identity(node).can_address != address:
-        raise Garbled("The node accepted the new CAN address but still reports the old one.")
+        raise GarbledError("The node accepted the new CAN address but still reports the old one.")
     with station.durable("address"):
         station.nodes.remember(node.uuid, can_address=address)
         station.audit("address", node.uuid, "done", address=address)
@@ -325,10 +325,10 @@ def _is_at(node: Conversation, address: int) -> bool:
 # -- read, reset, verify, write ----------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class ReadDone:
-    """Every TEDS of a node; ``error`` is Unproven where a key is held here and nothing shows who said it."""
+    """Every TEDS of a node; ``error`` is UnprovenError where a key is held here and nothing shows who said it."""
 
     image: Image
-    error: Unproven | None
+    error: UnprovenError | None
 
 
 def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadDone:
@@ -372,7 +372,7 @@ def verify_at(
 ) -> VerifyDone:
     """Check the image file, or the node, that ``what`` names; with ``node`` a node's name goes first.
 
-    ``error``: NotAuthentic (4), Unproven (5), or PolicyRefused (6) for a calibration that would hurt.
+    ``error``: NotAuthenticError (4), UnprovenError (5), or PolicyError (6) for a calibration that would hurt.
     """
     found = node_or_image(station, what, node=node)
     if isinstance(found, Image):
@@ -386,7 +386,7 @@ def verify_at(
                 finally:
                     in_session = visit.node.sealed
             image, verified = looked.image, looked.verified
-        except NodeRefused as refusal:  # outside a session anyone may have sent it: it decides nothing
+        except NodeRefusedError as refusal:  # outside a session anyone may have sent it: it decides nothing
             if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
                 raise
             station.audit("verify", found, "unproven", why=refusal.message)
@@ -420,7 +420,7 @@ def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, di
     else:
         wanted = known_image(station, uuid)
     if wanted is None:
-        raise NotFound(
+        raise NotFoundError(
             f"Nothing has been built for node {uuid.hex()}.", hint="build and sign it first, or give --image."
         )
     name = own_name(station, wanted, profile)
@@ -430,9 +430,9 @@ def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, di
     if name is not None and draft is not None and file is None and (record is None or record.name != name):
         require_free_name(station, uuid, name)
     if wanted.uuid != uuid:
-        raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
+        raise PolicyError(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
     if wanted.security is None:
-        raise BadData("The image has no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
+        raise BadDataError("The image has no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
     return wanted, facts
 
 
@@ -454,7 +454,8 @@ def write_at(
     ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
     ``low`` before a node with a low battery is written; ``retype`` before a board becomes one of another type than it
     says it is (None: that is refused), unless it was ``retyped`` by a word.
-    Raises NotFound (nothing built), BadData (not signed), PolicyRefused (another node's image), as ``write`` does.
+    Raises NotFoundError (nothing built), BadDataError (not signed), PolicyError (another node's image), as ``write``
+    does.
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
@@ -511,13 +512,13 @@ def sign_at(
 ) -> SignDone:
     """Sign the draft of the node that ``what`` names, or an image file; ``read_node``: against the node itself.
 
-    ``output`` is where the caller will write the image: an image file needs one. Raises UsageFailure, and what
+    ``output`` is where the caller will write the image: an image file needs one. Raises UsageError, and what
     :func:`sign_image` raises.
     """
     found = node_or_image(station, what)
     image = found if isinstance(found, Image) else None
     if image is not None and output is None and not dry_run:
-        raise UsageFailure("Signing an image file requires an output file.", hint="Add --output IMAGE.")
+        raise UsageError("Signing an image file requires an output file.", hint="Add --output IMAGE.")
     uuid = image.uuid if image is not None else station.nodes.resolve(what)
     order = SignOrder(uuid, image, accept_calibration, dry_run)
     if not dry_run:
@@ -536,7 +537,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     station knew them; what this one knows counts where it is newer.
 
     Where nothing lies ready, what the node was last read to have is signed: nothing to do, if it still holds. Raises
-    NotFound (nothing built, key unknown), BadData, PolicyRefused (guard), NotWhitelisted.
+    NotFoundError (nothing built, key unknown), BadDataError, PolicyError (guard), NotWhitelistedError.
     """
     uuid = order.uuid
     station.policy.require_whitelisted(uuid)
@@ -544,7 +545,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     known = known_image(station, uuid)
     image = order.image or (draft.image if draft is not None else known)
     if image is None or not image.unsigned_blocks():
-        raise NotFound(
+        raise NotFoundError(
             f"Nothing has been built for node {uuid.hex()}.", hint=f"To build it: teds-provision build {uuid.hex()}"
         )
     present = _last_known(station, uuid, known, order.image) if node is None else _read_now(station, node, order)
@@ -612,7 +613,7 @@ def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image 
         return _Present(known, epoch, sequence)  # this very sequence was given here: the signature may still hold
     highest = max(sequence, record.sequence if record else 0)
     if highest and brought.sequence > highest + SEQUENCE_WINDOW:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The image has sequence {brought.sequence}; the last one known here is {highest}.",
             hint="That number is unverified. Check it against the node: sign IMAGE --read-node",
         )
@@ -697,7 +698,9 @@ def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
         if record.sequence == sequence:
             return record
     listed = ", ".join(str(record.sequence) for record in known) or "none"
-    raise NotFound(f"Node {uuid.hex()} never had a datasheet with sequence {sequence}.", hint=f"Known are: {listed}.")
+    raise NotFoundError(
+        f"Node {uuid.hex()} never had a datasheet with sequence {sequence}.", hint=f"Known are: {listed}."
+    )
 
 
 def bring_back(
@@ -705,7 +708,7 @@ def bring_back(
 ) -> BroughtBack:
     """Write a datasheet that the node had under ``sequence``, signed anew; its content counts, not its number.
 
-    Raises NotFound (no such datasheet), PolicyRefused, and what ``write`` raises.
+    Raises NotFoundError (no such datasheet), PolicyError, and what ``write`` raises.
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)

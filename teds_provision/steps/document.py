@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
@@ -58,16 +58,17 @@ def plan_sheet(
 ) -> SheetPlan:
     """What writing these TEDS would change, in a session of the node; changes nothing.
 
-    Raises NotWhitelisted, PolicyRefused (no key, the guard), BadData (damaged TEDS, another node's), WrongBoard where
-    the board says that it is of another type, unless ``retype``: no document names the type that it was given before.
+    Raises NotWhitelistedError, PolicyError (no key, the guard), BadDataError (damaged TEDS, another node's),
+    WrongBoardError where the board says that it is of another type, unless ``retype``: no document names the type that
+    it was given before.
     """
     station.policy.require_whitelisted(node.uuid)
     for (channel, code), teds in blocks.items():
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
-            raise BadData(f"TEDS {code} of channel {channel} is damaged, or is one that no node can store.")
+            raise BadDataError(f"TEDS {code} of channel {channel} is damaged, or is one that no node can store.")
     meant = stated_uuid(blocks)
     if meant is not None and meant != node.uuid:
-        raise BadData(
+        raise BadDataError(
             f"This datasheet belongs to node {meant.hex()}, not to {node.uuid.hex()}.",
             hint="To use it for this node, remove the UUID from its Meta-TEDS (or set it to zeros).",
         )
@@ -99,7 +100,7 @@ def write_sheet(
     accept_calibration: str | None = None,
     retype: bool = False,
 ) -> SheetWritten:
-    """Plan, sign, write, read back and verify; raises as the steps do, and NotAuthentic where the end is not good."""
+    """Plan, sign, write, read back and verify; raises as the steps do, and NotAuthenticError if the end is not good."""
     steps = Steps(reporter)
     with steps.step("build") as step:
         plan = plan_sheet(station, node, blocks, accept_calibration=accept_calibration, retype=retype, record=True)

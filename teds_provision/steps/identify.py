@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from teds_provision import teds
-from teds_provision.errors import NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
+from teds_provision.errors import KeyringUnavailableError, NodeRefusedError, NotAuthenticError, WrongPassphraseError
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
@@ -45,11 +45,11 @@ class Identified:
 
 
 def prove(node: Conversation, point: bytes) -> None:
-    """Have the node sign a fresh challenge (128.8); raises NotAuthentic where it cannot."""
+    """Have the node sign a fresh challenge (128.8); raises NotAuthenticError where it cannot."""
     challenge = os.urandom(CHALLENGE_OCTETS)
     proof = node.ask(security_command(Function.PROVE, challenge), "to prove its key")
     if not verify(point, prove_message(node.uuid, challenge), proof):
-        raise NotAuthentic(
+        raise NotAuthenticError(
             f"The node cannot prove that it holds the key {fingerprint(point)[:16]}, which it presents.",
             hint="This may be a copied tag. Do not use it.",
         )
@@ -60,11 +60,11 @@ def identify(
 ) -> Identified:
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
-    Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. A tap pins the key that it
-    brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept, and ``last_seen``
-    moves only where the key that signed is known. State, epoch and address of a plain Identify are hints: they change
-    nothing in the store, a session does. ``expect`` is asked before anything is recorded, and raises where another
-    node was meant.
+    Raises KeyMismatchError (a known UUID with another key), NotAuthenticError, BadDataError, LinkError. A tap pins the
+    key that it brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept, and
+    ``last_seen`` moves only where the key that signed is known. State, epoch and address of a plain Identify are hints:
+    they change nothing in the store, a session does. ``expect`` is asked before anything is recorded, and raises where
+    another node was meant.
     """
     who = examine(station, node)
     expect(who)
@@ -114,7 +114,7 @@ def _pinned_now(station: Station, who: Identified) -> WhitelistEntry | None:
 
 def _opened(station: Station) -> bool:
     """Whether the vault is open, which seals a pin; where nobody gives the passphrase, the first agreement will pin."""
-    with suppress(WrongPassphrase, NoKeyring):
+    with suppress(WrongPassphraseError, KeyringUnavailableError):
         station.unlock()
         return True
     return False
@@ -126,7 +126,7 @@ def examine(station: Station, node: Conversation) -> Identified:
     shown = security.decode(octets)
     point = shown.node_key
     if not node_key_good(node.uuid, point, shown.node_key_signature):
-        raise NotAuthentic(f"The key that the node presents is not signed for UUID {node.uuid.hex()} (field 102).")
+        raise NotAuthenticError(f"The key that the node presents is not signed for UUID {node.uuid.hex()} (field 102).")
     prove(node, point)
     with station.reading():
         station.pins.check(node.uuid, point)
@@ -165,7 +165,7 @@ def describe(node: Conversation) -> Description:
     for block in ((0, AccessCode.META), (0, AccessCode.NAME)):
         try:
             decoded = teds.decode(read_block(node, block))
-        except NodeRefused:
+        except NodeRefusedError:
             continue
         found, count = decoded.get("TCName"), decoded.get("MaxChan")
         name = printable(found) if isinstance(found, str) else name

@@ -11,7 +11,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from teds_provision import teds
-from teds_provision.errors import NotFound, PolicyRefused
+from teds_provision.errors import NotFoundError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -36,7 +36,8 @@ _UUID_DIGITS = 20
 def search(station: Station, text: str | None = None, *, state: str | None = None, **more: str | None) -> list[bytes]:
     """The UUIDs of the nodes that are meant; ``more``: the other fields of :class:`Search`.
 
-    ``text``: a whole UUID, an exact name, or any part of UUID, name or profile. Raises NotFound where nothing fits it.
+    ``text``: a whole UUID, an exact name, or any part of UUID, name or profile. Raises NotFoundError where nothing fits
+    it.
     """
     number: str | int | None = NodeState[state.upper()].value if state in STATES[:3] else state
     if text is None:
@@ -44,7 +45,7 @@ def search(station: Station, text: str | None = None, *, state: str | None = Non
     exact = _exact(station, text) if number is None and not any(more.values()) else None
     found = [exact] if exact is not None else station.nodes.find(Search(text, number, **more))
     if not found:
-        raise NotFound(f"No node matches {text!r}.", hint="See: teds-provision nodes.")
+        raise NotFoundError(f"No node matches {text!r}.", hint="See: teds-provision nodes.")
     return found
 
 
@@ -151,14 +152,14 @@ def fits_of(
 
 
 def require(fits: Iterable[NodeFit]) -> None:
-    """Raise PolicyRefused (exit 6) unless a group meets every requirement that it was judged by."""
+    """Raise PolicyError (exit 6) unless a group meets every requirement that it was judged by."""
     by_requirement: dict[Requirement, list[Fit]] = {}
     for found in fits:
         by_requirement.setdefault(found.requirement, []).append(found.fit)
     for requirement, found_fits in by_requirement.items():
         if not teds.fits.met(requirement, found_fits):
             reasons = " ".join(dict.fromkeys(fit.why for fit in found_fits if fit.result != "passed"))
-            raise PolicyRefused(
+            raise PolicyError(
                 f"No channel suffices for {requirement.subject}: {reasons}"
                 if not requirement.channel
                 else f"{requirement.subject[0].upper()}{requirement.subject[1:]} does not suffice: {reasons}",

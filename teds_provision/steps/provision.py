@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError
+from teds_provision.errors import PolicyError, StoreError, TedsProvisionError
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.shown_units import shown_units, units_of
@@ -48,7 +48,7 @@ from teds_provision.steps.verify_node import look_at_node, verify_node
 from teds_provision.steps.write import Low, Written, wait_for_charge, write
 from teds_provision.store import WhitelistEntry
 from teds_provision.store.records import Assurance
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.image import SECURITY, Image
@@ -100,13 +100,13 @@ def inspect(station: Station, node: Conversation, line: ProductionLine, reporter
                     step.result = DONE if borne.asked else SKIPPED
                 done = Provisioned(who, tuple(steps.done), looked.image, looked.verified, borne.warnings, borne.samples)
                 unit.ended(node, done)
-            except (TedsProvisionError, SessionLost) as error:
-                cause = error.cause if isinstance(error, SessionLost) else error
+            except (TedsProvisionError, SessionLostError) as error:
+                cause = error.cause if isinstance(error, SessionLostError) else error
                 unit.failed(node, who, steps.done, steps.current, cause)
                 raise
             return done
     except TedsProvisionError as error:
-        with suppress(StoreFailure):
+        with suppress(StoreError):
             station.audit("provision", node.uuid, error.code, step=steps.current, why=error.message)
         raise
 
@@ -148,7 +148,7 @@ class ProductionLine(Protocol):
         """What all boards get."""
 
     def order(self, who: Identified) -> Prepared:
-        """What this board gets; raises PolicyRefused where it gets nothing."""
+        """What this board gets; raises PolicyError where it gets nothing."""
 
     @property
     def only_verify(self) -> bool:
@@ -166,7 +166,7 @@ class ProductionLine(Protocol):
     def take(self, node: Conversation, who: Identified, prepared: Prepared, entry: WhitelistEntry | None) -> Unit:
         """Take a unit for this board, durably, or find the one that it has; ``entry`` is a newcomer's.
 
-        Raises PolicyRefused, and then no unit was taken.
+        Raises PolicyError, and then no unit was taken.
         """
 
 
@@ -199,7 +199,7 @@ def provision(
         with station.turn(node.uuid), station.released(node.uuid, "provision"), station.run():
             return run.proven()
     except TedsProvisionError as error:
-        with suppress(StoreFailure):  # a full disk must not hide what happened
+        with suppress(StoreError):  # a full disk must not hide what happened
             station.audit("provision", node.uuid, error.code, step=run.steps.current, why=error.message)
         raise
 
@@ -234,9 +234,9 @@ class _Run:
             done = self.run(who)
             if self.unit is not None:
                 self.unit.ended(self.node, done)
-        except (TedsProvisionError, SessionLost) as error:
+        except (TedsProvisionError, SessionLostError) as error:
             if self.unit is not None:
-                cause = error.cause if isinstance(error, SessionLost) else error
+                cause = error.cause if isinstance(error, SessionLostError) else error
                 self.unit.failed(self.node, who, self.steps.done, self.steps.current, cause)
             raise
         return done
@@ -412,14 +412,14 @@ def newcomer(station: Station, node: Conversation, who: Identified) -> Whitelist
     """The whitelist entry of a node that was just identified, pinned to its key by tap, or by the bus of a new node.
 
     A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. Over the
-    air nothing is pinned. Changes nothing. Raises PolicyRefused (revoked), OtherKey.
+    air nothing is pinned. Changes nothing. Raises PolicyError (revoked), KeyMismatchError.
     """
     new = who.state == NodeState.FACTORY and node.wired
     assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
     with station.reading():
         revoked = station.policy.revocation(who.uuid)
         if revoked is not None:
-            raise PolicyRefused(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
+            raise PolicyError(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
         station.pins.check(who.uuid, who.point)
     return WhitelistEntry(who.uuid, who.fingerprint if node.tapped or new else None, assurance=assurance)
 

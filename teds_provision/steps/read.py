@@ -6,7 +6,7 @@ import time
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from teds_provision.errors import BadData, Garbled, NodeRefused
+from teds_provision.errors import BadDataError, GarbledError, NodeRefusedError
 from teds_provision.links.ports import Spaced
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
@@ -39,8 +39,8 @@ def read_block(node: Conversation, block: BlockId, *, until: float | None = None
     """Read one TEDS, segment by segment, as long as its Length says (or as the node has octets).
 
     Outside a session, where no tag tells noise from a bad TEDS, one whose checksum is wrong is read again: what comes
-    twice alike is what the node has. ``until`` is a monotonic time. Raises NodeRefused (18: no such TEDS) and,
-    for a Length beyond 1 MiB (of a Security TEDS, 65535 octets), BadData in a session, Garbled outside one.
+    twice alike is what the node has. ``until`` is a monotonic time. Raises NodeRefusedError (18: no such TEDS) and,
+    for a Length beyond 1 MiB (of a Security TEDS, 65535 octets), BadDataError in a session, GarbledError outside one.
     """
     octets = _read_once(node, block, until)
     for _ in range(_NOISY_READS):
@@ -50,13 +50,13 @@ def read_block(node: Conversation, block: BlockId, *, until: float | None = None
         if again == octets:
             return octets
         octets = again
-    raise Garbled(f"TEDS {block[1]} of channel {block[0]} reads differently each time; the link is noisy.")
+    raise GarbledError(f"TEDS {block[1]} of channel {block[0]} reads differently each time; the link is noisy.")
 
 
 def _whole(octets: bytes) -> bool:
     try:
         unframe(octets)
-    except BadData:
+    except BadDataError:
         return False
     return True
 
@@ -67,7 +67,7 @@ def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes
     until = time.monotonic() + READING_SECONDS if until is None else until
     while True:
         if time.monotonic() > until:
-            raise Garbled(f"The node delivers its TEDS too slowly: not finished after {READING_SECONDS:.0f} s.")
+            raise GarbledError(f"The node delivers its TEDS too slowly: not finished after {READING_SECONDS:.0f} s.")
         segment = _read_segment(node, block, len(octets))
         octets += segment
         total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
@@ -76,9 +76,9 @@ def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes
         if total > largest:
             said = f"TEDS {block[1]} of channel {block[0]} claims {total} octets; at most {largest} are read."
             raise (
-                BadData(said)
+                BadDataError(said)
                 if node.sealed
-                else Garbled(f"{said} That is unverified: it was received outside a session.")
+                else GarbledError(f"{said} That is unverified: it was received outside a session.")
             )
 
 
@@ -90,7 +90,7 @@ def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:
         payload = _ask_despite_noise(node, command, what)
         if len(payload) >= 4 and int.from_bytes(payload[:4], "big") == offset:
             return payload[4:]
-    raise Garbled(f"The node read TEDS {access_code} of channel {channel} from a different offset than requested.")
+    raise GarbledError(f"The node read TEDS {access_code} of channel {channel} from a different offset than requested.")
 
 
 def _ask_despite_noise(node: Conversation, command: Command, what: str) -> bytes:
@@ -98,7 +98,7 @@ def _ask_despite_noise(node: Conversation, command: Command, what: str) -> bytes
     for left in range(_REFUSED_READS, -1, -1):
         try:
             return node.ask(command, what)
-        except NodeRefused:
+        except NodeRefusedError:
             if node.sealed or not left:
                 raise
     raise AssertionError("the last refusal is raised")
@@ -120,13 +120,13 @@ def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
             continue
         try:
             blocks[block] = read_block(node, block, until=until)
-        except NodeRefused as refusal:
+        except NodeRefusedError as refusal:
             if refusal.reason != Reason.NO_SUCH_TEDS:
                 raise
             continue
         total += len(blocks[block])
         if total > LARGEST_IMAGE:
-            raise BadData("The node lists more than 4 MiB of TEDS.")
+            raise BadDataError("The node lists more than 4 MiB of TEDS.")
     return Image(node.uuid, blocks)
 
 
@@ -135,7 +135,7 @@ def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Im
 
     For a node that measures meanwhile: who steps through it chooses when the bus is free, and frames of a reply are
     asked for with ``gap`` ms between them. No new session is opened where the old one is gone: it carries the streams.
-    Raises SessionLost, LinkFailure, NodeRefused, BadData.
+    Raises SessionLostError, LinkError, NodeRefusedError, BadDataError.
     """
 
     def sent(command: Command, what: str) -> bytes:
@@ -158,13 +158,15 @@ def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Im
             what = f"to read TEDS {code} of channel {channel}"
             payload = sent(read_teds(channel, code, len(octets)), what)
             if len(payload) < 4 or int.from_bytes(payload[:4], "big") != len(octets):
-                raise Garbled(f"The node read TEDS {code} of channel {channel} from a different offset than requested.")
+                raise GarbledError(
+                    f"The node read TEDS {code} of channel {channel} from a different offset than requested."
+                )
             if len(payload) == 4:
                 break
             octets += payload[4:]
             total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
             if total > largest or sum(map(len, blocks.values())) + total > LARGEST_IMAGE:
-                raise BadData(f"TEDS {code} of channel {channel} claims {total} octets, which is too many.")
+                raise BadDataError(f"TEDS {code} of channel {channel} claims {total} octets, which is too many.")
             if len(octets) < total:
                 yield
         blocks[channel, code] = bytes(octets)
@@ -175,7 +177,7 @@ def read_identity(node: Conversation) -> Identity:
     """Ask Identify again, inside the session where one is open (then it is authentic)."""
     identity = Identity.decode(node.ask(IDENTIFY, "to identify itself"))
     if identity.uuid != node.uuid:
-        raise Garbled(f"The node gave its UUID as {node.uuid.hex()} before and gives {identity.uuid.hex()} now.")
+        raise GarbledError(f"The node gave its UUID as {node.uuid.hex()} before and gives {identity.uuid.hex()} now.")
     if node.sealed:
         node.proven = identity
     return identity

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
-from teds_provision.errors import StoreChanged
+from teds_provision.errors import StoreChangedError
 from teds_provision.station.station import Station
 from teds_provision.steps.verify import (
     ABOUT_THE_REST,
@@ -172,7 +172,9 @@ def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]
     held = set(keyed)
     try:
         judging = remember_page(station, [row.uuid for row in rows])
-    except StoreChanged:  # of one node another program wrote the pin: it costs that one its verdict, not the others
+    except (
+        StoreChangedError
+    ):  # of one node another program wrote the pin: it costs that one its verdict, not the others
         found = {row.uuid: _judged_or_not(station, row, keyed=row.uuid in held) for row in rows}
     else:
         found = {row.uuid: _judged(judging, row, keyed=row.uuid in held) for row in rows}
@@ -182,7 +184,7 @@ def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]
 def _judged_or_not(station: Station, row: NodeReading, *, keyed: bool) -> NodeVerdict:
     try:
         return _judged(station, row, keyed=keyed)
-    except StoreChanged as error:
+    except StoreChangedError as error:
         return NodeVerdict(Verified(row.uuid, (Check("node key", "failed", error.message),)), "plain", row.at, row.by)
 
 

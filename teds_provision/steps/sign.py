@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.protocol.datasheet import (
     SignedNodeKey,
     can_be_stored,
@@ -43,15 +43,15 @@ class Signed:
 
 
 def node_keys_of(uuid: bytes, security_teds: bytes) -> SignedNodeKey:
-    """Take fields 101 and 102 from a Security TEDS of the node; raises BadData where 102 is not over this UUID."""
+    """Take fields 101 and 102 from a Security TEDS of the node; raises BadDataError where 102 is not over this UUID."""
     shown = security.decode(security_teds)
     if not node_key_good(uuid, shown.node_key, shown.node_key_signature):
-        raise BadData(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
+        raise BadDataError(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
     return SignedNodeKey(uuid, shown.node_key, shown.node_key_signature)
 
 
 def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -> SignedNodeKey:
-    """The node's key and its signature, from the image at hand or from what was last read; raises NotFound."""
+    """The node's key and its signature, from the image at hand or from what was last read; raises NotFoundError."""
     for source in (image, known_image(station, uuid)):
         if source is not None and source.security is not None:
             keys = node_keys_of(uuid, source.security)
@@ -60,10 +60,10 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
     row = station.nodes.reading(uuid)
     if row is not None and row.node_key is not None and row.node_key_signature is not None:
         if not node_key_good(uuid, row.node_key, row.node_key_signature):
-            raise BadData(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
+            raise BadDataError(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
         station.pins.check(uuid, row.node_key)
         return SignedNodeKey(uuid, row.node_key, row.node_key_signature)
-    raise NotFound(
+    raise NotFoundError(
         f"The key of node {uuid.hex()} is not known yet.",
         hint="Identify it first: teds-provision identify",
     )
@@ -115,7 +115,7 @@ def sign(
     """
     for block, teds in image.unsigned_blocks().items():
         if not can_be_stored(block) or not passes_own_check(block, teds):
-            raise BadData(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
+            raise BadDataError(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
     if sequence is None:
         # What says the same is not signed anew, so a run that is repeated leaves the node as it is. A signature that
         # never arrived is good while its sequence is above the node's: the node takes no other.
@@ -132,7 +132,7 @@ def sign(
         # The store knows of signatures that never reached the node, the node of those by other stations.
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
         if number > LAST_SEQUENCE:
-            raise PolicyRefused("This node has no sequence numbers left.")
+            raise PolicyError("This node has no sequence numbers left.")
         unsigned = unsigned_datasheet(
             keys,
             credentials.key.point,
@@ -160,7 +160,7 @@ def _sequence_if_the_same(station: Station, keys: SignedNodeKey, image: Image, o
     """The sequence of a Security TEDS that says the same of this image: content, epoch and signer unchanged."""
     try:
         found = security.decode(octets)
-    except BadData:
+    except BadDataError:
         return None
     ca = station.keys.ca_of(keys.uuid)
     same = (

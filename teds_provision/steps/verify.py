@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, Protocol
 
-from teds_provision.errors import BadData, BadDatasheet, NotAuthentic, TedsProvisionError, Unproven
+from teds_provision.errors import BadDataError, BadDatasheetError, NotAuthenticError, TedsProvisionError, UnprovenError
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.agreement import other_key
 from teds_provision.protocol.fingerprints import same_key
@@ -21,7 +21,7 @@ from teds_provision.steps.sign import known_image
 from teds_provision.store import RevocationRecord, WhitelistEntry
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
-from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
+from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
 from teds_provision.teds.image import SECURITY, Image
 
 # -- what it is judged by: a station's keys, pins and deny list, asked one by one or remembered for many ---------------
@@ -31,7 +31,7 @@ class PinsAsked(Protocol):
     """Which key a UUID is pinned to."""
 
     def check(self, uuid: bytes, point: bytes) -> None:
-        """Raise OtherKey where this UUID is known with another key."""
+        """Raise KeyMismatchError where this UUID is known with another key."""
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
         """The whitelist entry of a node."""
@@ -115,7 +115,7 @@ class StationSnapshot:
 
 
 def remember(station: Station) -> StationSnapshot:
-    """Take down everything that judging images asks a station for; raises StoreChanged as the station does."""
+    """Take down everything that judging images asks a station for; raises StoreChangedError as the station does."""
     return StationSnapshot(
         station.point,
         _Pins(station.pins.all(), {entry.uuid: entry for entry in station.pins.whitelist()}),
@@ -223,7 +223,7 @@ def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Known:
     octets = image.security if image is not None else None
     try:
         shown = security.decode(octets) if octets is not None else None
-    except BadData:
+    except BadDataError:
         shown = None
     if image is None or octets is None or shown is None or not shown.signed:
         return Known(identity)
@@ -254,7 +254,7 @@ def verify_images(station: Judging, images: Iterable[Image]) -> list[list[Check]
 class _Proofs(NamedTuple):
     """What the Security TEDS of an image says, or why it cannot be read (None: there is none), and its signatures."""
 
-    shown: SecurityTeds | NotCanonical | None
+    shown: SecurityTeds | NotCanonicalError | None
     node_key: bool = False
     datasheet: bool = False
 
@@ -266,7 +266,7 @@ def _proofs(image: Image) -> _Proofs:
         return _Proofs(None)
     try:
         shown = security.decode(octets)
-    except NotCanonical as error:
+    except NotCanonicalError as error:
         return _Proofs(error)
     node_key = node_key_good(image.uuid, shown.node_key, shown.node_key_signature)
     return _Proofs(shown, node_key, shown.signed and datasheet.signature_good(shown, octets, image.uuid))
@@ -285,7 +285,7 @@ class Signers(NamedTuple):
     station_key_signature: bytes | None = None
 
     @classmethod
-    def of(cls, shown: SecurityTeds | NotCanonical | None) -> Signers:
+    def of(cls, shown: SecurityTeds | NotCanonicalError | None) -> Signers:
         """Those of a Security TEDS that was read; none of one that is absent or not of this profile."""
         if not isinstance(shown, SecurityTeds):
             return cls()
@@ -307,7 +307,7 @@ def what_octets_say(image: Image, known: Known | None) -> tuple[list[Check], Sig
     return [*checks, *_not_older(shown, known)], Signers.of(shown)
 
 
-_Shown = SecurityTeds | NotCanonical | None
+_Shown = SecurityTeds | NotCanonicalError | None
 _SAID: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(maxlen=4)
 
 
@@ -354,7 +354,7 @@ def _by_itself(image: Image, proofs: _Proofs) -> tuple[Check, ...]:
     checks, shown = [_form(image)], proofs.shown
     if shown is None:
         return (*checks, Check("signed", "failed", "the image has no Security TEDS"))
-    if isinstance(shown, NotCanonical):
+    if isinstance(shown, NotCanonicalError):
         ours = security.has_profile_version(image.blocks[SECURITY])
         why = shown.message if ours else "the Security TEDS does not follow this profile: shown, never trusted"
         return (*checks, Check("canonical form", "failed", why))
@@ -377,7 +377,7 @@ def possession(prove: Callable[[], None]) -> Check:
     """Run the challenge and tell it as a check; a link that fails is raised, not judged."""
     try:
         prove()
-    except NotAuthentic as error:
+    except NotAuthenticError as error:
         return Check("possession", "failed", error.message)
     return Check("possession", "passed", "the node signed a fresh challenge")
 
@@ -394,9 +394,9 @@ def session(opened: str, why: str) -> Check:
     return Check(_SESSION, "skipped", "this station holds no key of this node")
 
 
-def unproven(uuid: bytes, why: str) -> Unproven:
+def unproven(uuid: bytes, why: str) -> UnprovenError:
     """The error (exit 5) where a key of the node is held and neither a session nor its signature vouches for it."""
-    return Unproven(
+    return UnprovenError(
         f"Nothing could be proven about node {uuid.hex()}: {why}.",
         hint="Data received outside a session may be a replay. Try it on the reader; to take a node over: agree"
         " --rotate",
@@ -404,19 +404,22 @@ def unproven(uuid: bytes, why: str) -> Unproven:
 
 
 def require_authentic(verified: Verified) -> None:
-    """Raise NotAuthentic (exit 4), or Unproven (5), unless the verdict is ``authentic``; names the first failure."""
+    """Raise NotAuthenticError (exit 4), or UnprovenError (5), unless the verdict is ``authentic``.
+
+    Names the first failure.
+    """
     if verified.verdict == "authentic":
         return
     failed = {check.name: check for check in reversed(verified.checks) if check.result == "failed"}
     if verified.verdict == "unproven" and _PAGES in failed:
-        raise Unproven(
+        raise UnprovenError(
             f"Nothing could be proven about the datasheet of node {verified.uuid.hex()}: {failed[_PAGES].why}.",
             hint="To get them: teds-provision registry sync",
         )
     if verified.verdict == "unproven":
         raise unproven(verified.uuid, failed[_SESSION].why)
     told = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
-    raise BadDatasheet(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
+    raise BadDatasheetError(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
 
 
 def _check(name: str, holds: bool, why: str, good: str = "") -> Check:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision import teds
-from teds_provision.errors import BadData, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
@@ -146,7 +146,7 @@ def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
     octets = 0
     for path in paths:
         try:
-            text = read_limited(path, LIMITS.teds_file, "image", failure=BadData)
+            text = read_limited(path, LIMITS.teds_file, "image", failure=BadDataError)
             octets += len(text)
             some.append((path, security.require_our_wire(Image.from_json(text))))
         except TedsProvisionError as error:
@@ -186,7 +186,7 @@ def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
     texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
     harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]
     whole = FileVerdict(result.path, result.uuid, result.verdict, result.checks, texts)
-    return _ended(whole, PolicyRefused(f"The calibration is refused: {harmful[0]}.")) if harmful else whole
+    return _ended(whole, PolicyError(f"The calibration is refused: {harmful[0]}.")) if harmful else whole
 
 
 def _ended(result: FileVerdict, error: TedsProvisionError) -> FileVerdict:

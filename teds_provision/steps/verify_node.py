@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from hashlib import sha256
 
-from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic
+from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps import reading
@@ -39,7 +39,7 @@ class Looked:
 
 
 def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
-    """Open a session where a key is held, read every TEDS and judge them; raises LinkFailure and what a read raises.
+    """Open a session where a key is held, read every TEDS and judge them; raises LinkError and what a read raises.
 
     One in which the node answers nothing but that it is busy is as good as none: then all is read without it.
     """
@@ -47,7 +47,7 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
     c = node.c
     try:
         image = read_image(node)
-    except NodeRefused as refusal:
+    except NodeRefusedError as refusal:
         if not (node.sealed and refusal.message.startswith(HEARD)):
             raise
         node.forget()
@@ -56,7 +56,7 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
 
 
 def look_in_session(station: Station, node: Conversation, *, by: str) -> Looked:
-    """Judge the TEDS of a node in the session that is open. Raises LinkFailure, NodeRefused.
+    """Judge the TEDS of a node in the session that is open. Raises LinkError, NodeRefusedError.
 
     Where its Security TEDS is octet for octet the one that was read before, and nothing spoke against the rest then,
     the rest is not read again here: it names the digest of every other TEDS. c of the session tells whether the node
@@ -78,11 +78,11 @@ def look_in_session(station: Station, node: Conversation, *, by: str) -> Looked:
 def open_or_say_why(station: Station, node: Conversation) -> str:
     """Open a session where a key is held; why there is none although one is held, else an empty text.
 
-    Raises LinkFailure, and NodeRefused for a refusal in the session.
+    Raises LinkError, and NodeRefusedError for a refusal in the session.
     """
     try:
         held = session_if_keyed(station, node)
-    except NodeRefused as refusal:
+    except NodeRefusedError as refusal:
         if node.sealed:
             raise
         return _why(refusal)
@@ -92,7 +92,7 @@ def open_or_say_why(station: Station, node: Conversation) -> str:
     return ""
 
 
-def _why(refusal: NodeRefused) -> str:
+def _why(refusal: NodeRefusedError) -> str:
     return refusal.message.removeprefix(HEARD).rstrip(".")
 
 
@@ -163,7 +163,7 @@ def vouched(node: Conversation, point: bytes, why: str) -> Check:
     if why and node.identity.state == NodeState.FACTORY:
         try:
             proof_of_reset(node, point)
-        except (NotAuthentic, NodeRefused, LinkFailure):
+        except (NotAuthenticError, NodeRefusedError, LinkError):
             return session("", f"{why}, and it did not prove that it was reset")
         return session("the node signed that it was reset: it no longer has the key held here", "")
     return session("", why)

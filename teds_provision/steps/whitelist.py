@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import BadData, OtherKey, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, KeyMismatchError, PolicyError, UsageError
 from teds_provision.files import read_text
 from teds_provision.limits import check_count, load_json
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
@@ -72,7 +72,7 @@ class _Reading:
         """Take one entry in, or note what is wrong with it."""
         self.count += 1
         if self.count > MAX_ENTRIES:
-            raise BadData(f"{self.file}:{line}: there are more than {MAX_ENTRIES} entries.")
+            raise BadDataError(f"{self.file}:{line}: there are more than {MAX_ENTRIES} entries.")
         before = len(self.mistakes)
         uuid = self._digits(line, "uuid", uuid_of_eui64(values.get("uuid", "")), _UUID_DIGITS)
         print_text = values.get("fingerprint", "").strip()
@@ -120,11 +120,11 @@ def uuid_of_eui64(text: str) -> str:
 def read_whitelist(path: Path, form: str | None = None) -> list[ListedNode]:
     """Read a whitelist file; the format is ``form``, else the file's extension, else what its content looks like.
 
-    Raises NotFound, or BadData that names file, line and field of every mistake (the first ten in full).
+    Raises NotFoundError, or BadDataError that names file, line and field of every mistake (the first ten in full).
     """
     text = read_text(path, MAX_FILE_OCTETS, "whitelist")
     if not text.strip():
-        raise BadData(f"{path} is empty.", hint="Supported: XML, CSV (with column names in line 1) and JSON.")
+        raise BadDataError(f"{path} is empty.", hint="Supported: XML, CSV (with column names in line 1) and JSON.")
     form = form or _form_of(path, text)
     reading = _Reading(str(path))
     readers: dict[str, Callable[[str, _Reading], None]] = {"xml": _read_xml, "csv": _read_csv, "json": _read_json}
@@ -132,7 +132,7 @@ def read_whitelist(path: Path, form: str | None = None) -> list[ListedNode]:
     if reading.mistakes:
         shown = "; ".join(reading.mistakes[:_SHOWN_MISTAKES])
         more = len(reading.mistakes) - _SHOWN_MISTAKES
-        raise BadData(
+        raise BadDataError(
             f"{shown}{f'; and {more} more' if more > 0 else ''}.",
             hint="Nothing was imported. Fix these lines and import again.",
         )
@@ -140,9 +140,9 @@ def read_whitelist(path: Path, form: str | None = None) -> list[ListedNode]:
 
 
 def require_name(name: str | None) -> None:
-    """Raise BadData for what cannot be a node's name."""
+    """Raise BadDataError for what cannot be a node's name."""
     if not _is_name(name):
-        raise BadData(f"{_NAME_RULE[0].upper()}{_NAME_RULE[1:]}.")
+        raise BadDataError(f"{_NAME_RULE[0].upper()}{_NAME_RULE[1:]}.")
 
 
 def _is_name(name: str | None) -> bool:
@@ -200,7 +200,7 @@ def _read_xml(text: str, reading: _Reading) -> None:
 
         def startElement(self, name: str, attrs: Any) -> None:
             if len(self.open) >= _MAX_DEPTH:
-                raise BadData(f"{reading.file}:{parser.getLineNumber()}: elements are nested too deeply.")
+                raise BadDataError(f"{reading.file}:{parser.getLineNumber()}: elements are nested too deeply.")
             fields = {_field_name(key): value for key, value in attrs.items()}
             self.open.append(_Element(_field_name(name), parser.getLineNumber(), fields))
 
@@ -219,23 +219,23 @@ def _read_xml(text: str, reading: _Reading) -> None:
     try:
         parser.parse(io.StringIO(text))
     except DefusedXmlException as error:
-        raise BadData(
+        raise BadDataError(
             f"{reading.file}: the XML has a DTD or entities, which are not allowed.", hint="Remove the DOCTYPE."
         ) from error
     except SAXParseException as error:
-        raise BadData(f"{reading.file}:{error.getLineNumber()}: this is not XML: {error.getMessage()}.") from error
+        raise BadDataError(f"{reading.file}:{error.getLineNumber()}: this is not XML: {error.getMessage()}.") from error
     except SAXException as error:
-        raise BadData(f"{reading.file}: this is not XML: {error.getMessage()}.") from error
+        raise BadDataError(f"{reading.file}: this is not XML: {error.getMessage()}.") from error
 
 
 def _refuse_long(text: str, separator: str, file: str, what: str) -> None:
-    """Raise BadData where two separators are too far apart; linear in the text, which no regex of a count is."""
+    """Raise BadDataError where two separators are too far apart; linear in the text, which no regex of a count is."""
     at = 0
     while at < len(text):
         end = text.find(separator, at, at + _MAX_TAG)
         if end < 0 and at + _MAX_TAG <= len(text):
             line = text.count("\n", 0, at) + 1
-            raise BadData(f"{file}:{line}: {what} of more than {_MAX_TAG} characters.")
+            raise BadDataError(f"{file}:{line}: {what} of more than {_MAX_TAG} characters.")
         at = end + 1 if end >= 0 else len(text)
 
 
@@ -323,7 +323,7 @@ def _read_csv(text: str, reading: _Reading) -> None:
                 continue
             reading.add(rows.line_num, dict(zip(columns, cells, strict=False)))
     except csv.Error as error:
-        raise BadData(f"{reading.file}:{rows.line_num}: this is not CSV: {error}.") from error
+        raise BadDataError(f"{reading.file}:{rows.line_num}: this is not CSV: {error}.") from error
 
 
 # -- JSON --------------------------------------------------------------------------------------------------------------
@@ -333,7 +333,7 @@ def _read_json(text: str, reading: _Reading) -> None:
     value = load_json(text, "the whitelist", octets=MAX_FILE_OCTETS, file=reading.file)
     listed = value.get("whitelist") if isinstance(value, dict) else value
     if not isinstance(listed, list):
-        raise BadData(f'{reading.file}:1: whitelist: expected a list, or an object with "whitelist": […].')
+        raise BadDataError(f'{reading.file}:1: whitelist: expected a list, or an object with "whitelist": […].')
     for line, item in _with_lines(text, inside=isinstance(value, dict)):
         if isinstance(item, str):
             reading.add(line, {"uuid": item})
@@ -397,13 +397,14 @@ class WhitelistPlan:
 def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPlan:
     """Hold entries against what is known; changes nothing.
 
-    Raises OtherKey where a UUID is pinned to another key, PolicyRefused for a revoked node: then none may be added.
+    Raises KeyMismatchError where a UUID is pinned to another key, PolicyError for a revoked node: then none may be
+    added.
     """
     revoked = {one.uuid: one.why for one in station.policy.revocations()}
     uuids = [entry.uuid for entry in listed if entry.uuid in revoked]
     if uuids:
         shown = ", ".join(f"{uuid.hex()} ({revoked[uuid]})" for uuid in uuids[:_SHOWN])
-        raise PolicyRefused(f"Revoked nodes cannot be whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
+        raise PolicyError(f"Revoked nodes cannot be whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[ListedNode, str]] = []
     new = 0
@@ -445,7 +446,7 @@ def _refuse_conflicts(conflicts: list[tuple[ListedNode, str]]) -> None:
             for entry, pin in conflicts[:_SHOWN]
         )
         first = conflicts[0][0].uuid.hex()
-        raise OtherKey(
+        raise KeyMismatchError(
             f"{shown}{_more(conflicts)}.",
             hint=f"Nothing was added. If a board was really replaced: teds-provision whitelist remove {first}",
         )
@@ -500,12 +501,12 @@ def as_dict(entry: WhitelistEntry) -> dict[str, Any]:
 
 
 def form_of(path: Path, form: str | None) -> str:
-    """Format to write: ``form``, else by extension, else XML; raises UsageFailure for an extension that is none."""
+    """Format to write: ``form``, else by extension, else XML; raises UsageError for an extension that is none."""
     suffix = path.suffix.lower().removeprefix(".")
     if form is not None or suffix in FORMATS:
         return form or suffix
     if suffix:
-        raise UsageFailure(f"Cannot tell the format from the name {path.name}.", hint="Add --format xml, csv or json.")
+        raise UsageError(f"Cannot tell the format from the name {path.name}.", hint="Add --format xml, csv or json.")
     return "xml"
 
 

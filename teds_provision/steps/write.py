@@ -15,7 +15,14 @@ from pathlib import PurePath
 from types import MappingProxyType
 from typing import Final
 
-from teds_provision.errors import BadData, Garbled, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
+from teds_provision.errors import (
+    BadDataError,
+    GarbledError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    PolicyError,
+)
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
 from teds_provision.protocol.messages.identity import Identity, NodeState
@@ -26,7 +33,7 @@ from teds_provision.steps.reading import is_known, keep, keep_read
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.verify import known_of
 from teds_provision.store import NodeRecord
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId, Image
@@ -44,8 +51,8 @@ Low = Callable[[str], object]
 
 
 def wait_for_charge(question: str) -> None:
-    """The answer where nobody was asked: no. Raises PolicyRefused."""
-    raise PolicyRefused(
+    """The answer where nobody was asked: no. Raises PolicyError."""
+    raise PolicyError(
         question.removesuffix(" Write it?"), hint="Charge it first (leave it on the reader), or add --yes."
     )
 
@@ -73,15 +80,15 @@ def write(
     """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
 
     ``present`` is what the node was read to hold in this session: blocks that are the same are not sent again.
-    ``facts`` are remembered of the node once it is written. Raises NodeRefused with the node's reason, PolicyRefused
+    ``facts`` are remembered of the node once it is written. Raises NodeRefusedError with the node's reason, PolicyError
     where the image is older than what the node has, or so far ahead that more than one step of 65,536 would be needed
     and no person said so (``jump``): that uses up the sequence of the node for good; where ``low`` is not content with
-    the node's charge. NotAuthentic where the read-back differs.
+    the node's charge. NotAuthenticError where the read-back differs.
     """
     started = time.monotonic()
     signed = security.decode(image.blocks[SECURITY])
     if not signed.signed:
-        raise BadData("The image is not signed.", hint="Sign it first: teds-provision sign UUID")
+        raise BadDataError("The image is not signed.", hint="Sign it first: teds-provision sign UUID")
     has = present.image if present is not None else None
     if (has.security if has is not None else read_block(node, SECURITY)) == image.security:
         has = has or read_image(node)
@@ -135,7 +142,7 @@ def _conclude(
     octets: int,
     sequence: int,
 ) -> None:
-    """Record what was read back, and whether it is what was written; raises NotAuthentic where it is not."""
+    """Record what was read back, and whether it is what was written; raises NotAuthenticError where it is not."""
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
 
     identity, profile = node.proven, facts.get("profile")
@@ -159,7 +166,7 @@ def _conclude(
     station.behind(record)  # whoever verifies next has the node prove its key meanwhile
     if differing:
         channel, access_code = differing[0]
-        raise NotAuthentic(
+        raise NotAuthenticError(
             f"TEDS {access_code} of channel {channel} reads back differently from what was written.",
             hint="Try again. If the error persists, the board's flash is defective.",
         )
@@ -182,7 +189,7 @@ def _percent(node: Conversation) -> int | None:
         return None
     try:
         power = Power.decode(node.ask(POWER, "to tell its charge"))
-    except (NodeRefused, BadData):
+    except (NodeRefusedError, BadDataError):
         return None  # it has no battery, or does not measure
     return power.level if power.flags & PowerFlag.BATTERY else None
 
@@ -197,17 +204,17 @@ def _again(station: Station, uuid: bytes) -> str:
 
 def _require_newer(station: Station, uuid: bytes, signed: SecurityTeds, identity: Identity, *, jump: bool) -> None:
     if signed.sequence <= identity.sequence:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The image has sequence {signed.sequence}; the node is already at {identity.sequence}.",
             hint=_again(station, uuid),
         )
     if signed.key_epoch != identity.epoch:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The image was signed for key epoch {signed.key_epoch}; the node is at {identity.epoch}.",
             hint=_again(station, uuid),
         )
     if signed.sequence > identity.sequence + SEQUENCE_WINDOW and not jump:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The image has sequence {signed.sequence}, far ahead of the node's {identity.sequence}: earlier"
             " data about this node may have been forged.",
             hint=f"{_again(station, uuid)}. Or, if you know why: write UUID --sequence-jump --yes",
@@ -220,21 +227,21 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
     for _ in range(_STARTS - 1):
         try:
             return _stage_and_commit(station, node, image, skip, progress)
-        except NodeRefused as refusal:
+        except NodeRefusedError as refusal:
             if refusal.reason != Reason.DIGEST_MISMATCH or not skip:
                 raise
             skip = set()  # the node does not hold what it was last read to hold: send everything
             continue
-        except (NodeSilent, Garbled):
+        except (NodeSilentError, GarbledError):
             if not node.lives():
                 raise
-        except SessionLost:
+        except SessionLostError:
             pass  # the new session below tells whether only the reply was lost
         if _is_there(node, image):
             return 0
     try:
         return _stage_and_commit(station, node, image, skip, progress)
-    except SessionLost as lost:
+    except SessionLostError as lost:
         raise lost.cause from lost
 
 
@@ -280,7 +287,7 @@ def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId
             part = teds[offset : offset + piece]
             try:
                 node.send(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
-            except (NodeSilent, Garbled):
+            except (NodeSilentError, GarbledError):
                 losses += 1
                 if losses > _LOSSES or not node.lives():
                     raise

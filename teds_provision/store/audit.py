@@ -108,7 +108,7 @@ class AuditLog:
         self._root = hashlib.sha256(b"TEDS1 audit\0" + store_id.encode()).digest()
 
     def append(self, act: str, uuid: bytes | None, outcome: str, detail: Mapping[str, Any] | None = None) -> None:
-        """Add one entry; ``detail`` holds JSON values only and never a secret. Raises StoreFailure."""
+        """Add one entry; ``detail`` holds JSON values only and never a secret. Raises StoreError."""
         text = _encode(dict(detail or {}))
         with self._database.together():
             last = self._database.one(_END)
@@ -121,11 +121,11 @@ class AuditLog:
             self._remember(count + 1, head)
 
     def entries(self, after: int = 0) -> Iterator[AuditEntry]:
-        """Give the entries numbered above ``after``, oldest first; raises StoreFailure."""
+        """Give the entries numbered above ``after``, oldest first; raises StoreError."""
         return self._database.stream(_entry, _PAGE_OF_ENTRIES, after)
 
     def chosen(self, choice: Choice, after: int = 0) -> Iterator[AuditEntry]:
-        """Give the entries numbered above ``after`` that are meant, oldest first; raises StoreFailure."""
+        """Give the entries numbered above ``after`` that are meant, oldest first; raises StoreError."""
         terms = _terms(choice)
         statement = f"SELECT * FROM audit WHERE seq > ?{terms} ORDER BY seq LIMIT ?"
         return self._database.stream(_entry, statement, after)
@@ -163,7 +163,7 @@ class AuditLog:
         return int(end[0]) if end is not None else 0
 
     def check(self, after: int = 0) -> AuditVerdict:
-        """Recompute the chain from entry ``after`` on (0: the whole of it); raises StoreFailure for an unreadable file.
+        """Recompute the chain from entry ``after`` on (0: the whole of it); raises StoreError for an unreadable file.
 
         From the middle on it says that what stands there was not changed since the entry before was as it is.
         """

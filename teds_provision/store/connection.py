@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from teds_provision.errors import BadData, StoreFailure, StoreLocked, TedsProvisionError
+from teds_provision.errors import BadDataError, StoreError, StoreLockedError, TedsProvisionError
 from teds_provision.lazy import late
 from teds_provision.store.behind import Behind
 
@@ -61,28 +61,28 @@ _OS_CAUSES: dict[int, tuple[str, str]] = {
 }
 
 
-def as_store_failure(error: sqlite3.Error | OSError, path: Path) -> StoreFailure:
+def as_store_failure(error: sqlite3.Error | OSError, path: Path) -> StoreError:
     """Say in the words of the tool why SQLite or the system refused; cause and cure, no octet of the contents."""
     if isinstance(error, OSError):
         cause, cure = _OS_CAUSES.get(error.errno or 0, (error.strerror or type(error).__name__, "Check that path."))
-        return StoreFailure(f"The store {path} cannot be used: {cause}.", hint=cure)
+        return StoreError(f"The store {path} cannot be used: {cause}.", hint=cure)
     primary = getattr(error, "sqlite_errorcode", 0) & 0xFF
     if primary in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-        return StoreLocked(
+        return StoreLockedError(
             f"The store {path} was kept busy by another process for {BUSY_SECONDS:.0f} s.",
             hint="Wait until the other command has ended, then run this one again.",
         )
     cause, cure = _CAUSES.get(primary, (f"SQLite says: {error}", "Run teds-provision doctor."))
-    return StoreFailure(f"The store {path} cannot be used: {cause}.", hint=cure)
+    return StoreError(f"The store {path} cannot be used: {cause}.", hint=cure)
 
 
-def damaged(path: Path) -> StoreFailure:
+def damaged(path: Path) -> StoreError:
     """The error for a file that holds what this tool never wrote."""
     cause, cure = _CAUSES[_SQLITE_CORRUPT]
-    return StoreFailure(f"The store {path} cannot be used: {cause}.", hint=cure)
+    return StoreError(f"The store {path} cannot be used: {cause}.", hint=cure)
 
 
-def is_no_place_to_write(failure: StoreFailure) -> bool:
+def is_no_place_to_write(failure: StoreError) -> bool:
     """Whether a store could not be opened because nothing can be written where it lies."""
     cause = failure.__cause__
     if isinstance(cause, OSError):
@@ -91,9 +91,9 @@ def is_no_place_to_write(failure: StoreFailure) -> bool:
     return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in refused
 
 
-def too_old(what: str, version: int) -> StoreFailure:
+def too_old(what: str, version: int) -> StoreError:
     """The error for a store, or the store in a backup (``what``), of a schema before KeyAgreement 2."""
-    return StoreFailure(
+    return StoreError(
         f"{what} is of schema {version}, from before KeyAgreement 2, which nodes no longer support.",
         hint="That version was never released. Choose another --home, run init there, and provision the nodes again.",
     )
@@ -125,11 +125,11 @@ class Connection:
         """By thread: the run that has a step taken behind its back, for which its next statement waits."""
         self.notice: Callable[[str], object] | None = None
         """Told, in a sentence, what a change of the store waits for."""
-        self._frozen: StoreFailure | None = None
+        self._frozen: StoreError | None = None
         """Why nothing can be written; what is read then comes from a private copy."""
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """Run one statement and return all its rows; raises StoreFailure."""
+        """Run one statement and return all its rows; raises StoreError."""
         if self.behind:
             self.in_order()
         with self._lock:
@@ -147,16 +147,16 @@ class Connection:
             behind.wait()
 
     def add(self, statement: str, values: Sequence[Any] = ()) -> None:
-        """Run an INSERT of one new row: the transaction around it is sure to write to the disk; raises StoreFailure."""
+        """Run an INSERT of one new row: the transaction around it is sure to write to the disk; raises StoreError."""
         self.execute(statement, values)
         self._added = True
 
     def change(self, statement: str, values: Sequence[Any] = ()) -> int:
-        """Run one statement and return how many rows it changed; raises StoreFailure."""
+        """Run one statement and return how many rows it changed; raises StoreError."""
         return self._run(lambda: self._connection.execute(statement, values).rowcount)
 
     def execute_many(self, statement: str, rows: Iterable[Sequence[Any]]) -> None:
-        """Run one statement with each row of values, all or none; raises StoreFailure."""
+        """Run one statement with each row of values, all or none; raises StoreError."""
         with self.together(), self._translated():
             self._connection.executemany(statement, rows)
 
@@ -237,14 +237,14 @@ class Connection:
         """All or nothing, as :meth:`transaction`; inside another one a part of it, without a savepoint of its own.
 
         What fails in it after a change takes the whole with it: where that error is caught and the rest goes on, the
-        end undoes everything and raises StoreFailure.
+        end undoes everything and raises StoreError.
         """
         return Transaction(self, apart=False)
 
     def settle(self, through: int | None = None) -> None:
         """Wait until all commits, or the first ``through`` of those that did not wait, are on the disk.
 
-        Raises StoreFailure.
+        Raises StoreError.
         """
         self.in_order()
         with self._lock:
@@ -295,7 +295,7 @@ class Connection:
         self._steady, self._added = None, False
 
     def leave(self, block: Transaction, *, failed: bool) -> None:
-        """End a block; for :class:`Transaction` alone. Raises StoreFailure where it cannot be kept."""
+        """End a block; for :class:`Transaction` alone. Raises StoreError where it cannot be kept."""
         try:
             if failed:
                 self._undo(block)
@@ -317,7 +317,7 @@ class Connection:
 
     def _conclude(self, block: Transaction) -> None:
         if self._spoilt and not block.spoilt and (block.apart or block.level == 0):
-            raise StoreFailure("Part of this change failed, so all of it was undone.", hint="Run it again.")
+            raise StoreError("Part of this change failed, so all of it was undone.", hint="Run it again.")
         if block.level == 0:
             self.execute("COMMIT")
             if self._added and not block.later:  # the log, and all that was written to it before, is on the disk
@@ -337,7 +337,7 @@ class Connection:
                 self._connection.execute(statement)
         self._spoilt = block.spoilt
 
-    def _damaged(self) -> StoreFailure:
+    def _damaged(self) -> StoreError:
         return damaged(self.path)
 
     @contextmanager
@@ -355,7 +355,7 @@ class Connection:
             if self._frozen is not None and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY:
                 return self._frozen
             return as_store_failure(error, self.path)
-        return BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.")  # from a command line
+        return BadDataError("A name or text is not valid UTF-8.", hint="Give it in UTF-8.")  # from a command line
 
 
 class Transaction:

@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from teds_provision.errors import StoreFailure, StoreLocked
+from teds_provision.errors import StoreError, StoreLockedError
 from teds_provision.lazy import late
 from teds_provision.store.connection import (
     BUSY_SECONDS,
@@ -55,18 +55,16 @@ def prepare_home(home: Path, *, create: bool) -> None:
     try:
         status = home.stat()
     except FileNotFoundError:
-        raise StoreFailure(f"There is no store in {home}.", hint="Run teds-provision init.") from None
+        raise StoreError(f"There is no store in {home}.", hint="Run teds-provision init.") from None
     if not stat.S_ISDIR(status.st_mode):
-        raise StoreFailure(f"{home} is not a directory.", hint="Choose another --home.")
+        raise StoreError(f"{home} is not a directory.", hint="Choose another --home.")
     if status.st_uid != os.geteuid():
-        raise StoreFailure(f"{home} belongs to another user.", hint="Run this as its owner, or choose another --home.")
+        raise StoreError(f"{home} belongs to another user.", hint="Run this as its owner, or choose another --home.")
     private = not status.st_mode & 0o077
     if create and not private and not any(home.iterdir()):
         home.chmod(0o700)
     elif status.st_mode & 0o022:
-        raise StoreFailure(
-            f"Other users can write to {home}.", hint=f"Run: chmod 700 {home}, or choose another --home."
-        )
+        raise StoreError(f"Other users can write to {home}.", hint=f"Run: chmod 700 {home}, or choose another --home.")
 
 
 def prepare_file(path: Path, *, create: bool) -> None:
@@ -77,7 +75,7 @@ def prepare_file(path: Path, *, create: bool) -> None:
     for file in (path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")):
         _require_own(file)
     if not path.exists():
-        raise StoreFailure(f"There is no store in {path.parent}.", hint="Run teds-provision init.")
+        raise StoreError(f"There is no store in {path.parent}.", hint="Run teds-provision init.")
     if path.stat().st_mode & 0o077:
         with suppress(OSError):  # a disk that is read-only: what is read stays as open as it was
             path.chmod(0o600)
@@ -91,7 +89,7 @@ def _require_own(file: Path) -> None:
         return
     if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
         what = "a link" if stat.S_ISLNK(status.st_mode) else "not owned by this user"
-        raise StoreFailure(f"{file} is {what}.", hint="It was put there by somebody else: check it and move it away.")
+        raise StoreError(f"{file} is {what}.", hint="It was put there by somebody else: check it and move it away.")
 
 
 PAGE = 500
@@ -117,7 +115,7 @@ class Database(Connection):
     def open(cls, home: Path, *, create: bool) -> Database:
         """Open ``home``/store.sqlite3, making it (0600, in a directory of 0700) if ``create``.
 
-        Raises StoreFailure: missing, damaged, of a newer version, foreign, no permission, no space.
+        Raises StoreError: missing, damaged, of a newer version, foreign, no permission, no space.
         """
         path = home / FILE_NAME
         try:
@@ -127,7 +125,7 @@ class Database(Connection):
             raise as_store_failure(error, path) from error
         try:
             return cls._opened(path, create=create)
-        except StoreFailure as failure:
+        except StoreError as failure:
             if create or not is_no_place_to_write(failure):
                 raise
             return cls._read_only(path, failure)
@@ -147,7 +145,7 @@ class Database(Connection):
         return database
 
     @classmethod
-    def _read_only(cls, path: Path, failure: StoreFailure) -> Database:
+    def _read_only(cls, path: Path, failure: StoreError) -> Database:
         """Open a private copy to be read; whatever would change it raises why the store itself cannot be written."""
         try:
             connection = open_copy(path)
@@ -164,7 +162,7 @@ class Database(Connection):
         return database
 
     @property
-    def frozen(self) -> StoreFailure | None:
+    def frozen(self) -> StoreError | None:
         """Why nothing can be written (the disk is full or read-only), None where it can."""
         return self._frozen
 
@@ -174,12 +172,12 @@ class Database(Connection):
             self._connection.close()
 
     def one(self, statement: str, values: Sequence[Any] = ()) -> tuple[Any, ...] | None:
-        """Return the first row, None if there is none; raises StoreFailure."""
+        """Return the first row, None if there is none; raises StoreError."""
         rows = self.execute(statement, values)
         return rows[0] if rows else None
 
     def read(self, make: Callable[..., _Record], statement: str, values: Sequence[Any] = ()) -> list[_Record]:
-        """Make a record of every row; raises StoreFailure, also where a damaged row makes no record."""
+        """Make a record of every row; raises StoreError, also where a damaged row makes no record."""
         rows = self.execute(statement, values)
         try:
             return [make(*row) for row in rows]
@@ -210,7 +208,7 @@ class Database(Connection):
             return records
 
     def stream(self, make: Callable[..., _Record], statement: str, after: int = 0) -> Iterator[_Record]:
-        """Make records a page at a time, holding no lock between pages; raises StoreFailure.
+        """Make records a page at a time, holding no lock between pages; raises StoreError.
 
         The statement has two marks, for the number to go on after and for the page's length, and its first column is
         that number, growing.
@@ -227,7 +225,7 @@ class Database(Connection):
                 yield record
 
     def set_up(self, *, create: bool) -> None:
-        """Bring a connection into order: its journal, its schema, its pragmas. Raises StoreFailure."""
+        """Bring a connection into order: its journal, its schema, its pragmas. Raises StoreError."""
         self._check_version(create=create)
         self._write_ahead()
         self._bring_in_order(create=create)
@@ -235,7 +233,7 @@ class Database(Connection):
     def _check_version(self, *, create: bool) -> int:
         version = self._version()
         if version == 0 and not create:
-            raise StoreFailure(f"The store {self.path} is empty.", hint="Run teds-provision init.")
+            raise StoreError(f"The store {self.path} is empty.", hint="Run teds-provision init.")
         return version
 
     def _bring_in_order(self, *, create: bool) -> None:
@@ -260,7 +258,7 @@ class Database(Connection):
         while True:
             try:
                 self.execute("PRAGMA journal_mode=WAL")
-            except StoreLocked:
+            except StoreLockedError:
                 if time.monotonic() >= until:
                     raise
                 time.sleep(0.01)
@@ -271,11 +269,11 @@ class Database(Connection):
         (mark,), (version,) = self.execute("PRAGMA application_id")[0], self.execute("PRAGMA user_version")[0]
         tables = self.execute("SELECT count(*) FROM sqlite_schema")[0][0]
         if (version or tables) and mark != APPLICATION_ID:
-            raise StoreFailure(f"{self.path} is a database of another program.", hint="Choose another --home.")
+            raise StoreError(f"{self.path} is a database of another program.", hint="Choose another --home.")
         if 0 < version < OLDEST_SCHEMA:
             raise too_old(f"The store {self.path}", version)
         if version > SCHEMA_VERSION:
-            raise StoreFailure(
+            raise StoreError(
                 f"The store {self.path} has schema {version}; this version of the tool knows up to {SCHEMA_VERSION}.",
                 hint="Use the newer version of teds-provision that made it.",
             )

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from teds_provision.errors import BadData, StoreFailure
+from teds_provision.errors import BadDataError, StoreError
 from teds_provision.lazy import late
 from teds_provision.store.connection import too_old
 from teds_provision.store.database import PAGE, places
@@ -51,7 +51,7 @@ class RowSource(Protocol):
 def dump(store: Store) -> Iterator[bytes]:
     """Give the store as it is at one moment, a few hundred rows at a time; others may read and write meanwhile.
 
-    Raises StoreFailure.
+    Raises StoreError.
     """
     database = store._database
     with database._lock, database._translated():
@@ -74,7 +74,7 @@ def dump(store: Store) -> Iterator[bytes]:
 def load(source: RowSource) -> Store:
     """Make a store of a dump, in a private database that SQLite keeps in memory or in an unnamed temporary file.
 
-    An older schema is brought forward. Raises BadData (form, unknown tables, rows that break a rule), StoreFailure.
+    An older schema is brought forward. Raises BadDataError (form, unknown tables, rows that break a rule), StoreError.
     """
     connection = sqlite3.connect("", isolation_level=None, check_same_thread=False)
     try:
@@ -83,13 +83,13 @@ def load(source: RowSource) -> Store:
         _fill(connection, source)
         store = Store.of_backup(connection)
         if connection.execute("PRAGMA foreign_key_check").fetchone():
-            raise BadData("The store in the backup is damaged.")
+            raise BadDataError("The store in the backup is damaged.")
     except (sqlite3.IntegrityError, sqlite3.DataError, UnicodeDecodeError) as error:
         connection.close()
-        raise BadData("The store in the backup breaks a rule of its own tables.") from error
+        raise BadDataError("The store in the backup breaks a rule of its own tables.") from error
     except sqlite3.Error as error:
         connection.close()
-        raise StoreFailure(
+        raise StoreError(
             f"The backup cannot be unpacked: {error}.", hint="Free some space in the folder for temporary files."
         ) from error
     except BaseException:
@@ -112,7 +112,7 @@ def _fill(connection: sqlite3.Connection, source: RowSource) -> None:
     known = _tables(connection)
     for table, columns in tables.items():
         if known.get(table) != columns:
-            raise BadData(f"The store in the backup has an unknown table {table}.")
+            raise BadDataError(f"The store in the backup has an unknown table {table}.")
     for table in known:
         connection.execute(f"DELETE FROM {table}")  # what a schema begins with; the dump brings it as it became
     inserts = [f"INSERT INTO {table} VALUES({places(columns)})" for table, columns in tables.items()]
@@ -130,13 +130,13 @@ def _head(source: RowSource) -> tuple[int, dict[str, list[str]]]:
         version, tables = head["schema"], head["tables"]
         whole = type(version) is int and all(_is_table(name, columns) for name, columns in tables.items())
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise BadData("The backup holds no store.") from None
+        raise BadDataError("The backup holds no store.") from None
     if not whole or version < 1 or len(tables) >= _END:
-        raise BadData("The backup holds no store.")
+        raise BadDataError("The backup holds no store.")
     if version < OLDEST_SCHEMA:
         raise too_old("The store in the backup", version)
     if version > SCHEMA_VERSION:
-        raise StoreFailure(
+        raise StoreError(
             f"The store in the backup has schema {version}; this version of the tool knows up to {SCHEMA_VERSION}.",
             hint="Use the newer version of teds-provision that made it.",
         )
@@ -158,7 +158,7 @@ def _pages(source: RowSource, widths: list[int]) -> Iterator[tuple[int, list[tup
         if number == _END and length == 0:
             return
         if number >= len(widths) or length > MAX_RECORD_OCTETS:
-            raise BadData("A row of the store in the backup is damaged.")
+            raise BadDataError("A row of the store in the backup is damaged.")
         current = number
         page.append(_row(source.read(length), widths[number]))
 
@@ -166,7 +166,7 @@ def _pages(source: RowSource, widths: list[int]) -> Iterator[tuple[int, list[tup
 def _record(number: int, row: tuple[Any, ...]) -> bytes:
     body = b"".join(map(_value, row))
     if len(body) > MAX_RECORD_OCTETS:
-        raise StoreFailure("A row of the store is too large for a backup.", hint="Please report this.")
+        raise StoreError("A row of the store is too large for a backup.", hint="Please report this.")
     return _HEAD.pack(number, len(body)) + body
 
 
@@ -201,7 +201,7 @@ def _row(body: bytes, width: int) -> tuple[Any, ...]:
                 values.append(octets.decode() if kind == 2 else octets)
                 place += 5 + length
     except (struct.error, ValueError):
-        raise BadData("A row of the store in the backup is damaged.") from None
+        raise BadDataError("A row of the store in the backup is damaged.") from None
     if len(values) != width:
-        raise BadData("A row of the store in the backup is damaged.")
+        raise BadDataError("A row of the store in the backup is damaged.")
     return tuple(values)

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from teds_provision.errors import NodeBusy, StoreLocked
+from teds_provision.errors import NodeBusyError, StoreLockedError
 from teds_provision.store.connection import as_store_failure
 from teds_provision.store.records import utc_now
 
@@ -86,8 +86,8 @@ class _HeldFile(ABC):
 class StoreLock(_HeldFile):
     """``with StoreLock(home, command="provision"):`` holds the store of ``home`` for one command.
 
-    Waits up to ``wait`` seconds; ``notice`` is told once, in one sentence, whom it waits for. Raises StoreLocked after
-    that, StoreFailure where the file cannot be made. Not re-entrant: take it once, at the outside.
+    Waits up to ``wait`` seconds; ``notice`` is told once, in one sentence, whom it waits for. Raises StoreLockedError
+    after that, StoreError where the file cannot be made. Not re-entrant: take it once, at the outside.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class StoreLock(_HeldFile):
             waited = time.monotonic() - began
             if waited >= self._wait:
                 hint = "Wait for it to finish, or stop it."
-                raise StoreLocked(f"The store is locked by {_holder(descriptor)}.", hint=hint)
+                raise StoreLockedError(f"The store is locked by {_holder(descriptor)}.", hint=hint)
             if not told and waited >= _POLL_SECONDS and self._notice is not None:
                 self._notice(f"Waiting for the store, locked by {_holder(descriptor)}.")
                 told = True
@@ -137,9 +137,9 @@ class StoreLock(_HeldFile):
 class Mark(_HeldFile):
     """``with Mark(path, command="measure hand") as mark:`` something is taken, for as long as this process lives.
 
-    Does not wait: raises :class:`MarkTaken`, which names the holder. Several may hold it together where each takes it
-    as ``shared``. ``left_behind`` says that the one before had no time to put its mark away (it was killed, or the
-    power failed).
+    Does not wait: raises :class:`UsageLockTakenError`, which names the holder. Several may hold it together where each
+    takes it as ``shared``. ``left_behind`` says that the one before had no time to put its mark away (it was killed, or
+    the power failed).
     """
 
     def __init__(self, path: Path, *, command: str, shared: bool = False) -> None:
@@ -159,7 +159,7 @@ class Mark(_HeldFile):
             fcntl.flock(descriptor, (fcntl.LOCK_SH if self._shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = _holder(descriptor)
-            raise MarkTaken(f"It is locked by {holder}.", holder) from None
+            raise UsageLockTakenError(f"It is locked by {holder}.", holder) from None
         self.left_behind = bool(os.pread(descriptor, 1, 0))
         with suppress(OSError):  # as above
             os.ftruncate(descriptor, 0)
@@ -187,7 +187,7 @@ class Mark(_HeldFile):
         return _held_by(self._path, shared=True) is not None
 
 
-class MarkTaken(StoreLocked):
+class UsageLockTakenError(StoreLockedError):
     """Somebody else holds a :class:`Mark`; ``holder`` names the process."""
 
     def __init__(self, message: str, holder: str) -> None:
@@ -270,8 +270,8 @@ class _LockedOctet(_HeldFile):
 class NodeTurn(_LockedOctet):
     """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
 
-    Two nodes may share an octet: then they take turns, no more. Waits up to a minute; raises NodeBusy after that,
-    StoreFailure where the file cannot be made.
+    Two nodes may share an octet: then they take turns, no more. Waits up to a minute; raises NodeBusyError after that,
+    StoreError where the file cannot be made.
     """
 
     def __init__(self, home: Path, uuid: bytes, *, notice: Callable[[str], object] | None = None) -> None:
@@ -282,7 +282,7 @@ class NodeTurn(_LockedOctet):
         until, told = time.monotonic() + _TURN_SECONDS, False
         while not self._try_to_lock(descriptor):
             if time.monotonic() >= until:
-                raise NodeBusy(
+                raise NodeBusyError(
                     f"Another command of this station is using node {self._uuid.hex()}.",
                     hint="Wait for it to finish, or stop it.",
                 )
@@ -296,7 +296,7 @@ class OwnerLock(_LockedOctet):
     """``with OwnerLock(home, measurement_id):`` the command that owns a measurement lives.
 
     The kernel releases it when the command ends, also by kill -9, whichever process gets its process ID afterwards.
-    Raises StoreLocked if another command owns a measurement of this ID.
+    Raises StoreLockedError if another command owns a measurement of this ID.
     """
 
     def __init__(self, home: Path, measurement_id: str) -> None:
@@ -304,4 +304,4 @@ class OwnerLock(_LockedOctet):
 
     def _acquire(self, descriptor: int) -> None:
         if not self._try_to_lock(descriptor):
-            raise StoreLocked("Another command owns this measurement.", hint="Wait for it to finish, or stop it.")
+            raise StoreLockedError("Another command owns this measurement.", hint="Wait for it to finish, or stop it.")

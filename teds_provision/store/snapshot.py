@@ -8,7 +8,7 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.files import whole_draft
 from teds_provision.lazy import late
 from teds_provision.store.connection import as_store_failure
@@ -37,11 +37,11 @@ class Relation(Enum):
 def place(copy: Store, home: Path) -> None:
     """Make a copy the store of a home that has none: the whole file, or none. The caller holds the StoreLock.
 
-    Raises StoreFailure: a store is there already, or it cannot be written.
+    Raises StoreError: a store is there already, or it cannot be written.
     """
     path = home / FILE_NAME
     if path.exists():
-        raise StoreFailure(f"There is a store in {home} already.", hint="Restore into another --home.")
+        raise StoreError(f"There is a store in {home} already.", hint="Restore into another --home.")
     try:
         with whole_draft(path, replace=False) as (draft, _):
             with closing(sqlite3.connect(draft)) as target, copy._database._lock, copy._database._translated():
@@ -60,7 +60,7 @@ def totals(store: Store) -> dict[str, int]:
 
 
 def set_aside(home: Path) -> Path:
-    """Give a damaged store another name, with its log, and return it. Raises StoreFailure."""
+    """Give a damaged store another name, with its log, and return it. Raises StoreError."""
     path = home / FILE_NAME
     name = f"{FILE_NAME}.damaged-{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}"
     try:
@@ -72,7 +72,7 @@ def set_aside(home: Path) -> Path:
     return path.with_name(name)
 
 
-def is_damage(failure: StoreFailure) -> bool:
+def is_damage(failure: StoreError) -> bool:
     """Say whether a store could not be used because its file is damaged (and not locked, newer or unreadable)."""
     cause = failure.__cause__
     return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGE

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal
 
-from teds_provision.errors import BadData, StoreFailure
+from teds_provision.errors import BadDataError, StoreError
 from teds_provision.store.audit import AuditLog
 from teds_provision.store.behind import Behind
 from teds_provision.store.database import FILE_NAME, Database
@@ -45,8 +45,8 @@ class Store(
 ):
     """Whitelist, nodes, wrapped keys, datasheets, drafts, trust, handovers, groups and the audit log of one station.
 
-    Every method is durable when it returns, and all of them raise StoreFailure (or StoreLocked) where the file cannot
-    give or take what they ask. Several processes may have it open; a command that changes it holds a StoreLock.
+    Every method is durable when it returns, and all of them raise StoreError (or StoreLockedError) where the file
+    cannot give or take what they ask. Several processes may have it open; a command that changes it holds a StoreLock.
     """
 
     id: str
@@ -60,7 +60,7 @@ class Store(
     def open(cls, home: Path, *, create: bool = False) -> Store:
         """Open the store of ``home``; ``create`` makes it (and the directory) where it is missing.
 
-        Raises StoreFailure: missing, damaged, of a newer version, not ours, no permission, no space.
+        Raises StoreError: missing, damaged, of a newer version, not ours, no permission, no space.
         """
         database = Database.open(home, create=create)
         try:
@@ -73,13 +73,13 @@ class Store(
     def of_backup(cls, connection: sqlite3.Connection) -> Store:
         """The store in a private database that a backup was unpacked to; an older schema is brought forward.
 
-        Raises BadData where it is damaged, StoreFailure. The connection stays open then.
+        Raises BadDataError where it is damaged, StoreError. The connection stays open then.
         """
         database = Database(Path("backup", FILE_NAME), connection)
         database.set_up(create=False)
         store = cls._identified(database)
         if store.damage() is not None:
-            raise BadData("The store in the backup is damaged.")
+            raise BadDataError("The store in the backup is damaged.")
         return store
 
     @classmethod
@@ -95,7 +95,7 @@ class Store(
         return self._home
 
     @property
-    def frozen(self) -> StoreFailure | None:
+    def frozen(self) -> StoreError | None:
         """Why nothing can be written (the disk is full or read-only), None where it can."""
         return self._database.frozen
 
@@ -167,7 +167,7 @@ class Store(
             if self._database.path.stat().st_size % page:  # SQLite reads zeros for the octets that are missing
                 return "The file ends within a page."
             found = str(self._database.execute("PRAGMA quick_check(1)")[0][0])
-        except StoreFailure as failure:
+        except StoreError as failure:
             return failure.message
         return None if found == "ok" else found
 
@@ -179,5 +179,5 @@ class Store(
                 self._database.execute("INSERT OR IGNORE INTO meta VALUES('id', ?)", (fresh,))
                 row = self._database.one("SELECT value FROM meta WHERE name = 'id'")
         if row is None:
-            raise StoreFailure(f"The store {self._database.path} has no identifier.", hint="Run teds-provision init.")
+            raise StoreError(f"The store {self._database.path} has no identifier.", hint="Run teds-provision init.")
         return str(row[0])

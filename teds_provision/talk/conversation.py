@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from types import TracebackType
 
-from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NodeSilent, TedsProvisionError
+from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NodeSilentError, TedsProvisionError
 from teds_provision.links import Contact, Notice
 from teds_provision.links.ports import Link, NoticeSink, Prompt
 from teds_provision.protocol.messages.frames import (
@@ -80,28 +80,28 @@ HEARD = "Not verified: "
 """What a refusal outside a session begins with: anyone on the link may have sent it."""
 
 
-def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefused:
+def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefusedError:
     """The error for a refusal of ``doing`` something; outside a session (not ``sealed``) it is a hint, and says so."""
     heard = "The node refused" if sealed else f"{HEARD}the node refuses"
     try:
         known = Reason(reason if reason is not None else 0)
     except ValueError:
-        return NodeRefused(f"{heard} {doing} without a known reason ({reason}).", reason=reason or 0)
-    return NodeRefused(
+        return NodeRefusedError(f"{heard} {doing} without a known reason ({reason}).", reason=reason or 0)
+    return NodeRefusedError(
         f"{heard} {doing}: {_MEANING[known]} (reason {int(known)}).", reason=int(known), hint=_CURE.get(known, "")
     )
 
 
 def is_busy(error: TedsProvisionError) -> bool:
     """Whether a node refused because it is busy (17): time cures that, nothing else does."""
-    return isinstance(error, NodeRefused) and error.reason == Reason.BUSY
+    return isinstance(error, NodeRefusedError) and error.reason == Reason.BUSY
 
 
 # What a node says to an Open of which an octet was changed on the way; said twice it is what the node means.
 _DISTURBED = (Reason.UNKNOWN_KEY, Reason.BAD_FORM, Reason.BAD_POINT)
 
 
-class SessionLost(Exception):
+class SessionLostError(Exception):
     """The session is gone at the node; ``cause`` is what to tell when opening a new one does not help."""
 
     def __init__(self, cause: TedsProvisionError) -> None:
@@ -163,7 +163,9 @@ class Conversation:
     # -- sessions --------------------------------------------------------------------------------------------------
 
     def open(self, key: bytes, *, statics: tuple[bytes, ...] = ()) -> None:
-        """Open a session under a link key; raises NodeRefused (16: unknown key) or NotAuthentic (wrong node tag).
+        """Open a session under a link key.
+
+        Raises NodeRefusedError (16: unknown key) or NotAuthenticError (wrong node tag).
 
         ``statics``: P(station) and P(node), where they are at hand; the node's one-time key is neither.
         """
@@ -211,7 +213,7 @@ class Conversation:
             return
         try:
             self.send(security_command(Function.CLOSE), "to close the session")
-        except (LinkFailure, SessionLost, NodeRefused):
+        except (LinkError, SessionLostError, NodeRefusedError):
             pass
         finally:
             self.forget()
@@ -219,28 +221,28 @@ class Conversation:
     # -- commands --------------------------------------------------------------------------------------------------
 
     def plain(self, command: Command, doing: str) -> bytes:
-        """Send a plain command and return its payload; raises NodeRefused, LinkFailure."""
+        """Send a plain command and return its payload; raises NodeRefusedError, LinkError."""
         reply = self._exchange(command)
         if not reply.ok:
             raise refused(reply.reason, doing)
         return reply.payload
 
     def send(self, command: Command, doing: str, *, within: float | None = None) -> bytes:
-        """Send sealed where a session is open, else plain. Raises SessionLost where the session is gone.
+        """Send sealed where a session is open, else plain. Raises SessionLostError where the session is gone.
 
-        ``within``: seconds after which what it orders is of no use; it is given up then (NodeSilent).
+        ``within``: seconds after which what it orders is of no use; it is given up then (NodeSilentError).
         """
         session = self._session
         if session is None:
             return self.plain(command, doing)
         outer = self._exchange(session.seal(command), command, within)
         if not outer.ok:
-            raise SessionLost(refused(outer.reason, doing))
+            raise SessionLostError(refused(outer.reason, doing))
         try:
             inner = session.unseal(outer.payload)
         except TedsProvisionError as error:
             self.contact.note("in", outer.encode(), lambda: describe_answer(command, outer), sealed=True)
-            raise SessionLost(error) from error
+            raise SessionLostError(error) from error
         if self.contact.trace is not None:
             words, opened = describe_answer(command, inner), inner.encode()
             self.contact.note("in", outer.encode(), words, sealed=True, opened=opened)
@@ -255,7 +257,7 @@ class Conversation:
         """
         try:
             return self.send(command, doing)
-        except NodeRefused:
+        except NodeRefusedError:
             if self.sealed or not self._is_noisy:
                 raise
         return self.send(command, doing)
@@ -270,14 +272,14 @@ class Conversation:
         while True:
             try:
                 return self.sure(command, doing)
-            except SessionLost as lost:
+            except SessionLostError as lost:
                 reopenings += 1
                 if reopenings > _REOPENINGS or is_busy(lost.cause):
                     raise lost.cause from lost
                 self.reopen()
-            except (NodeSilent, Garbled) as failure:
-                torn += isinstance(failure, Garbled)
-                repeats += isinstance(failure, NodeSilent)
+            except (NodeSilentError, GarbledError) as failure:
+                torn += isinstance(failure, GarbledError)
+                repeats += isinstance(failure, NodeSilentError)
                 if repeats > _REPEATS or torn > _TORN_REPEATS or time.monotonic() > until or not self.lives():
                     raise
 
@@ -299,7 +301,7 @@ class Conversation:
             return False
         try:
             self._exchange(IDENTIFY)
-        except LinkFailure:
+        except LinkError:
             return False
         return True
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from teds_provision.errors import (
-    AddressConflict,
-    NoNode,
-    NoReader,
-    StoreLocked,
+    AddressConflictError,
+    NoNodeError,
+    NoReaderError,
+    StoreLockedError,
     TedsProvisionError,
-    UsageFailure,
-    VaultLocked,
+    UsageError,
+    VaultLockedError,
 )
 from teds_provision.links import Contact, LinkSettings, Notice, open_place, open_port, open_ports
 from teds_provision.links.ports import NoticeSink, Port
@@ -26,7 +26,7 @@ from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.store import utc_now
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import Reporter
 
 if TYPE_CHECKING:
@@ -52,7 +52,8 @@ def meet(
     Of several nodes on a bus that is the one which is not finished yet. ``before`` is called when the link is open and
     nothing is waited for yet: the time to ask for a passphrase. Where nobody said which link, ``uuid`` is looked for on
     the buses that are named beside, else on the one where it was met last, and then waited for at the reader. Raises
-    NoReader, NoNode after ``links.timeout`` seconds, AddressConflict, UsageFailure where several could be meant.
+    NoReaderError, NoNodeError after ``links.timeout`` seconds, AddressConflictError, UsageError where several could be
+    meant.
     """
     if uuid is None:
         port = open_port(links)
@@ -84,7 +85,7 @@ def _met_at(
 
     try:
         port = open_port(links)
-    except NoReader as error:
+    except NoReaderError as error:
         if not links.is_open:
             raise
         raise _no_link(station, uuid, error) from error
@@ -125,17 +126,20 @@ def _met_somewhere(
         there = replace(links.at(place), timeout=min(links.timeout, _TRY_SECONDS))
         try:
             return stack.enter_context(_met_at(station, there, uuid, reporter, once))
-        except (NoNode, NoReader) as error:  # off, elsewhere, or an adapter that is not plugged in: a tap may come
+        except (
+            NoNodeError,
+            NoReaderError,
+        ) as error:  # off, elsewhere, or an adapter that is not plugged in: a tap may come
             _log.debug("%s is not at %s: %s", uuid.hex(), place, error.message)
     left = replace(links, timeout=max(0.1, links.timeout - (time.monotonic() - began)))
     try:
         return stack.enter_context(_met_at(station, left, uuid, reporter, once))
-    except NoReader as no_reader:
+    except NoReaderError as no_reader:
         try:
             return stack.enter_context(_met_at(station, left.at(known[0]), uuid, reporter, once))
-        except NoNode as error:
+        except NoNodeError as error:
             where = " or ".join(place.partition(":")[2] for place in known)
-            raise NoNode(
+            raise NoNodeError(
                 f"Node {uuid.hex()} did not answer on {where} within {links.timeout:g} s, and there is no NFC reader.",
                 hint=error.hint,
             ) from no_reader
@@ -151,12 +155,12 @@ def likely_places(station: Station, links: LinkSettings, uuids: Sequence[bytes])
     return links.buses or tuple(dict.fromkeys(station.nodes.last_places(uuids).values()))
 
 
-def _no_link(station: Station, uuid: bytes, error: NoReader) -> NoReader:
+def _no_link(station: Station, uuid: bytes, error: NoReaderError) -> NoReaderError:
     """The error where no link is named, so that a reader is looked for, and there is none."""
     known = station.nodes.get(uuid)
     met = known is not None and known.can_address
     last = f" It was last met on a CAN bus, at address 0x{known.can_address:02X}." if known and met else ""
-    return NoReader(
+    return NoReaderError(
         f"No link to node {uuid.hex()} is named, and no NFC reader can be used: {error.message}",
         hint=f"Give its link: --can socketcan:can0, --ble hci0 or --nfc usb; or set it once in config.toml.{last}",
     )
@@ -172,7 +176,7 @@ def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
     """Keep off the source address from which a process of this station measures the node.
 
     A session belongs to a pair of addresses: another one from here would end that one's. Where none was named the next
-    free one is taken; raises StoreLocked where one was, or none is free.
+    free one is taken; raises StoreLockedError where one was, or none is free.
     """
     if port.via != "can" or not hasattr(port, "spec") or not station.measurements.is_running(uuid):
         return
@@ -184,7 +188,7 @@ def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
                 bus.use_source(source)
                 return
         other = 0xF2 if spec.source == 0xF1 else 0xF1
-        raise StoreLocked(
+        raise StoreLockedError(
             f"Node {uuid.hex()} is being measured from source address 0x{spec.source:02X}.",
             hint=f"Add source=0x{other:02X} to --can, or end that measurement.",
         )
@@ -206,7 +210,7 @@ def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conv
 def without_twins(contacts: list[Contact], notice: NoticeSink) -> list[Contact]:
     """Those whose UUID answers at one address alone; anybody can copy a UUID, so it costs that node and no other.
 
-    ``notice`` is told of the rest; raises AddressConflict where nothing is left.
+    ``notice`` is told of the rest; raises AddressConflictError where nothing is left.
     """
     same: dict[bytes, list[Contact]] = {}
     for contact in contacts:
@@ -214,18 +218,18 @@ def without_twins(contacts: list[Contact], notice: NoticeSink) -> list[Contact]:
     for uuid, group in same.items():
         try:
             refuse_twins(group)
-        except AddressConflict as conflict:
+        except AddressConflictError as conflict:
             notice(Notice("conflict", f"{conflict.message} {conflict.hint}", uuid=uuid))
     return [one for one in contacts if len(same[one.identity.uuid]) == 1] or refuse_twins(contacts)
 
 
 def refuse_twins(contacts: list[Contact]) -> list[Contact]:
-    """The contacts as they are; raises AddressConflict where one UUID answers at two addresses."""
+    """The contacts as they are; raises AddressConflictError where one UUID answers at two addresses."""
     seen: dict[bytes, Contact] = {}
     for contact in contacts:
         twin = seen.setdefault(contact.identity.uuid, contact)
         if twin is not contact:
-            raise AddressConflict(
+            raise AddressConflictError(
                 f"Node {contact.identity.uuid.hex()} answers at 0x{twin.address or 0:02x} and at "
                 f"0x{contact.address or 0:02x}: one of them is an impostor.",
                 hint="Disconnect one of them, or select one by node=ADDRESS in --can: its key shows which one"
@@ -244,7 +248,7 @@ def the_one(station: Station, contacts: list[Contact]) -> Contact:
     meant = unfinished or contacts
     listed = ", ".join(f"{each.identity.uuid.hex()} at 0x{each.address or 0:02x}" for each in meant[:_SHOWN])
     which = f"{len(meant)} of them not finished" if len(meant) < len(contacts) else ""
-    raise UsageFailure(
+    raise UsageError(
         f"{len(contacts)} nodes answer on the bus{', ' if which else ''}{which}: {listed}"
         f"{', …' if len(meant) > _SHOWN else ''}.",
         hint="Select one by its UUID, or by node=ADDRESS in --can.",
@@ -262,7 +266,7 @@ def _finished(station: Station, identity: Identity) -> bool:
 def onward(links: LinkSettings, notice: NoticeSink) -> Callable[[Conversation], None] | None:
     """How to go on once a key is agreed on: where both ``--nfc`` and ``--ble`` are named, over BLE; None where not.
 
-    What is returned raises NoReader, NoNode (it does not advertise, or is out of reach), LinkFailure.
+    What is returned raises NoReaderError, NoNodeError (it does not advertise, or is out of reach), LinkError.
     """
     place = links.onward
     if place is None:
@@ -369,7 +373,8 @@ def watch_nodes(
     """Do ``work`` with every node that comes on the chosen links; yields how each of them ended.
 
     Debounced (one visit, one result); goes on when a reader is unplugged and plugged in again. Several readers serve
-    several taps at once, each in a thread of its own. Raises NoReader only where one cannot be opened at the start.
+    several taps at once, each in a thread of its own. Raises NoReaderError only where one cannot be opened at the
+    start.
     """
     ports = open_ports(links)
     try:
@@ -392,11 +397,11 @@ def _watch(
         try:
             with Conversation(contact, notice=reporter.notice) as node:
                 result = work(node)
-        except VaultLocked:  # of the whole command, and of no node
+        except VaultLockedError:  # of the whole command, and of no node
             raise
         except TedsProvisionError as failure:
             error = failure
-        except SessionLost as lost:
+        except SessionLostError as lost:
             error = lost.cause
         yield Arrival(uuid, port.place, time.monotonic() - began, result, error)
 

@@ -11,7 +11,7 @@ from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
@@ -146,7 +146,7 @@ class Channel:
     def shown(self) -> WrittenUnit:
         """Unit in which people see its values: the profile's where one is known and fits, else the datasheet's."""
         if self.display:
-            with suppress(BadData):
+            with suppress(BadDataError):
                 chosen = display_unit(self.units, self.display)
                 if parse_unit(self.display).units == self.units:
                     return chosen

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import kind_of
 from teds_provision.teds.calibration.model import Calibration, from_decoded, is_sound
@@ -232,7 +232,7 @@ def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: CurveChanne
     try:
         decoded = decode(blocks[channel, AccessCode.CALIBRATION])
         found = from_decoded(decoded, channel=channel, units=own.units, actuator=own.actuator)
-    except BadData:
+    except BadDataError:
         return None
     return found if is_sound(found) else None
 

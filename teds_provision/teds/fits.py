@@ -16,7 +16,7 @@ from datetime import datetime
 from difflib import get_close_matches
 from typing import Final, Literal
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_size, load_toml
 from teds_provision.teds.channel import ROUNDING
 from teds_provision.teds.codec.model import Units
@@ -118,29 +118,31 @@ class Fit:
 
 
 def parse_fits(text: str) -> Requirement:
-    """Read ``angle >= 360 deg, uncertainty <= 1 deg``; raises BadData with the term that is wrong."""
+    """Read ``angle >= 360 deg, uncertainty <= 1 deg``; raises BadDataError with the term that is wrong."""
     check_size(len(text.encode()), LIMITS.expression, "the expression")
     parts = [part for part in text.split(",") if part.strip()]
     if not 1 <= len(parts) <= LIMITS.terms:
-        raise BadData(
+        raise BadDataError(
             f"An expression has 1 to {LIMITS.terms} terms, this one {len(parts)}.",
             hint='Write it like "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".',
         )
     terms = tuple(_term(part) for part in parts)
     quantities = sorted({term.what for term in terms if term.what in QUANTITIES})
     if len(quantities) > 1:
-        raise BadData(f"One expression asks for one quantity, this one for {' and '.join(quantities)}.")
+        raise BadDataError(f"One expression asks for one quantity, this one for {' and '.join(quantities)}.")
     return _with_fitting_units(Requirement(terms, quantity=quantities[0] if quantities else ""))
 
 
 def parse_require(text: str, file: str) -> tuple[Requirement, ...]:
-    """Read the TOML of ``--require``: a table for each channel name or quantity; raises BadData with the place.
+    """Read the TOML of ``--require``: a table for each channel name or quantity; raises BadDataError with the place.
 
     ``[angle]`` with ``range = ">= 360 deg"``, ``uncertainty = "<= 1 deg"``, ``rate = ">= 1 kHz"``.
     """
     data = load_toml(text, file)
     if not data:
-        raise BadData(f"{file}: it asks for nothing.", hint='Write a table such as [angle] with range = ">= 360 deg".')
+        raise BadDataError(
+            f"{file}: it asks for nothing.", hint='Write a table such as [angle] with range = ">= 360 deg".'
+        )
     return tuple(_table(name, table, file) for name, table in data.items())
 
 
@@ -247,22 +249,22 @@ def _relative(term: Term) -> bool:
 def _term(text: str) -> Term:
     match = _TERM.match(text)
     if match is None:
-        raise BadData(
+        raise BadDataError(
             f'"{text.strip()[:60]}" is no bound.', hint='Write a name, one of >= <= > <, and a value: "rate >= 1 kHz".'
         )
     name = match[1].strip().lower().replace(" ", "-").replace("_", "-")
     if name not in _PROPERTIES and name not in QUANTITIES:
         near = get_close_matches(name[:64], [*_PROPERTIES, *QUANTITIES], n=1, cutoff=0.6)
-        raise BadData(
+        raise BadDataError(
             f'"{name}" is no quantity that is known here.',
             hint=f'Did you mean "{near[0]}"?' if near else f"Known are {', '.join([*_PROPERTIES, *QUANTITIES])}.",
         )
     try:
         value = float(match[3])
     except ValueError as error:
-        raise BadData(f'"{match[3]}" in "{text.strip()[:60]}" is not a number.') from error
+        raise BadDataError(f'"{match[3]}" in "{text.strip()[:60]}" is not a number.') from error
     if not math.isfinite(value):
-        raise BadData(f'"{match[3]}" in "{text.strip()[:60]}" is too large.')
+        raise BadDataError(f'"{match[3]}" in "{text.strip()[:60]}" is too large.')
     unit = parse_unit((match[4] or "1").strip())
     return Term(name, match[2], value, unit)
 
@@ -281,7 +283,7 @@ def _with_fitting_units(requirement: Requirement) -> Requirement:
             fits = True
         if not fits:
             asked = "1/s" if term.what == "rate" else format_units(QUANTITIES[requirement.quantity])
-            raise BadData(
+            raise BadDataError(
                 f'"{term.text}": the unit {term.unit.text or "1"} does not measure this.',
                 hint=f"Write it in {asked}, or in another unit of the same kind.",
             )
@@ -290,26 +292,26 @@ def _with_fitting_units(requirement: Requirement) -> Requirement:
 
 def _table(name: str, table: object, file: str) -> Requirement:
     if not isinstance(table, dict) or not table:
-        raise BadData(f"{file}: [{name[:40]}] is no table of bounds.", hint='[angle] with range = ">= 360 deg"')
+        raise BadDataError(f"{file}: [{name[:40]}] is no table of bounds.", hint='[angle] with range = ">= 360 deg"')
     key = name.strip().lower().replace(" ", "-").replace("_", "-")
     quantity = key if key in QUANTITIES else ""
     try:
         terms = tuple(_entry(what, value, quantity) for what, value in table.items())
         if len(terms) > LIMITS.terms:
-            raise BadData(f"it has {len(terms)} bounds; {LIMITS.terms} are the most.")
+            raise BadDataError(f"it has {len(terms)} bounds; {LIMITS.terms} are the most.")
         return _with_fitting_units(Requirement(terms, quantity, "" if quantity else name))
-    except BadData as error:
-        raise BadData(f"{file}: [{name[:40]}]: {error.message}", hint=error.hint) from error
+    except BadDataError as error:
+        raise BadDataError(f"{file}: [{name[:40]}]: {error.message}", hint=error.hint) from error
 
 
 def _entry(what: str, value: object, quantity: str) -> Term:
     if not isinstance(value, str):
-        raise BadData(f'the bound of {what[:40]} is a text such as ">= 360 deg".')
+        raise BadDataError(f'the bound of {what[:40]} is a text such as ">= 360 deg".')
     check_size(len(value.encode()), LIMITS.expression, f"the bound of {what[:40]}")
     known = (*_PROPERTIES, quantity) if quantity else _PROPERTIES
     if what not in known:
         near = ", ".join(known)
-        raise BadData(f'there is no bound "{what[:40]}".', hint=f"Known are {near}.")
+        raise BadDataError(f'there is no bound "{what[:40]}".', hint=f"Known are {near}.")
     text = value if value.strip()[:1] in "<>" and value.strip() else f"{'<=' if what in _DOWN else '>='} {value}"
     return _term(f"{what} {text}")
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Final, Literal
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate, residuals
 from teds_provision.teds.calibration.model import Calibration, from_decoded
@@ -387,7 +387,7 @@ class _Judge:
             return
         try:
             calibration = self._calibration(decoded, self.new)
-        except BadData as error:
+        except BadDataError as error:
             yield self._not_understood(decoded, error)
             return
         damage = list(self._damage(calibration))
@@ -398,7 +398,7 @@ class _Judge:
             for text in calibration.date_warnings(self.now):
                 yield GuardFinding(self.number, "overdue", text, "warning")
 
-    def _not_understood(self, decoded: Decoded, error: BadData) -> GuardFinding:
+    def _not_understood(self, decoded: Decoded, error: BadDataError) -> GuardFinding:
         """An error where the fields are ours; else somebody else's form, of which nothing can be said."""
         text = f"{error.message} It was not checked."
         if decoded.field("CalInput") is None and decoded.field("Coefs") is None:
@@ -461,7 +461,7 @@ class _Judge:
             return None  # the node was of another type
         try:
             calibration = self._calibration(decode(octets), self.old)
-        except BadData:
+        except BadDataError:
             return None
         return None if any(True for _ in self._damage(calibration)) else calibration
 

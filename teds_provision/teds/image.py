@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_count, load_json
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, checksum, teds_class
 from teds_provision.teds.codec.model import AccessCode
@@ -59,44 +59,44 @@ class Image:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Image:
-        """Read an image file strictly; raises BadData naming what is wrong."""
+        """Read an image file strictly; raises BadDataError naming what is wrong."""
         data = load_json(text, "the TEDS image")
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise BadData(f'This is not a TEDS image: "format" is not "{FORMAT}".')
+            raise BadDataError(f'This is not a TEDS image: "format" is not "{FORMAT}".')
         uuid = _hex(data.get("uuid"), "uuid")
         if len(uuid) != 10:
-            raise BadData(f'"uuid" of the image has {len(uuid)} octets, a UUID has 10.')
+            raise BadDataError(f'"uuid" of the image has {len(uuid)} octets, a UUID has 10.')
         entries = data.get("blocks")
         if not isinstance(entries, list):
-            raise BadData('"blocks" of the image is not a list.')
+            raise BadDataError('"blocks" of the image is not a list.')
         check_count(len(entries), LIMITS.teds_of_a_file, "TEDS in the image")
         blocks: dict[BlockId, bytes] = {}
         for number, entry in enumerate(entries):
             key, teds = _block(entry, number)
             if key in blocks:
-                raise BadData(f"Block {number} of the image repeats access code {key[1]} on channel {key[0]}.")
+                raise BadDataError(f"Block {number} of the image repeats access code {key[1]} on channel {key[0]}.")
             blocks[key] = teds
         return cls(uuid, blocks)
 
 
 def _block(entry: object, number: int) -> tuple[BlockId, bytes]:
     if not isinstance(entry, dict):
-        raise BadData(f"Block {number} of the image is not an object.")
+        raise BadDataError(f"Block {number} of the image is not an object.")
     access_code, channel = entry.get("access_code"), entry.get("channel")
     if type(access_code) is not int or not 0 <= access_code <= 255:
-        raise BadData(f'"access_code" of block {number} is not a number from 0 to 255.')
+        raise BadDataError(f'"access_code" of block {number} is not a number from 0 to 255.')
     if type(channel) is not int or not 0 <= channel <= 0xFFFF:
-        raise BadData(f'"channel" of block {number} is not a number from 0 to 65535.')
+        raise BadDataError(f'"channel" of block {number} is not a number from 0 to 65535.')
     return (channel, access_code), _hex(entry.get("teds"), f"teds of block {number}")
 
 
 def _hex(value: object, name: str) -> bytes:
     if not isinstance(value, str):
-        raise BadData(f'"{name}" is not a string of hex digits.')
+        raise BadDataError(f'"{name}" is not a string of hex digits.')
     try:
         return bytes.fromhex(value)
     except ValueError as error:
-        raise BadData(f'"{name}" is not a string of hex digits.') from error
+        raise BadDataError(f'"{name}" is not a string of hex digits.') from error
 
 
 # One TEDS with its place, and cutting a run of framed TEDS apart.

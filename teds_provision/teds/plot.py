@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.files import SHARED, write_whole
 from teds_provision.lazy import how_to_install, late
 from teds_provision.teds.calibration.formula import kind_of, residuals
@@ -48,19 +48,19 @@ def plot_blocks(
 ) -> tuple[int, ...]:
     """Draw the calibrations among framed TEDS into a PNG or SVG file (by its ending); returns the channels drawn.
 
-    ``calibrations`` are those that the blocks were made from: their points and residuals are drawn too. Raises BadData
-    (no calibration that can be drawn), UsageFailure (another ending, no matplotlib), and what
+    ``calibrations`` are those that the blocks were made from: their points and residuals are drawn too. Raises
+    BadDataError (no calibration that can be drawn), UsageError (another ending, no matplotlib), and what
     ``write_whole`` raises.
     """
     kind = path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
-        raise UsageFailure(f'"{path.name}" is no picture that can be drawn.', hint="Let its name end in .png or .svg.")
+        raise UsageError(f'"{path.name}" is no picture that can be drawn.', hint="Let its name end in .png or .svg.")
     panels = _panels(blocks, channel, profile, calibrations or {})
     if not panels:
         which = f"channel {channel}" if channel is not None else "any channel"
-        raise BadData(f"There is no calibration of {which} that can be drawn.")
+        raise BadDataError(f"There is no calibration of {which} that can be drawn.")
     if len(panels) > MAXIMUM_PANELS:
-        raise UsageFailure(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
+        raise UsageError(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
     sheet = Sheet.of_blocks(blocks)
     title = "  ".join(part for part in (sheet.meta.name, sheet.uuid.hex()) if part)
     write_whole(path, _picture(panels, kind, title), mode=SHARED)

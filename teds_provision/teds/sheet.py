@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import Calibration, from_decoded, is_finite
 from teds_provision.teds.channel import (
     NOT_STATED,
@@ -177,7 +177,7 @@ class _Reader:
             return replace(own, calibration_problem="Its length, checksum or structure is wrong.")
         try:
             found = from_decoded(teds, channel=number, units=own.units, actuator=own.actuator)
-        except BadData as error:
+        except BadDataError as error:
             return replace(own, calibration_problem=error.message)
         self.understood[number] = found
         problem = computable(found)

@@ -10,7 +10,7 @@ from dataclasses import field as dataclass_field
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import calibrated_unit, from_decoded
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.decode import decode
@@ -220,7 +220,7 @@ def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[
     own = described(context.channel or 1, context.beside)
     try:
         calibration = from_decoded(decoded, channel=context.channel, units=own.units, actuator=own.actuator)
-    except BadData as error:
+    except BadDataError as error:
         yield "calibration", f"{error.message} {error.hint}".strip()
         return
     segments = " × ".join(str(part.segments) for part in calibration.inputs)
@@ -248,7 +248,7 @@ def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
     if ours and context.beside:
         try:
             security.decode(decoded.octets)
-        except BadData as error:
+        except BadDataError as error:
             yield "form", f"not canonical, so never authentic: {error.message}"
 
 

@@ -16,7 +16,7 @@ from fractions import Fraction
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import how_to_install
 from teds_provision.limits import LIMITS
 from teds_provision.teds.codec.model import UNIT_PARTS, Units
@@ -222,11 +222,11 @@ def parse_unit(text: str) -> WrittenUnit:
 
     ``%``, ``mV/V``, ``mm/mm`` become ratios (interpretation 1, exponents of one side), ``dB`` the log of a power ratio
     (3), ``dBm`` the log of a power (2), ``digital`` and ``arbitrary`` interpretations 4 and 5. ``g`` is the gram,
-    ``g_n`` the standard acceleration of free fall. Raises BadData naming the text and how to write it.
+    ``g_n`` the standard acceleration of free fall. Raises BadDataError naming the text and how to write it.
     """
     text = text.strip()
     if len(text) > LIMITS.unit:
-        raise BadData(f"A unit has at most {LIMITS.unit} characters, this one {len(text)}.")
+        raise BadDataError(f"A unit has at most {LIMITS.unit} characters, this one {len(text)}.")
     if text in SPECIAL:
         return WrittenUnit(text, *SPECIAL[text])
     if text in NAMED:
@@ -240,7 +240,7 @@ def parse_unit(text: str) -> WrittenUnit:
 
 
 def parse_units(text: str) -> Units:
-    """Exponents alone of a unit as people write it; raises BadData."""
+    """Exponents alone of a unit as people write it; raises BadDataError."""
     return parse_unit(text).units
 
 
@@ -251,7 +251,7 @@ def _ratio(text: str) -> WrittenUnit | None:
     upper, lower = (part.strip() for part in text.split("/"))
     try:
         above, below = parse_unit(upper), parse_unit(lower)
-    except BadData:
+    except BadDataError:
         return None
     if above.units != below.units or above.units.interpretation != PRODUCT or above.units == Units():
         return None
@@ -329,7 +329,7 @@ def _by_pint(text: str) -> WrittenUnit:
     registry = _registry()
     if registry is None:
         unknown = _unknown(text)
-        raise BadData(
+        raise BadDataError(
             f"{unknown.message[:-1]} that is known without the package pint.",
             hint=f"{unknown.hint} A rare unit needs pint. {how_to_install('units')}",
         )
@@ -348,7 +348,7 @@ def _by_pint(text: str) -> WrittenUnit:
         if name in _PINT_BASES:
             out[_PINT_BASES[name]] = power
         elif name not in _COUNTS:
-            raise BadData(
+            raise BadDataError(
                 f'The unit "{text}" holds {name}, which the SI units of a TEDS cannot say.',
                 hint='Use "arbitrary" for what has no SI unit, "count" for a number, "digital" for bits.',
             )
@@ -367,16 +367,16 @@ def _exponents(container: Mapping[str, Any]) -> dict[str, Fraction]:
 def _representable(text: str, exponents: dict[str, Fraction]) -> None:
     for name, power in exponents.items():
         if (2 * power).denominator != 1 or not -128 <= 2 * power <= 127:
-            raise BadData(
+            raise BadDataError(
                 f'The unit "{text}" has the exponent {power} of {name}; a TEDS can say halves from -64 to 63.5.',
                 hint='Describe the channel in another unit, or as "arbitrary".',
             )
 
 
-def _unknown(text: str) -> BadData:
+def _unknown(text: str) -> BadDataError:
     near = get_close_matches(text[:64], [*NAMED, *TABLE, *SPECIAL], n=1, cutoff=0.6)
     guess = f'Did you mean "{near[0]}"? ' if near else ""
-    return BadData(
+    return BadDataError(
         f'"{text}" is not a unit.', hint=f'{guess}Write it like "degree", "N", "mm", "degC", "m/s²", "mV/V" or "count".'
     )
 
@@ -503,7 +503,7 @@ def _quantity(value: object) -> tuple[float, str]:
     """The number and the unit of ``"100 us"``."""
     match = _QUANTITY.match(value) if isinstance(value, str) else None
     if match is None:
-        raise BadData(
+        raise BadDataError(
             f"{value!r} is not a time.", hint='Write a number of seconds, or a text like "100 us" or "1 year".'
         )
     return float(match[1]), match[2]
@@ -512,7 +512,7 @@ def _quantity(value: object) -> tuple[float, str]:
 def parse_seconds(value: object) -> float:
     """Seconds of ``"100 us"``, ``"1 year"`` (365.2425 days), ``"10 kHz"`` (its period) or a bare number of seconds.
 
-    Raises BadData.
+    Raises BadDataError.
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
         return float(value)
@@ -524,7 +524,7 @@ def parse_seconds(value: object) -> float:
         return unit.to_si(number)
     if unit.units == NAMED["1/s"] and number:
         return 1.0 / unit.to_si(number)
-    raise BadData(
+    raise BadDataError(
         f'"{value}" is not a time: {text} is no unit of time.', hint='Write it like "100 us", "5 s" or "10 kHz".'
     )
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from teds_provision import __version__
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.links.ports import Direction
 from teds_provision.trace.frames import can_words, nfc_words
 from teds_provision.trace.record import Record
@@ -64,7 +64,10 @@ def is_pcapng(octets: bytes) -> bool:
 
 
 def read_pcapng(octets: bytes) -> Iterator[Record]:
-    """Every packet of a link type that is known here; a last block that was cut short is left out. Raises BadData."""
+    """Every packet of a link type that is known here; a last block that was cut short is left out.
+
+    Raises BadDataError.
+    """
     interfaces: list[tuple[int, float]] = []
     for at, order, kind, body in _blocks(octets):
         try:
@@ -75,7 +78,7 @@ def read_pcapng(octets: bytes) -> Iterator[Record]:
             elif kind == _PACKET and (record := _record(order, body, interfaces)) is not None:
                 yield record
         except (struct.error, IndexError, ValueError) as error:
-            raise BadData(f"The pcapng block at octet {at} does not parse: {error}.") from error
+            raise BadDataError(f"The pcapng block at octet {at} does not parse: {error}.") from error
 
 
 def _blocks(octets: bytes) -> Iterator[tuple[int, str, int, bytes]]:
@@ -86,7 +89,7 @@ def _blocks(octets: bytes) -> Iterator[tuple[int, str, int, bytes]]:
             order = "<" if octets[at + 8 : at + 12] == struct.pack("<I", _ORDER) else ">"
         kind, length = struct.unpack_from(f"{order}II", octets, at)
         if length < 12 or length % 4:
-            raise BadData(f"The pcapng block at octet {at} says it has {length} octets.")
+            raise BadDataError(f"The pcapng block at octet {at} says it has {length} octets.")
         if at + length > len(octets):
             return
         yield at, order, kind, octets[at + 8 : at + length - 4]

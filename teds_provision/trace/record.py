@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Any, Final, Literal
 
 from teds_provision import __version__
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.links.ports import Direction
 
 Layer = Literal["frame", "message"]
@@ -78,7 +78,7 @@ def is_lines(octets: bytes) -> bool:
 
 
 def read_lines(octets: bytes) -> Iterator[Record]:
-    """Every record; a last line that was cut short is left out. Raises BadData with the line's number."""
+    """Every record; a last line that was cut short is left out. Raises BadDataError with the line's number."""
     for number, row in enumerate(io.BytesIO(octets), 1):
         if number == 1 or not row.strip():
             continue
@@ -87,7 +87,7 @@ def read_lines(octets: bytes) -> Iterator[Record]:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if not row.endswith(b"\n"):
                 return
-            raise BadData(f"Line {number} of the trace is not a valid record: {error}.") from error
+            raise BadDataError(f"Line {number} of the trace is not a valid record: {error}.") from error
 
 
 def _record(row: dict[str, Any]) -> Record:

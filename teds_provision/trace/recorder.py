@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, NotFound, StoreFailure
+from teds_provision.errors import BadDataError, NotFoundError, StoreError
 from teds_provision.files import PRIVATE, open_to_read, require_new
 from teds_provision.links.ports import Direction
 from teds_provision.trace import pcapng
@@ -25,15 +25,15 @@ PCAPNG = ".pcapng"
 def open_trace(path: Path, tell: Callable[[str], None]) -> Recorder:
     """Make the file of a trace, mode 0600, never over another one; ``tell`` hears of a disk that takes no more.
 
-    Raises UsageFailure where something lies at ``path``, NotFound where its folder is missing, else StoreFailure.
+    Raises UsageError where something lies at ``path``, NotFoundError where its folder is missing, else StoreError.
     """
     require_new(path)
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
     except FileNotFoundError:
-        raise NotFound(f"There is no folder {path.parent}.") from None
+        raise NotFoundError(f"There is no folder {path.parent}.") from None
     except OSError as error:
-        raise StoreFailure(
+        raise StoreError(
             f"The trace {path} cannot be written: {error.strerror}.", hint="Choose another file for --trace."
         ) from error
     return Recorder(path, descriptor, tell)
@@ -122,14 +122,19 @@ _HEAD_OCTETS: Final = 64
 
 
 def read_trace(path: Path) -> Iterator[Record]:
-    """Every record of a file. Raises NotFound, and BadData where it is no trace (told before the first record)."""
+    """Every record of a file.
+
+    Raises NotFoundError, and BadDataError if it is no trace (told before the first record).
+    """
     with open_to_read(path) as file:
         octets = file.read(_HEAD_OCTETS)
         reading = read_lines if is_lines(octets) else read_pcapng if is_pcapng(octets) else None
         if reading is not None:
             octets += file.read(_MOST_OCTETS)
     if len(octets) > _MOST_OCTETS:
-        raise BadData(f"{path} is larger than {_MOST_OCTETS} octets, which is too large for a trace.")
+        raise BadDataError(f"{path} is larger than {_MOST_OCTETS} octets, which is too large for a trace.")
     if reading is not None:
         return reading(octets)
-    raise BadData(f"{path} is not a trace.", hint="Supported: files written by --trace, or pcapng with CAN frames.")
+    raise BadDataError(
+        f"{path} is not a trace.", hint="Supported: files written by --trace, or pcapng with CAN frames."
+    )

@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import VaultError
 from teds_provision.files import listen_alone, short_path
 from teds_provision.lazy import late
 from teds_provision.vault.hardening import harden
@@ -60,10 +60,10 @@ def lock(home: Path) -> bool:
 def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
     """Hold ``secret`` for so many seconds, in a process of its own; one that is there ends first.
 
-    Raises VaultFailure where this system has no such sockets, or the process does not come up.
+    Raises VaultError where this system has no such sockets, or the process does not come up.
     """
     if not hasattr(socket, "SO_PEERCRED"):
-        raise VaultFailure("unlock requires Linux: this system does not identify the peer of a socket.")
+        raise VaultError("unlock requires Linux: this system does not identify the peer of a socket.")
     lock(home)
     package = Path(__file__).parents[2]
     # -P and an appended folder: neither the folder that the user is in, nor ours, comes before Python's own modules.
@@ -88,7 +88,7 @@ def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
     if ready != b"ready\n":
         process.kill()
         process.wait()
-        raise VaultFailure(f"The vault cannot be kept open: {SOCKET} in {home} does not come up.")
+        raise VaultError(f"The vault cannot be kept open: {SOCKET} in {home} does not come up.")
 
 
 def _ask(home: Path, request: bytes) -> bytes:

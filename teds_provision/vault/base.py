@@ -20,11 +20,11 @@ LAST_ATTEMPT = "last attempt before it locks"
 
 
 class Vault(Protocol):
-    """Where the secrets of one station lie. All methods raise VaultFailure or a leaf below it.
+    """Where the secrets of one station lie. All methods raise VaultError or a leaf below it.
 
     What changes the vault reads first what lies there now, and makes what it writes from that: the caller holds the
-    store's lock, and a copy from before the lock decides nothing. It raises VaultChanged where the passphrase (or PIN)
-    that opened this one is not the vault's any more.
+    store's lock, and a copy from before the lock decides nothing. It raises VaultChangedError where the passphrase (or
+    PIN) that opened this one is not the vault's any more.
     """
 
     @property
@@ -60,7 +60,7 @@ class Vault(Protocol):
         """Ask for another passphrase (or PIN), with no lock held; what is returned sets it durably, under the lock.
 
         The keys stay. ``ask`` is called for the new one, and before it for the old one where the vault has to give it
-        on. Raises VaultFailure where another program does that.
+        on. Raises VaultError where another program does that.
         """
 
     def refresh(self) -> bool:
@@ -69,8 +69,8 @@ class Vault(Protocol):
     def reread(self) -> None:
         """Read the master keys again with what this process has opened already, for a process that runs for long.
 
-        A token's PIN may be another one by now: an open session does not need it. Raises VaultChanged if only the new
-        passphrase opens the vault.
+        A token's PIN may be another one by now: an open session does not need it. Raises VaultChangedError if only the
+        new passphrase opens the vault.
         """
 
     def master_keys(self) -> MasterKeys:
@@ -88,7 +88,7 @@ class Vault(Protocol):
     def export_ca(self, path: Path, passphrase: str) -> None:
         """Write the CA key to a new file as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
 
-        Raises VaultFailure: no CA key here, one that cannot leave, a weak passphrase, the file exists.
+        Raises VaultError: no CA key here, one that cannot leave, a weak passphrase, the file exists.
         """
 
     def drop_ca(self) -> bool:
@@ -97,7 +97,8 @@ class Vault(Protocol):
     def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
         """Take in the CA key that :meth:`export_ca` wrote, and return it.
 
-        Raises WrongPassphrase, NotFound, VaultFailure: not such a file, another CA key is here, none can come in.
+        Raises WrongPassphraseError, NotFoundError, VaultError: not such a file, another CA key is here, none can come
+        in.
         """
 
     def secret_material(self) -> str:

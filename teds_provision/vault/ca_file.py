@@ -12,7 +12,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Final
 
-from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.errors import UsageError, VaultError, WrongPassphraseError
 from teds_provision.files import read_limited, write_new
 from teds_provision.vault.passphrase import check_new
 
@@ -32,7 +32,7 @@ _SEQUENCE, _INTEGER, _OCTETS = 0x30, 0x02, 0x04
 def write_ca(path: Path, secret: bytes, passphrase: str) -> None:
     """Write the key of a 32-octet scalar, encrypted, into a new file of mode 0600.
 
-    Raises VaultFailure: the file exists, the passphrase is weak, or it cannot be written (then none is left).
+    Raises VaultError: the file exists, the passphrase is weak, or it cannot be written (then none is left).
     """
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
@@ -41,33 +41,35 @@ def write_ca(path: Path, secret: bytes, passphrase: str) -> None:
     key = ec.derive_private_key(int.from_bytes(secret, "big"), ec.SECP256R1())
     pem = _encrypted_pem(key.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption()), passphrase)
     try:
-        write_new(path, pem, failure=VaultFailure)
-    except UsageFailure as taken:  # this command's exit code is that of the vault since version 0.1
-        raise VaultFailure(taken.message, hint=taken.hint) from None
+        write_new(path, pem, failure=VaultError)
+    except UsageError as taken:  # this command's exit code is that of the vault since version 0.1
+        raise VaultError(taken.message, hint=taken.hint) from None
 
 
 def read_ca(path: Path, passphrase: str) -> bytes:
     """Return the 32-octet scalar of an encrypted P-256 key in PEM.
 
-    Raises NotFound, WrongPassphrase, BadData (too large), VaultFailure (not such a file).
+    Raises NotFoundError, WrongPassphraseError, BadDataError (too large), VaultError (not such a file).
     """
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-    pem = read_limited(path, _MAX_OCTETS, "CA key", failure=VaultFailure)
+    pem = read_limited(path, _MAX_OCTETS, "CA key", failure=VaultError)
     if _LABEL.encode() not in pem:
-        raise VaultFailure(
+        raise VaultError(
             f"{path} contains no encrypted private key in PEM format.", hint="Give the file that trust ca export wrote."
         )
     _check_costs(path, pem)
     try:
         key = load_pem_private_key(pem, passphrase.encode("utf-8", "surrogateescape"))
     except (ValueError, TypeError):  # a wrong passphrase and a damaged file look alike
-        raise WrongPassphrase(f"The passphrase does not open {path} (or it is damaged).", hint="Try again.") from None
+        raise WrongPassphraseError(
+            f"The passphrase does not open {path} (or it is damaged).", hint="Try again."
+        ) from None
     except Exception as error:  # the library names unsupported ciphers and curves by many classes
-        raise VaultFailure(f"{path} contains an unsupported kind of key.") from error
+        raise VaultError(f"{path} contains an unsupported kind of key.") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(key.curve, ec.SECP256R1):
-        raise VaultFailure(f"{path} contains no P-256 key.", hint="Give the file that trust ca export wrote.")
+        raise VaultError(f"{path} contains no P-256 key.", hint="Give the file that trust ca export wrote.")
     return key.private_numbers().private_value.to_bytes(32, "big")
 
 
@@ -81,7 +83,7 @@ def _check_costs(path: Path, pem: bytes) -> None:
     place = der.find(_PBKDF2)
     rounds = _rounds(der[place + len(_PBKDF2) :]) if _PBES2 in der and place >= 0 else 0
     if not 0 < rounds <= MAX_ROUNDS:
-        raise VaultFailure(
+        raise VaultError(
             f"{path} is encrypted in an unsupported way.",
             hint=f"Encrypt it with PBES2 and PBKDF2 of at most {MAX_ROUNDS:,} rounds: openssl pkcs8 -topk8 -v2 aes256",
         )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from teds_provision.errors import UsageFailure, VaultChanged, VaultFailure, WrongPassphrase
+from teds_provision.errors import UsageError, VaultChangedError, VaultError, WrongPassphraseError
 from teds_provision.lazy import late
 from teds_provision.vault import agent
 from teds_provision.vault.base import LAST_ATTEMPT, Ask, Vault
@@ -23,7 +23,7 @@ _opened: dict[tuple[Path, str, str], Vault] = {}
 _Made = TypeVar("_Made")
 
 
-class _Unasked(Exception):
+class _QuestionNeededError(Exception):
     """Somebody has to be asked first."""
 
     def __init__(self, prompt: str, confirm: bool) -> None:
@@ -42,13 +42,13 @@ def asked_first(ask: Ask, work: Callable[[Ask], _Made]) -> _Made:
 
     def known(prompt: str, confirm: bool) -> str:
         if (prompt, confirm) not in answers:
-            raise _Unasked(prompt, confirm)
+            raise _QuestionNeededError(prompt, confirm)
         return answers[prompt, confirm]
 
     while True:
         try:
             return work(known)
-        except _Unasked as unasked:
+        except _QuestionNeededError as unasked:
             answers[unasked.question] = ask(*unasked.question)
 
 
@@ -70,7 +70,7 @@ def create_vault(
 
     ``keystore`` is ``keyring``, ``file``, ``pkcs11:…`` (RFC 7512) or None: then the keyring if one works (proven by a
     set, a read back and a delete), else a passphrase file. ``costs`` are those of a new passphrase file, ``restored``
-    the secret material of a backup; ``with_ca`` False makes no CA key. Raises VaultFailure (leaves too), UsageFailure.
+    the secret material of a backup; ``with_ca`` False makes no CA key. Raises VaultError (leaves too), UsageError.
     """
     harden()
 
@@ -94,7 +94,7 @@ def create_vault(
 def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool = False) -> Vault:
     """Open the vault of a station; a second call in one process gives the same as it is now, without asking again.
 
-    With ``use_agent`` nobody is asked while ``unlock`` holds it open. Raises VaultFailure and its leaves: locked,
+    With ``use_agent`` nobody is asked while ``unlock`` holds it open. Raises VaultError and its leaves: locked,
     missing, damaged, wrong passphrase.
     """
     harden()
@@ -104,11 +104,11 @@ def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent:
         try:
             vault.refresh()
             return vault
-        except VaultChanged as failure:  # under another passphrase: that one has to be asked for
+        except VaultChangedError as failure:  # under another passphrase: that one has to be asked for
             changed = failure
     try:
         _opened[place] = vault = _open(home, store_id, keystore, ask, use_agent=use_agent)
-    except WrongPassphrase:
+    except WrongPassphraseError:
         if changed is not None:  # it was the right one before
             raise changed from None
         raise
@@ -140,13 +140,13 @@ def _create(
         vault = file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored)
         return vault, "as requested"
     if keystore is not None:
-        raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
+        raise UsageError(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
     if (home / file_vault.FILE_NAME).exists():
         vault = file_vault.FileVault.create(home, store_id, ask, restored=restored)
         return vault, "the passphrase file already exists"
     try:
         return keyring_vault.KeyringVault.create(store_id, restored=restored), "an OS keyring is available"
-    except VaultFailure as failure:
+    except VaultError as failure:
         why = f"no OS keyring: {failure.message[:1].lower()}{failure.message[1:].rstrip('.')}"
     return file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
 
@@ -161,11 +161,11 @@ def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool
         if pin is not None:
             try:
                 return pkcs11.Pkcs11Vault.open(home, store_id, keystore, _holding(pin, ask))
-            except WrongPassphrase:  # the PIN is another one by now: a second try could lock the token
+            except WrongPassphraseError:  # the PIN is another one by now: a second try could lock the token
                 agent.lock(home)
                 raise
         return pkcs11.Pkcs11Vault.open(home, store_id, keystore, ask)
-    raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
+    raise UsageError(f"There is no keystore {keystore!r}.", hint="Use keyring, file or pkcs11:URI.")
 
 
 def _holding(pin: bytes, ask: Ask) -> Ask:

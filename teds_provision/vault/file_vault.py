@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import BadData, NotFound, VaultChanged, VaultFailure, WrongPassphrase
+from teds_provision.errors import BadDataError, NotFoundError, VaultChangedError, VaultError, WrongPassphraseError
 from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.vault.base import Ask
 from teds_provision.vault.master import Material
@@ -40,7 +40,7 @@ class FileVault(SoftwareVault):
         """Make the vault, or open the one that is there (it is never overwritten).
 
         ``ask`` is called once: for a new passphrase (with confirmation) or for that of the existing file.
-        ``restored`` is the secret material of a backup. Raises VaultFailure, WrongPassphrase.
+        ``restored`` is the secret material of a backup. Raises VaultError, WrongPassphraseError.
         """
         path = home / FILE_NAME
         if path.exists():
@@ -53,14 +53,14 @@ class FileVault(SoftwareVault):
         material = settle(None, restored)
         key = SealingKey.derive(passphrase, costs=costs)
         content = _sealed(store_id, material, key)
-        write_new(path, _octets_of(content), failure=VaultFailure)
+        write_new(path, _octets_of(content), failure=VaultError)
         return cls(path, store_id, material, key, content)
 
     @classmethod
     def open(cls, home: Path, store_id: str, ask: Ask, *, held: bytes | None = None) -> FileVault:
         """Open the vault with what an agent held (:meth:`opener`), else with the passphrase that ``ask`` gives.
 
-        Raises VaultFailure (missing, damaged, of another store), WrongPassphrase.
+        Raises VaultError (missing, damaged, of another store), WrongPassphraseError.
         """
         path = home / FILE_NAME
         content = read_sealed(path)
@@ -71,7 +71,7 @@ class FileVault(SoftwareVault):
             content = read_sealed(path)  # as it is now: a person may have thought for an hour
             try:
                 opened = unseal(passphrase, content, context=_context(store_id))
-            except WrongPassphrase:
+            except WrongPassphraseError:
                 if content == asked:
                     raise
                 raise _another_passphrase() from None
@@ -115,12 +115,12 @@ class FileVault(SoftwareVault):
 
     def _save(self, material: Material) -> None:
         content = _sealed(self._store_id, material, self._key)
-        write_whole(self._path, _octets_of(content), failure=VaultFailure)
+        write_whole(self._path, _octets_of(content), failure=VaultError)
         self._content = content
 
 
-def _another_passphrase() -> VaultChanged:
-    return VaultChanged(
+def _another_passphrase() -> VaultChangedError:
+    return VaultChangedError(
         "Another command has changed the passphrase in the meantime; this one changed nothing.",
         hint="Run it again with the new passphrase.",
     )
@@ -132,7 +132,7 @@ def _material(plaintext: bytes) -> Material:
 
 def _require_store(content: dict[str, Any], store_id: str, path: Path) -> None:
     if content.get("store") != store_id:
-        raise VaultFailure(f"{path} belongs to another store.", hint="Restore a backup that contains both.")
+        raise VaultError(f"{path} belongs to another store.", hint="Restore a backup that contains both.")
 
 
 def _context(store_id: str) -> bytes:
@@ -149,21 +149,21 @@ def _octets_of(content: dict[str, Any]) -> bytes:
 
 
 def read_sealed(path: Path) -> dict[str, Any]:
-    """Read the file, still sealed; raises VaultFailure (missing, damaged)."""
+    """Read the file, still sealed; raises VaultError (missing, damaged)."""
     try:
-        octets = read_limited(path, _MAX_OCTETS, "vault", failure=VaultFailure, follow=False)
-    except NotFound:
-        raise VaultFailure(
+        octets = read_limited(path, _MAX_OCTETS, "vault", failure=VaultError, follow=False)
+    except NotFoundError:
+        raise VaultError(
             f"The passphrase file {path} is missing.", hint="Restore a backup of this station (teds-provision restore)."
         ) from None
-    except BadData:
+    except BadDataError:
         octets = b""
     try:
         content = json.loads(octets)
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ValueError
     except (ValueError, RecursionError):
-        raise VaultFailure(
+        raise VaultError(
             f"{path} is damaged or not a vault of this version.", hint="Restore a backup (teds-provision restore)."
         ) from None
     return content

@@ -14,7 +14,7 @@ from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
 
-from teds_provision.errors import NoKeyring, VaultFailure
+from teds_provision.errors import KeyringUnavailableError, VaultError
 from teds_provision.vault.base import SERVICE, Ask
 from teds_provision.vault.master import Material
 from teds_provision.vault.software import SoftwareVault, settle
@@ -53,8 +53,8 @@ class KeyringVault(SoftwareVault):
     def create(cls, store_id: str, *, restored: str | None = None) -> KeyringVault:
         """Make the entry of this store, or take the one that is there.
 
-        ``restored`` is the secret material of a backup. Raises NoKeyring (none, or none that may hold a secret),
-        VaultFailure (locked, or it does not keep what it is given).
+        ``restored`` is the secret material of a backup. Raises KeyringUnavailableError (none, or none that may hold a
+        secret), VaultError (locked, or it does not keep what it is given).
         """
         name, backend = next(_viable())
         entry = _entry(store_id)
@@ -69,17 +69,17 @@ class KeyringVault(SoftwareVault):
 
     @classmethod
     def open(cls, store_id: str) -> KeyringVault:
-        """Read the entry of this store; raises NoKeyring, VaultFailure (locked, or no such entry)."""
-        failure: VaultFailure | None = None
+        """Read the entry of this store; raises KeyringUnavailableError, VaultError (locked, or no such entry)."""
+        failure: VaultError | None = None
         for name, backend in _viable():
             try:
                 line = _get(name, backend, _entry(store_id))
-            except VaultFailure as error:
+            except VaultError as error:
                 failure = failure or error
                 continue
             if line is not None:
                 return cls(backend, name, store_id, Material.decode(line))
-        raise failure or VaultFailure(
+        raise failure or VaultError(
             "The keyring has no entry for this station.",
             hint=_NO_ENTRY,
         )
@@ -89,8 +89,8 @@ class KeyringVault(SoftwareVault):
         return b""
 
     def new_passphrase(self, ask: Ask) -> Callable[[], None]:
-        """Refuse: the keyring asks for its own passphrase. Raises VaultFailure always."""
-        raise VaultFailure(
+        """Refuse: the keyring asks for its own passphrase. Raises VaultError always."""
+        raise VaultError(
             f"The keyring has its own passphrase ({self.description}).",
             hint="Change it with the keyring's own program (Seahorse, KWallet manager, Keychain Access, passwd).",
         )
@@ -98,7 +98,7 @@ class KeyringVault(SoftwareVault):
     def _load(self) -> Material:
         line = _get(self._name(), self._backend, self._entry)
         if line is None:
-            raise VaultFailure("The keyring no longer has an entry for this station.", hint=_NO_ENTRY)
+            raise VaultError("The keyring no longer has an entry for this station.", hint=_NO_ENTRY)
         return Material.decode(line)
 
     def _save(self, material: Material) -> None:
@@ -112,7 +112,7 @@ class KeyringVault(SoftwareVault):
 def inspect() -> str:
     """Name the keyring that would hold the keys, after it has answered (for doctor).
 
-    Raises NoKeyring (none, or none that may hold a secret), VaultFailure (locked, or it fails).
+    Raises KeyringUnavailableError (none, or none that may hold a secret), VaultError (locked, or it fails).
     """
     name, backend = next(_viable())
     _get(name, backend, _entry("doctor"))
@@ -124,11 +124,13 @@ def _entry(store_id: str) -> str:
 
 
 def _viable() -> Iterator[tuple[str, KeyringBackend]]:
-    """Give the allowed backends that work here, the best first; raises NoKeyring if there is none."""
+    """Give the allowed backends that work here, the best first; raises KeyringUnavailableError if there is none."""
     configured = _configured()
     if configured not in (None, _CHAINER):
         if configured not in ALLOWED:
-            raise NoKeyring(f"The configured keyring {configured} is not suitable for secrets.", hint=_INSTEAD)
+            raise KeyringUnavailableError(
+                f"The configured keyring {configured} is not suitable for secrets.", hint=_INSTEAD
+            )
         names = [str(configured)]
     else:
         names = _candidates()
@@ -145,7 +147,7 @@ def _viable() -> Iterator[tuple[str, KeyringBackend]]:
             found = True
             yield name, backend
     if not found:
-        raise NoKeyring("This machine has no keyring that is suitable for secrets.", hint=_INSTEAD)
+        raise KeyringUnavailableError("This machine has no keyring that is suitable for secrets.", hint=_INSTEAD)
 
 
 def _candidates() -> list[str]:
@@ -190,7 +192,7 @@ def _set(name: str, backend: KeyringBackend, entry: str, line: str) -> None:
     _call(name, lambda: backend.set_password(SERVICE, entry, line))
     read = _get(name, backend, entry)
     if read is None or not secrets.compare_digest(read.encode(), line.encode()):
-        raise VaultFailure(f"The keyring ({ALLOWED[name]}) did not store the secret.", hint=_INSTEAD)
+        raise VaultError(f"The keyring ({ALLOWED[name]}) did not store the secret.", hint=_INSTEAD)
 
 
 def _get(name: str, backend: KeyringBackend, entry: str) -> str | None:
@@ -208,9 +210,11 @@ def _fail(name: str, error: Exception) -> NoReturn:
     from keyring.errors import InitError, KeyringLocked, NoKeyringError
 
     if isinstance(error, NoKeyringError):
-        raise NoKeyring("This machine has no keyring that is suitable for secrets.", hint=_INSTEAD) from error
+        raise KeyringUnavailableError(
+            "This machine has no keyring that is suitable for secrets.", hint=_INSTEAD
+        ) from error
     if isinstance(error, KeyringLocked | InitError):
-        raise VaultFailure(f"The keyring is locked and was not unlocked ({ALLOWED[name]}).", hint=_UNLOCK) from error
-    raise VaultFailure(
+        raise VaultError(f"The keyring is locked and was not unlocked ({ALLOWED[name]}).", hint=_UNLOCK) from error
+    raise VaultError(
         f"The keyring failed ({ALLOWED[name]}: {type(error).__name__}).", hint="Check that its service runs."
     ) from error

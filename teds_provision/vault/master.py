@@ -17,7 +17,7 @@ from typing import Any
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from teds_provision.errors import UnknownMaster, VaultFailure
+from teds_provision.errors import UnknownMasterKeyError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 
 MASTER_OCTETS = 32
@@ -62,17 +62,22 @@ class MasterKeys:
         return head + nonce + self._cipher(number).encrypt(nonce, key, head + context)
 
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
-        """Open a wrapped key; raises VaultFailure if it is damaged or moved, UnknownMaster if of another master key."""
+        """Open a wrapped key.
+
+        Raises VaultError if it is damaged or moved, UnknownMasterKeyError if of another master key.
+        """
         head, nonce, sealed = wrapped[:_HEAD_OCTETS], wrapped[_HEAD_OCTETS:][:_NONCE_OCTETS], wrapped[17:]
         if len(sealed) < 16 or head[0] != _VERSION:
-            raise VaultFailure("A wrapped key in the store is damaged.", hint=_DAMAGED)
+            raise VaultError("A wrapped key in the store is damaged.", hint=_DAMAGED)
         number = int.from_bytes(head[1:], "big")
         if number not in self.keys:
-            raise UnknownMaster("A key in the store is wrapped under a master key that the vault lacks.", hint=_DAMAGED)
+            raise UnknownMasterKeyError(
+                "A key in the store is wrapped under a master key that the vault lacks.", hint=_DAMAGED
+            )
         try:
             return self._cipher(number).decrypt(nonce, sealed, head + context)
         except InvalidTag:
-            raise VaultFailure(
+            raise VaultError(
                 "A wrapped key in the store does not belong to this vault, node, epoch or slot.", hint=_DAMAGED
             ) from None
 
@@ -111,7 +116,7 @@ class Material:
 
     @classmethod
     def decode(cls, line: str) -> Material:
-        """Read what :meth:`encode` gave; raises VaultFailure, without a word of the content."""
+        """Read what :meth:`encode` gave; raises VaultError, without a word of the content."""
         try:
             if not line.startswith(_PREFIX):
                 raise ValueError
@@ -120,10 +125,10 @@ class Material:
             ca = None if content["ca"] is None else _octets(content["ca"])
             material = cls(_octets(content["identity"]), ca, MasterKeys(masters))
         except (ValueError, KeyError, TypeError, AttributeError, binascii.Error):
-            raise VaultFailure("The vault contains something other than a station's keys.", hint=_DAMAGED) from None
+            raise VaultError("The vault contains something other than a station's keys.", hint=_DAMAGED) from None
         secrets = [material.identity, *masters.values(), *([] if ca is None else [ca])]
         if not masters or any(len(secret) != _SECRET_OCTETS for secret in secrets):
-            raise VaultFailure("The station's keys in the vault are damaged.", hint=_DAMAGED)
+            raise VaultError("The station's keys in the vault are damaged.", hint=_DAMAGED)
         return material
 
 
@@ -135,9 +140,9 @@ def _octets(text: str) -> bytes:
     return base64.b64decode(text, validate=True)
 
 
-def another_life() -> VaultFailure:
+def another_life() -> VaultError:
     """The error where two backups of one station gave one number to different master keys."""
-    return VaultFailure(
+    return VaultError(
         "The vault and the backup are of one station, but each has another master key of the same number: "
         "the vault was restored from an older backup, and vault rewrap was run there since.",
         hint="Restore the backup into another --home.",

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from teds_provision.errors import VaultFailure, WrongPassphrase
+from teds_provision.errors import VaultError, WrongPassphraseError
 
 MIN_CHARACTERS: Final = 8
 MAX_OCTETS: Final = 1024
@@ -59,7 +59,7 @@ class SealingKey:
 
     @classmethod
     def derive(cls, passphrase: str, *, costs: Costs, salt: bytes | None = None) -> SealingKey:
-        """Run Argon2id over the passphrase (NFKC, UTF-8). Raises VaultFailure where the platform cannot."""
+        """Run Argon2id over the passphrase (NFKC, UTF-8). Raises VaultError where the platform cannot."""
         from cryptography.exceptions import UnsupportedAlgorithm
 
         salt = os.urandom(_SALT_OCTETS) if salt is None else salt
@@ -75,11 +75,11 @@ class SealingKey:
             )
             return cls(costs, salt, kdf.derive(_octets_of(passphrase)))
         except (UnsupportedAlgorithm, ImportError) as error:
-            raise VaultFailure(
+            raise VaultError(
                 "This Python's OpenSSL has no Argon2id.", hint="Install the wheel of cryptography from PyPI."
             ) from error
         except MemoryError as error:
-            raise VaultFailure(f"Not enough memory for Argon2id ({costs.memory_kib} KiB).") from error
+            raise VaultError(f"Not enough memory for Argon2id ({costs.memory_kib} KiB).") from error
 
     def seal(self, plaintext: bytes, *, context: bytes) -> dict[str, Any]:
         """Return a JSON object that holds ``plaintext``, sealed and bound to ``context``."""
@@ -99,7 +99,7 @@ class SealingKey:
 
 
 def seal(passphrase: str, plaintext: bytes, *, context: bytes, costs: Costs = PRODUCT) -> dict[str, Any]:
-    """Seal ``plaintext`` under a new passphrase; raises VaultFailure if the passphrase is too weak to be one."""
+    """Seal ``plaintext`` under a new passphrase; raises VaultError if the passphrase is too weak to be one."""
     check_new(passphrase)
     return SealingKey.derive(passphrase, costs=costs).seal(plaintext, context=context)
 
@@ -107,14 +107,14 @@ def seal(passphrase: str, plaintext: bytes, *, context: bytes, costs: Costs = PR
 def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tuple[bytes, SealingKey]:
     """Open a sealed object; returns the plaintext and the key, to seal again without asking.
 
-    Raises WrongPassphrase if the tag does not hold (wrong passphrase, or the object was changed: these cannot be told
-    apart), VaultFailure if it is not a sealed object at all.
+    Raises WrongPassphraseError if the tag does not hold (wrong passphrase, or the object was changed: these cannot be
+    told apart), VaultError if it is not a sealed object at all.
     """
     costs, salt, _, _ = _parts(sealed)
     key = SealingKey.derive(passphrase, costs=costs, salt=salt)
     opened = _decrypted(key, sealed, context)
     if opened is None:
-        raise WrongPassphrase(
+        raise WrongPassphraseError(
             "The passphrase does not open the sealed file, or the file was changed.",
             hint="Try again, and check the keyboard layout.",
         )
@@ -130,7 +130,7 @@ def unseal_with(held: bytes, sealed: Mapping[str, Any], *, context: bytes) -> tu
 
 
 def _parts(sealed: Mapping[str, Any]) -> tuple[Costs, bytes, bytes, bytes]:
-    """Costs, salt, nonce and ciphertext of a sealed object; raises VaultFailure where it is none."""
+    """Costs, salt, nonce and ciphertext of a sealed object; raises VaultError where it is none."""
     try:
         known = (sealed["kdf"], sealed["cipher"]) == ("argon2id", "aes-256-gcm")
         costs = Costs(int(sealed["memory_kib"]), int(sealed["iterations"]), int(sealed["lanes"]))
@@ -140,7 +140,7 @@ def _parts(sealed: Mapping[str, Any]) -> tuple[Costs, bytes, bytes, bytes]:
     if not (
         known and costs.bounded() and 8 <= len(salt) <= 64 and len(nonce) == _NONCE_OCTETS and len(ciphertext) > 16
     ):
-        raise VaultFailure("The data encrypted under a passphrase is damaged.", hint="Restore a backup of it.")
+        raise VaultError("The data encrypted under a passphrase is damaged.", hint="Restore a backup of it.")
     return costs, salt, nonce, ciphertext
 
 
@@ -156,15 +156,15 @@ def _decrypted(key: SealingKey, sealed: Mapping[str, Any], context: bytes) -> by
 
 
 def check_new(passphrase: str) -> None:
-    """Raise VaultFailure unless this can be a new passphrase: 8 characters to 1024 octets, one line, not one sign."""
+    """Raise VaultError unless this can be a new passphrase: 8 characters to 1024 octets, one line, not one sign."""
     if len(passphrase) < MIN_CHARACTERS:
-        raise VaultFailure(
+        raise VaultError(
             f"The passphrase is too short: at least {MIN_CHARACTERS} characters.", hint="Four random words are good."
         )
     if len(set(passphrase)) == 1:
-        raise VaultFailure("The passphrase repeats one character.", hint="Four random words are good.")
+        raise VaultError("The passphrase repeats one character.", hint="Four random words are good.")
     if any(unicodedata.category(character) == "Cc" for character in passphrase):
-        raise VaultFailure("The passphrase holds a control character.", hint="Use letters, digits, signs and spaces.")
+        raise VaultError("The passphrase holds a control character.", hint="Use letters, digits, signs and spaces.")
     _octets_of(passphrase)
 
 
@@ -172,9 +172,9 @@ def _octets_of(passphrase: str) -> bytes:
     try:
         octets = unicodedata.normalize("NFKC", passphrase).encode()
     except UnicodeEncodeError:
-        raise VaultFailure("The passphrase is not valid text.", hint="Check the encoding of the terminal.") from None
+        raise VaultError("The passphrase is not valid text.", hint="Check the encoding of the terminal.") from None
     if len(octets) > MAX_OCTETS:
-        raise VaultFailure(f"The passphrase is longer than {MAX_OCTETS} octets.")
+        raise VaultError(f"The passphrase is longer than {MAX_OCTETS} octets.")
     return octets
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import BadData, NotFound, VaultChanged, VaultFailure
+from teds_provision.errors import BadDataError, NotFoundError, VaultChangedError, VaultError
 from teds_provision.files import private_folder, read_limited, write_new, write_whole
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, verify
 from teds_provision.vault.base import Ask
@@ -57,7 +57,7 @@ class Pkcs11Vault:
         The URI's ``object`` and ``id`` name the station key; a key of that name which is in the token already is taken,
         if it cannot leave it. ``with_ca`` False makes no CA key. ``restored`` is what :meth:`secret_material` gave to a
         backup; it opens with the same token alone. ``ask`` is called once, for the PIN, unless the token has a pad.
-        Raises UsageFailure (URI), WrongPassphrase, VaultFailure.
+        Raises UsageError (URI), WrongPassphraseError, VaultError.
         """
         if (home / FILE_NAME).exists():
             vault = cls.open(home, store_id, uri, ask)
@@ -69,7 +69,7 @@ class Pkcs11Vault:
         with exclusive(where.module_path):
             if restored is not None:
                 _content_of(_parsed(restored.encode(), store_id, "The backup"), session)
-                write_new(home / FILE_NAME, restored.encode(), failure=VaultFailure)
+                write_new(home / FILE_NAME, restored.encode(), failure=VaultError)
             elif not (home / FILE_NAME).exists():  # else another process was quicker
                 station = _find_or_make(session, store_id, where, "station")
                 ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
@@ -81,7 +81,7 @@ class Pkcs11Vault:
     def open(cls, home: Path, store_id: str, uri: str, ask: Ask) -> Pkcs11Vault:
         """Open the vault with the PIN that ``ask`` gives.
 
-        Raises UsageFailure (URI), WrongPassphrase, VaultFailure (module, token, key or file missing or changed).
+        Raises UsageError (URI), WrongPassphraseError, VaultError (module, token, key or file missing or changed).
         """
         where = Pkcs11Uri.parse(uri)
         _read(home, store_id)  # before anyone is asked for a PIN
@@ -103,19 +103,19 @@ class Pkcs11Vault:
         return self._content.masters.wrap(key, context=context)
 
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
-        """Open a wrapped node key; raises VaultFailure if it is damaged or belongs elsewhere."""
+        """Open a wrapped node key; raises VaultError if it is damaged or belongs elsewhere."""
         return self._content.masters.unwrap(wrapped, context=context)
 
     def export_ca(self, path: Path, passphrase: str) -> None:
-        """Refuse: a key made in a token never leaves it. Raises VaultFailure always."""
-        raise VaultFailure(
+        """Refuse: a key made in a token never leaves it. Raises VaultError always."""
+        raise VaultError(
             "The CA key is in the token and cannot leave it.",
             hint="Keep the token itself offline, or create the CA in another home with --keystore file.",
         )
 
     def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
-        """Refuse: a key from a file was in the clear somewhere. Raises VaultFailure always."""
-        raise VaultFailure(
+        """Refuse: a key from a file was in the clear somewhere. Raises VaultError always."""
+        raise VaultError(
             "A CA key from a file cannot be imported into a token.", hint="Use --keystore file in another home."
         )
 
@@ -140,8 +140,8 @@ class Pkcs11Vault:
     def new_passphrase(self, ask: Ask) -> Callable[[], None]:
         """Ask for the token's PIN and a new one; what is returned has the token set it, the store being held.
 
-        That raises WrongPassphrase, VaultFailure, and VaultChanged, before the token counts a try, where another
-        command has set a new PIN since this vault was opened.
+        That raises WrongPassphraseError, VaultError, and VaultChangedError, before the token counts a try, where
+        another command has set a new PIN since this vault was opened.
         """
         old, new = ask("PIN of the token, as it is now", False), ask("New PIN of the token", True)
 
@@ -157,14 +157,14 @@ class Pkcs11Vault:
     def refresh(self) -> bool:
         """Take in what another process has written since; False where nothing was. Nobody is asked.
 
-        Raises VaultChanged where the token has a new PIN, VaultFailure.
+        Raises VaultChangedError where the token has a new PIN, VaultError.
         """
         if _read(self._home, self._store_id) == self._members:
             return False
         with exclusive(self._module_path):
             content, members = _load(self._home, self._store_id, self._session)
         if content.pins != self._content.pins:
-            raise VaultChanged(
+            raise VaultChangedError(
                 "Another command has changed the PIN in the meantime; this one changed nothing.",
                 hint="Run it again with the new PIN.",
             )
@@ -174,7 +174,7 @@ class Pkcs11Vault:
     def reread(self) -> None:
         """Read the master keys again in the session that is open: it lasts beyond a change of the PIN.
 
-        Raises VaultFailure. The count of PINs stays that of the opening, so :meth:`refresh` still reports a new one.
+        Raises VaultError. The count of PINs stays that of the opening, so :meth:`refresh` still reports a new one.
         """
         with exclusive(self._module_path):
             content, _ = _load(self._home, self._store_id, self._session)
@@ -201,7 +201,7 @@ class Pkcs11Vault:
 
     def secret_material(self) -> str:
         """Return what a backup needs: the file, sealed as it is. It is of no use without the token."""
-        octets = read_limited(self._home / FILE_NAME, _MAX_OCTETS, "vault", failure=VaultFailure, follow=False)
+        octets = read_limited(self._home / FILE_NAME, _MAX_OCTETS, "vault", failure=VaultError, follow=False)
         return octets.decode("utf-8", "replace")
 
     def close(self) -> None:
@@ -209,11 +209,11 @@ class Pkcs11Vault:
         self._session.close()
 
     def _join(self, other: _Content) -> None:
-        """Take in the master keys of a backup of this station; raises VaultFailure if it is of another."""
+        """Take in the master keys of a backup of this station; raises VaultError if it is of another."""
         self.refresh()
         here, there = self._content.masters.keys, other.masters.keys
         if other.station.point != self._content.station.point:
-            raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+            raise VaultError("The vault holds the keys of another station.", hint="Restore into another --home.")
         if any(here[number] != there[number] for number in here.keys() & there):
             raise another_life()
         if there.keys() - here.keys():
@@ -277,7 +277,7 @@ def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> dic
     members["sealed"] = AESGCM(key).encrypt(nonce, masters.encode(), None).hex()
     members["signature"] = content.station.sign(_signed(members)).hex()
     write = write_whole if replace else write_new
-    write(home / FILE_NAME, json.dumps(members, indent=1).encode() + b"\n", failure=VaultFailure)
+    write(home / FILE_NAME, json.dumps(members, indent=1).encode() + b"\n", failure=VaultError)
     return members
 
 
@@ -290,10 +290,10 @@ def _content_of(members: dict[str, Any], session: TokenSession) -> _Content:
     station = _held(session, members["station"], "station")
     ca = None if members["ca"] is None else _held(session, members["ca"], "CA")
     if not verify(station.point, _signed(members), _octets(members, "signature")):
-        raise VaultFailure(f"{FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
+        raise VaultError(f"{FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
     pins = members.get("pins", 0)
     if not isinstance(pins, int):
-        raise VaultFailure(f"{FILE_NAME} is damaged (pins).", hint=_DAMAGED)
+        raise VaultError(f"{FILE_NAME} is damaged (pins).", hint=_DAMAGED)
     return _Content(station, ca, _unsealed(station, members), pins)
 
 
@@ -305,7 +305,7 @@ def _unsealed(station: TokenKey, members: dict[str, Any]) -> MasterKeys:
     try:
         plain = AESGCM(key).decrypt(_octets(members, "nonce"), _octets(members, "sealed"), None)
     except (InvalidTag, ValueError):
-        raise VaultFailure(
+        raise VaultError(
             "The token does not open what was sealed to its key.", hint="Check the token's driver."
         ) from None
     return MasterKeys({int(number): bytes.fromhex(master) for number, master in json.loads(plain).items()})
@@ -337,15 +337,15 @@ def _held(session: TokenSession, described: Any, role: str) -> TokenKey:
     try:
         label, identifier, point = str(described["label"]), bytes.fromhex(described["id"]), described["point"]
     except (KeyError, TypeError, ValueError):
-        raise VaultFailure(f"{FILE_NAME} does not say which key is the {role} key.", hint=_DAMAGED) from None
+        raise VaultError(f"{FILE_NAME} does not say which key is the {role} key.", hint=_DAMAGED) from None
     key = session.find(label=label, identifier=identifier)
     if key is None:
-        raise VaultFailure(
+        raise VaultError(
             f"The token {session.label!r} does not hold the {role} key {label!r}.",
             hint="Plug in the token that was used at init; a key deleted there cannot be recovered.",
         )
     if key.point.hex() != point:
-        raise VaultFailure(
+        raise VaultError(
             f"The {role} key {label!r} in the token {session.label!r} is not the one from init.",
             hint="Plug in the token that was used at init.",
         )
@@ -356,16 +356,16 @@ def _octets(members: dict[str, Any], name: str) -> bytes:
     try:
         return bytes.fromhex(members[name])
     except (KeyError, TypeError, ValueError):
-        raise VaultFailure(f"{FILE_NAME} is damaged ({name}).", hint=_DAMAGED) from None
+        raise VaultError(f"{FILE_NAME} is damaged ({name}).", hint=_DAMAGED) from None
 
 
 def _read(home: Path, store_id: str) -> dict[str, Any]:
     path = home / FILE_NAME
     try:
-        octets = read_limited(path, _MAX_OCTETS, "vault", failure=VaultFailure, follow=False)
-    except NotFound:
-        raise VaultFailure(f"{path} is missing.", hint=_DAMAGED) from None
-    except BadData:
+        octets = read_limited(path, _MAX_OCTETS, "vault", failure=VaultError, follow=False)
+    except NotFoundError:
+        raise VaultError(f"{path} is missing.", hint=_DAMAGED) from None
+    except BadDataError:
         octets = b""
     return _parsed(octets, store_id, str(path))
 
@@ -376,9 +376,9 @@ def _parsed(octets: bytes, store_id: str, path: str) -> dict[str, Any]:
     except (ValueError, RecursionError):
         members = None
     if len(octets) > _MAX_OCTETS or not isinstance(members, dict) or not {"station", "ca"} <= members.keys():
-        raise VaultFailure(f"{path} is damaged.", hint=_DAMAGED)
+        raise VaultError(f"{path} is damaged.", hint=_DAMAGED)
     if members.get("format") != _FORMAT or members.get("store") != store_id:
-        raise VaultFailure(f"{path} is of another version or belongs to another store.", hint=_DAMAGED)
+        raise VaultError(f"{path} is of another version or belongs to another store.", hint=_DAMAGED)
     return members
 
 
@@ -394,12 +394,12 @@ _POLL_SECONDS = 0.02
 
 @contextmanager
 def exclusive(module_path: str) -> Iterator[None]:
-    """Hold the lock of a module; released by the kernel if the process dies. Raises VaultFailure after 30 s."""
+    """Hold the lock of a module; released by the kernel if the process dies. Raises VaultError after 30 s."""
     path = _folder() / f"pkcs11-{hashlib.sha256(module_path.encode()).hexdigest()[:16]}.lock"
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise VaultFailure(f"{path} cannot be opened: {error.strerror}.", hint="Check its owner and mode.") from error
+        raise VaultError(f"{path} cannot be opened: {error.strerror}.", hint="Check its owner and mode.") from error
     try:
         _wait(descriptor)
         yield
@@ -414,7 +414,7 @@ def _wait(descriptor: int) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() > until:
-                raise VaultFailure(
+                raise VaultError(
                     "Another teds-provision process is using the token.", hint="Wait for it to finish, or stop it."
                 ) from None
             time.sleep(_POLL_SECONDS)
@@ -435,7 +435,7 @@ def _folder() -> Path:
         return private_folder(parent / f"teds-provision-{user}")
     except (OSError, RuntimeError) as error:
         said = error.strerror if isinstance(error, OSError) else error
-        raise VaultFailure(
+        raise VaultError(
             f"The folder {parent / f'teds-provision-{user}'} cannot be used: {said}.",
             hint="Remove it and run the command again.",
         ) from error

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from teds_provision.errors import BadData, VaultFailure, WrongPassphrase
+from teds_provision.errors import BadDataError, VaultError, WrongPassphraseError
 from teds_provision.lazy import how_to_install
 from teds_provision.protocol.keys import fingerprint, normalise_signature, public_key
 from teds_provision.vault.base import LAST_ATTEMPT, Ask
@@ -51,7 +51,7 @@ class TokenKey:
         """x-coordinate of the ECDH: CKM_ECDH1_DERIVE with CKD_NULL into a secret of all 32 octets, read and destroyed.
 
         A shorter secret would be the *last* octets of x on some modules and the first on others; key derivation is
-        ours, outside, because tokens lack HKDF. Raises BadData for a bad point, VaultFailure.
+        ours, outside, because tokens lack HKDF. Raises BadDataError for a bad point, VaultError.
         """
         public_key(peer)  # a token need not look whether a point is on the curve
         return guarded(lambda: self._derive(peer))
@@ -93,16 +93,16 @@ class TokenSession:
     def find(self, *, label: str | None, identifier: bytes | None) -> TokenKey | None:
         """Return the P-256 key with this label and CKA_ID; None where there is none.
 
-        Raises VaultFailure: several fit, no public key beside it, another curve, or it may leave the token.
+        Raises VaultError: several fit, no public key beside it, another curve, or it may leave the token.
         """
         return guarded(lambda: self._find(label, identifier))
 
     def generate(self, *, label: str, identifier: bytes) -> TokenKey:
-        """Make a P-256 key pair in the token: private, sensitive, not extractable. Raises VaultFailure."""
+        """Make a P-256 key pair in the token: private, sensitive, not extractable. Raises VaultError."""
         guarded(lambda: self._generate(label, identifier), retry=False)
         key = self.find(label=label, identifier=identifier)
         if key is None:
-            raise VaultFailure("The token created a key but does not show it.", hint="Inspect it with pkcs11-tool -O.")
+            raise VaultError("The token created a key but does not show it.", hint="Inspect it with pkcs11-tool -O.")
         return key
 
     def destroy(self, key: TokenKey) -> None:
@@ -118,7 +118,7 @@ class TokenSession:
         guarded(run)
 
     def set_pin(self, old: str, new: str) -> None:
-        """Have the token take a new user PIN; one try. Raises WrongPassphrase, VaultFailure."""
+        """Have the token take a new user PIN; one try. Raises WrongPassphraseError, VaultError."""
         from pkcs11 import exceptions
 
         def run() -> None:
@@ -128,11 +128,11 @@ class TokenSession:
         try:
             run()
         except (exceptions.PinIncorrect, exceptions.ArgumentsBad):
-            raise WrongPassphrase(
+            raise WrongPassphraseError(
                 f"The PIN of the token {self.label!r} is wrong.", hint="Run it again with the right PIN."
             ) from None
         except (exceptions.PinInvalid, exceptions.PinLenRange):
-            raise VaultFailure(
+            raise VaultError(
                 f"The token {self.label!r} does not accept this as a new PIN.", hint="Check its length and characters."
             ) from None
         except exceptions.PKCS11Error as error:
@@ -179,14 +179,14 @@ class TokenSession:
         if not found:
             return None
         if len(found) > 1:
-            raise VaultFailure(
+            raise VaultError(
                 f"{len(found)} keys of the token {self.label!r} match.",
                 hint="Select one by object= and id= in the URI.",
             )
         key = found[0]
         assert isinstance(key, TokenObject)
         if not key[Attribute.SENSITIVE] or key[Attribute.EXTRACTABLE]:
-            raise VaultFailure(
+            raise VaultError(
                 f"The key {key.label!r} can leave the token {self.label!r}, so it is not used.",
                 hint="Let teds-provision create one: give no object or id, or new ones.",
             )
@@ -206,10 +206,10 @@ class TokenSession:
             point = point.removeprefix(_POINT_DER) if len(point) != 65 else point
             try:
                 public_key(point)
-            except BadData as error:
-                raise VaultFailure(f"The key {key.label!r} of the token is not a P-256 key.") from error
+            except BadDataError as error:
+                raise VaultError(f"The key {key.label!r} of the token is not a P-256 key.") from error
             return point
-        raise VaultFailure(
+        raise VaultError(
             f"The token {self.label!r} shows no public key beside {key.label!r}.",
             hint="Load the public key with the same label and id, using the vendor's tool.",
         )
@@ -218,28 +218,28 @@ class TokenSession:
 def find_token(uri: Pkcs11Uri) -> Token:
     """Load the module and return the one token that the URI names.
 
-    Raises VaultFailure: python-pkcs11 or the module missing, no such token, several, PIN locked.
+    Raises VaultError: python-pkcs11 or the module missing, no such token, several, PIN locked.
     """
     try:
         import pkcs11
     except ImportError as error:
-        raise VaultFailure("Keys in a token need the package python-pkcs11.", hint=how_to_install("pkcs11")) from error
+        raise VaultError("Keys in a token need the package python-pkcs11.", hint=how_to_install("pkcs11")) from error
     try:
         library = guarded(lambda: pkcs11.lib(uri.module_path))
         tokens = guarded(lambda: [token for token in library.get_tokens() if _fits(uri, token)])
-    except VaultFailure as failure:
+    except VaultError as failure:
         if type(failure.__cause__) is not pkcs11.PKCS11Error:  # a return code of the module, not the loader's word
             raise
-        raise VaultFailure(
+        raise VaultError(
             f"The PKCS #11 module {uri.module_path} cannot be loaded.",
             hint="Install the token's driver, or correct module-path in the URI.",
         ) from failure
     if not tokens:
-        raise VaultFailure(
+        raise VaultError(
             f"There is no {uri} here.", hint="Plug it in; pkcs11-tool --module MODULE -L (opensc) lists the tokens."
         )
     if len(tokens) > 1:
-        raise VaultFailure(f"{len(tokens)} tokens match the URI.", hint="Add serial= or slot-id= to it.")
+        raise VaultError(f"{len(tokens)} tokens match the URI.", hint="Add serial= or slot-id= to it.")
     if tokens[0].flags & pkcs11.TokenFlag.USER_PIN_LOCKED:
         raise _locked(uri)
     return tokens[0]
@@ -250,7 +250,7 @@ def log_in(token: Token, uri: Pkcs11Uri, pin: str | None, *, write: bool) -> Tok
 
     A login is the process's, not the session's: where this process holds one already, the module does not look at the
     PIN. ``open_vault`` asks once per process for that reason.
-    Raises WrongPassphrase, which says what the token tells of the tries left, or VaultFailure.
+    Raises WrongPassphraseError, which says what the token tells of the tries left, or VaultError.
     """
     from pkcs11 import PROTECTED_AUTH, TokenFlag, exceptions
 
@@ -262,14 +262,14 @@ def log_in(token: Token, uri: Pkcs11Uri, pin: str | None, *, write: bool) -> Tok
         flags = guarded(lambda: token.slot.get_token().flags)
         if flags & TokenFlag.USER_PIN_LOCKED:
             raise _locked(uri) from None
-        raise WrongPassphrase(
+        raise WrongPassphraseError(
             f"The PIN of the {uri} is wrong. {_tries(flags)}",
             hint="Run it again with the right PIN; it is not retried automatically.",
         ) from None
     except exceptions.PinLocked:
         raise _locked(uri) from None
     except (exceptions.PinExpired, exceptions.UserPinNotInitialized):
-        raise VaultFailure(f"The {uri} has no valid user PIN.", hint="Set one with the token's own tool.") from None
+        raise VaultError(f"The {uri} has no valid user PIN.", hint="Set one with the token's own tool.") from None
     except exceptions.PKCS11Error as error:
         raise _failure(error) from error
     return TokenSession(session, token)
@@ -286,7 +286,7 @@ def ask_pin(token: Token, uri: Pkcs11Uri, ask: Ask) -> str | None:
 
 
 def guarded(run: Callable[[], Result], *, retry: bool = True) -> Result:
-    """Run something on the token; every error of the module becomes a VaultFailure.
+    """Run something on the token; every error of the module becomes a VaultError.
 
     CKR_GENERAL_ERROR gets one more try: SoftHSM gives it when two processes touch their objects at once.
     """
@@ -324,17 +324,17 @@ def _tries(flags: int) -> str:
     return "The token does not say how many attempts are left."
 
 
-def _locked(uri: Pkcs11Uri) -> VaultFailure:
-    return VaultFailure(
+def _locked(uri: Pkcs11Uri) -> VaultError:
+    return VaultError(
         f"The PIN of the {uri} is locked after too many wrong attempts.",
         hint="Set a new PIN with the security officer's PIN, with the token's own tool.",
     )
 
 
-def _failure(error: Exception) -> VaultFailure:
+def _failure(error: Exception) -> VaultError:
     """Name a module's error by its PKCS #11 return code, which is what its maker's pages are sorted by."""
     name = type(error).__name__
     gone = name in {"DeviceRemoved", "DeviceError", "TokenNotPresent", "SessionHandleInvalid", "SessionClosed"}
-    return VaultFailure(
+    return VaultError(
         f"The token failed ({name}).", hint="Plug it in and run this again." if gone else "Check it with its own tool."
     )

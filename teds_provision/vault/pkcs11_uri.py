@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from urllib.parse import unquote_to_bytes
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 
 _PATH = frozenset({"token", "serial", "manufacturer", "model", "object", "id", "slot-id", "type"})
 _SECRETS = frozenset({"pin-value", "pin-source"})
@@ -27,25 +27,25 @@ class Pkcs11Uri:
 
     @classmethod
     def parse(cls, text: str) -> Pkcs11Uri:
-        """Read a URI strictly; raises UsageFailure.
+        """Read a URI strictly; raises UsageError.
 
         An attribute that is not known or stands twice is refused, as it might have told two tokens apart. So are
         ``pin-value`` and ``pin-source``: no option may hold a secret, and no store may say which file holds it.
         """
         scheme, colon, rest = text.partition(":")
         if scheme.lower() != "pkcs11" or not colon:
-            raise UsageFailure("A token is given as a URI that starts with pkcs11:.", hint=_EXAMPLE)
+            raise UsageError("A token is given as a URI that starts with pkcs11:.", hint=_EXAMPLE)
         path, _, query = rest.partition("?")
         found = _attributes(path, ";") | {f"?{name}": value for name, value in _attributes(query, "&").items()}
         _refuse(found)
         module = found.pop("?module-path", None)
         if module is None:
-            raise UsageFailure("The PKCS #11 URI has no module-path.", hint=_EXAMPLE)
+            raise UsageError("The PKCS #11 URI has no module-path.", hint=_EXAMPLE)
         unknown = ", ".join(name.removeprefix("?") for name in found.keys() - _PATH)
         if unknown:
-            raise UsageFailure(f"This tool does not know the PKCS #11 URI attribute {unknown}.", hint=_EXAMPLE)
+            raise UsageError(f"This tool does not know the PKCS #11 URI attribute {unknown}.", hint=_EXAMPLE)
         if found.get("type", b"private") != b"private":
-            raise UsageFailure("The PKCS #11 URI names another type than a private key.")
+            raise UsageError("The PKCS #11 URI names another type than a private key.")
         slot = _number("slot-id", found.get("slot-id"))
         texts = {name: _text(name, found.get(name)) for name in ("token", "serial", "manufacturer", "model", "object")}
         return cls(
@@ -69,26 +69,26 @@ def _attributes(part: str, separator: str) -> dict[str, bytes]:
     for pair in part.split(separator) if part else ():
         name, equals, value = pair.partition("=")
         if not equals or not name or name in found:
-            raise UsageFailure(f"The PKCS #11 URI has no or two values for {name!r}.", hint=_EXAMPLE)
+            raise UsageError(f"The PKCS #11 URI has no or two values for {name!r}.", hint=_EXAMPLE)
         found[name] = unquote_to_bytes(value)
     return found
 
 
 def _refuse(found: dict[str, bytes]) -> None:
     if any(name.removeprefix("?") in _SECRETS for name in found):
-        raise UsageFailure(
+        raise UsageError(
             "A PKCS #11 URI may not hold a PIN or say where one lies.",
             hint="Remove pin-value and pin-source: you are asked for the PIN, or pass it with --passphrase-fd.",
         )
     if "?module-name" in found:
-        raise UsageFailure("Use module-path, not module-name.", hint=_EXAMPLE)
+        raise UsageError("Use module-path, not module-name.", hint=_EXAMPLE)
 
 
 def _number(name: str, octets: bytes | None) -> int | None:
     if octets is None:
         return None
     if not octets.isdigit():
-        raise UsageFailure(f"The {name} of the PKCS #11 URI is not a number.")
+        raise UsageError(f"The {name} of the PKCS #11 URI is not a number.")
     return int(octets)
 
 
@@ -96,7 +96,7 @@ def _text(name: str, octets: bytes | None) -> str | None:
     try:
         text = None if octets is None else octets.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise UsageFailure(f"The {name} of the PKCS #11 URI is not UTF-8.") from error
+        raise UsageError(f"The {name} of the PKCS #11 URI is not UTF-8.") from error
     if text is not None and not (text and text.isprintable()):
-        raise UsageFailure(f"The {name} of the PKCS #11 URI is empty or not printable.")
+        raise UsageError(f"The {name} of the PKCS #11 URI is empty or not printable.")
     return text

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import VaultError
 from teds_provision.lazy import late
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint
 from teds_provision.vault.master import MasterKeys, Material, another_life
@@ -46,16 +46,16 @@ class SoftwareVault(ABC):
         return self._material.masters.wrap(key, context=context)
 
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
-        """Open a wrapped node key; raises VaultFailure if it is damaged or belongs elsewhere."""
+        """Open a wrapped node key; raises VaultError if it is damaged or belongs elsewhere."""
         return self._material.masters.unwrap(wrapped, context=context)
 
     def export_ca(self, path: Path, passphrase: str) -> None:
         """Write the CA key to ``path`` as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
 
-        Raises VaultFailure: no CA key here, weak passphrase, the file exists or cannot be written.
+        Raises VaultError: no CA key here, weak passphrase, the file exists or cannot be written.
         """
         if self._material.ca is None:
-            raise VaultFailure(
+            raise VaultError(
                 "This vault does not contain a CA key.", hint="It was exported and dropped, or never created here."
             )
         ca_file.write_ca(path, self._material.ca, passphrase)
@@ -71,12 +71,12 @@ class SoftwareVault(ABC):
     def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
         """Take in the CA key that :meth:`export_ca` wrote, and return it.
 
-        Raises WrongPassphrase, VaultFailure (not such a file, or another CA key is here), NotFound.
+        Raises WrongPassphraseError, VaultError (not such a file, or another CA key is here), NotFoundError.
         """
         secret = ca_file.read_ca(path, passphrase)
         self.refresh()
         if self._material.ca not in (None, secret):
-            raise VaultFailure("This vault contains a different CA key.", hint="Export and drop that one first.")
+            raise VaultError("This vault contains a different CA key.", hint="Export and drop that one first.")
         if self._material.ca is None:
             self._replace(self._material.with_ca(secret))
         return SoftwareKey.from_secret(secret)
@@ -88,18 +88,18 @@ class SoftwareVault(ABC):
     def refresh(self) -> bool:
         """Take in what another process has written since; False where nothing was. Nobody is asked.
 
-        Raises VaultChanged where it lies under another passphrase now, VaultFailure where it is gone.
+        Raises VaultChangedError where it lies under another passphrase now, VaultError where it is gone.
         """
         there = self._load()
         if there == self._material:
             return False
         if there.identity != self._material.identity:
-            raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+            raise VaultError("The vault holds the keys of another station.", hint="Restore into another --home.")
         self._material = there
         return True
 
     def reread(self) -> None:
-        """Read the master keys again; raises VaultChanged, VaultFailure as :meth:`refresh` does."""
+        """Read the master keys again; raises VaultChangedError, VaultError as :meth:`refresh` does."""
         self.refresh()
 
     def master_keys(self) -> MasterKeys:
@@ -132,7 +132,7 @@ class SoftwareVault(ABC):
         self._material = material
 
     def join(self, restored: str) -> None:
-        """Take in what a backup brings (:meth:`secret_material`); raises VaultFailure if it is of another station."""
+        """Take in what a backup brings (:meth:`secret_material`); raises VaultError if it is of another station."""
         self.refresh()
         joined = settle(self._material, restored)
         if joined != self._material:
@@ -140,17 +140,17 @@ class SoftwareVault(ABC):
 
     @abstractmethod
     def _load(self) -> Material:
-        """What lies there now; raises VaultChanged where this vault's passphrase does not open it, VaultFailure."""
+        """What lies there now; raises VaultChangedError where this vault's passphrase does not open it, VaultError."""
 
     @abstractmethod
     def _save(self, material: Material) -> None:
-        """Write ``material`` durably in place of the old one, or raise VaultFailure and keep the old."""
+        """Write ``material`` durably in place of the old one, or raise VaultError and keep the old."""
 
 
 def settle(existing: Material | None, restored: str | None) -> Material:
     """Return the keys a vault shall hold: what is there, joined with what a backup brings, or new ones.
 
-    Raises VaultFailure if the backup is of another station than what is there.
+    Raises VaultError if the backup is of another station than what is there.
     """
     if restored is None:
         return existing or Material.generate()
@@ -159,7 +159,7 @@ def settle(existing: Material | None, restored: str | None) -> Material:
         return material
     here, there = existing.masters.keys, material.masters.keys
     if existing.identity != material.identity:
-        raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+        raise VaultError("The vault holds the keys of another station.", hint="Restore into another --home.")
     if any(here[number] != there[number] for number in here.keys() & there):
         raise another_life()
     return Material(existing.identity, existing.ca or material.ca, MasterKeys({**there, **here}))

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from teds_provision import client, ncap
 from teds_provision.api import bodies
 from teds_provision.api.operations import OPERATIONS, document
-from teds_provision.api.schema import BadRequest, read, schema_of
+from teds_provision.api.schema import BadRequestError, read, schema_of
 
 BODIES = [one.body for one in OPERATIONS if one.body is not None]
 SCHEMAS = document()["components"]["schemas"]
@@ -38,7 +38,7 @@ def test_a_body_is_refused_exactly_where_its_published_schema_forbids_it(body: t
     try:
         read(body, json.dumps(members).encode())
         taken = True
-    except BadRequest:
+    except BadRequestError:
         taken = False
     assert taken == published
 
@@ -48,13 +48,13 @@ def test_a_text_is_as_long_as_its_published_schema_lets_it_be(match: str) -> Non
     published = jsonschema.Draft202012Validator(schema_of(bodies.NewMeasurement, {})).is_valid({"match": match})
     assert published == (0 < len(match) <= 1000)
     said = f"'match' must have 1 to 1000 characters, not {len(match)}."
-    with nullcontext() if published else pytest.raises(BadRequest, match=said):
+    with nullcontext() if published else pytest.raises(BadRequestError, match=said):
         assert read(bodies.NewMeasurement, json.dumps({"match": match}).encode()).match == match
 
 
 def test_the_end_of_a_pattern_is_the_end_of_the_text() -> None:
     """ECMA 262, which JSON Schema means, lets no line end pass before ``$``; Python does."""
-    with pytest.raises(BadRequest, match="'profile' must match"):
+    with pytest.raises(BadRequestError, match="'profile' must match"):
         read(bodies.Order, b'{"profile": "gripper\\n"}')
 
 
@@ -64,7 +64,7 @@ def test_the_end_of_a_pattern_is_the_end_of_the_text() -> None:
 @example("[" * 100_000)
 @example("1" * 5000)
 def test_what_is_no_json_object_is_refused_and_nothing_worse(text: str) -> None:
-    with suppress(BadRequest):
+    with suppress(BadRequestError):
         assert read(bodies.Nothing, text.encode()) == bodies.Nothing()
 
 
@@ -77,7 +77,7 @@ def test_what_is_no_json_object_is_refused_and_nothing_worse(text: str) -> None:
     ],
 )
 def test_equal_keys_are_refused_at_every_depth(text: str) -> None:
-    with pytest.raises(BadRequest, match="appears twice"):
+    with pytest.raises(BadRequestError, match="appears twice"):
         read(bodies.Detection, text.encode())
 
 
@@ -85,13 +85,13 @@ def test_equal_keys_are_refused_at_every_depth(text: str) -> None:
 def test_a_body_is_utf_8_without_a_byte_order_mark(form: str) -> None:
     text = '{"name": "pr\u00fcfstand", "uuids": []}'
     assert read(bodies.NewGroup, text.encode()).name == "pr\u00fcfstand"
-    with pytest.raises(BadRequest, match="not valid JSON"):
+    with pytest.raises(BadRequestError, match="not valid JSON"):
         read(bodies.NewGroup, text.encode(form))
 
 
 def test_a_member_that_is_null_is_as_one_that_is_not_there() -> None:
     assert read(bodies.NewVirtual, b'{"profile": "gripper", "name": null}') == bodies.NewVirtual(profile="gripper")
-    with pytest.raises(BadRequest, match="'mode' must be"):
+    with pytest.raises(BadRequestError, match="'mode' must be"):
         read(bodies.Detection, b'{"mode": null}')
 
 
@@ -114,7 +114,7 @@ def test_whole_numbers_and_numbers_come_as_what_they_are() -> None:
     ],
 )
 def test_a_refusal_names_the_member_and_what_it_may_be(body: type[Any], members: dict[str, Any], said: str) -> None:
-    with pytest.raises(BadRequest) as refused:
+    with pytest.raises(BadRequestError) as refused:
         read(body, json.dumps(members).encode())
     assert said in refused.value.message
 

@@ -14,7 +14,7 @@ import pytest
 from teds_provision.backup import sealed_file as backup_file
 from teds_provision.backup.restore import open_present
 from teds_provision.backup.sealed_file import SealedFile, Sealer
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, WrongPassphrase
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, WrongPassphraseError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
 from teds_provision.store import NodeRecord, Store
@@ -41,18 +41,18 @@ def test_a_wrong_passphrase_and_every_kind_of_damage_are_told_apart(station: Sta
     path = tmp_path / "station.backup"
     back_up(station, path)
     octets = path.read_bytes()
-    with pytest.raises(WrongPassphrase):
+    with pytest.raises(WrongPassphraseError):
         opened_octets(tmp_path, octets, "other words here")
     step = max(1, len(octets) // 150)
     for place_ in range(0, len(octets) - 1, step):
         changed = bytearray(octets)
         changed[place_] ^= 1
-        with pytest.raises((NotAuthentic, BadData)):
+        with pytest.raises((NotAuthenticError, BadDataError)):
             opened_octets(tmp_path, bytes(changed))
-    with pytest.raises((BadData, NotAuthentic)):
+    with pytest.raises((BadDataError, NotAuthenticError)):
         opened_octets(tmp_path, octets + b"more")
     for length in (0, 1, 70, len(octets) // 2, len(octets) - 2):
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             opened_octets(tmp_path, octets[:length])
 
 
@@ -64,14 +64,14 @@ def test_who_recomputes_the_digest_still_needs_the_passphrase(station: Station, 
     document.pop("sha256")
     document["created"] = "2030-01-01T00:00:00Z"
     forged = backup_file.dump({**document, "sha256": backup_file.digest_of(document)})
-    with pytest.raises(WrongPassphrase):
+    with pytest.raises(WrongPassphraseError):
         opened_octets(tmp_path, forged + b"\n" + chunks)
 
 
 @pytest.mark.parametrize("octets", [b"", b"{}", b"[]", b"\0" * 1000, b'{"format": "teds-image/1"}', b"{" * 100_000])
 def test_what_is_no_backup_is_bad_data(tmp_path: Path, octets: bytes) -> None:
     (tmp_path / "b").write_bytes(octets)
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         SealedFile(tmp_path / "b")
 
 
@@ -82,10 +82,10 @@ def test_a_recovery_key_opens_it_and_no_other(station: Station, tmp_path: Path) 
     assert sealed.is_for_key
     with sealed.open_with_key(recovery) as content:
         assert content.point == station.point
-    with pytest.raises(PolicyRefused, match="sealed to the recovery key"):
+    with pytest.raises(PolicyError, match="sealed to the recovery key"):
         sealed.open_with_key(SoftwareKey.generate())
     path.write_bytes(path.read_bytes().replace(b'"tag":"', b'"tag":"A', 1))
-    with pytest.raises((NotAuthentic, BadData)):
+    with pytest.raises((NotAuthenticError, BadDataError)):
         SealedFile(path).open_with_key(recovery)
 
 
@@ -96,14 +96,14 @@ def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Stati
     sealer = Sealer(recovery=recovery.point)
     with SealedFile(path).open_with_key(recovery) as real, path.open("wb") as file:
         backup_file.write(file, real, rows.dump(real.copy), forger, sealer)
-    with pytest.raises(NotAuthentic, match="not signed"):
+    with pytest.raises(NotAuthenticError, match="not signed"):
         SealedFile(path).open_with_key(recovery)
     with copy_of(station, tmp_path) as real, path.open("wb") as file:
         backup_file.write(file, replace(real, point=forger.point), rows.dump(real.copy), forger, sealer)
     forged = SealedFile(path).open_with_key(recovery)
-    with pytest.raises(PolicyRefused, match=r"the store in .* is of station"):
+    with pytest.raises(PolicyError, match=r"the store in .* is of station"):
         open_present(station.home, forged)
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         restored_into(tmp_path / "new", forged)
     assert not (tmp_path / "new" / "store.sqlite3").exists()
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
 from teds_provision.backup.sealed_file import SealedFile
-from teds_provision.errors import BadData, NotAuthentic, StoreFailure
+from teds_provision.errors import BadDataError, NotAuthenticError, StoreError
 from teds_provision.station.station import Station
 from teds_provision.store import Draft
 from teds_provision.store import dump as rows
@@ -45,7 +45,7 @@ def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp
     cut_at_a_chunk = octets[: head + 2 * full]
     ended_early = cut_at_a_chunk + b"teds-backup end\n"
     for changed in (swapped, dropped, doubled, cut_at_a_chunk, ended_early):
-        with pytest.raises((NotAuthentic, BadData)):
+        with pytest.raises((NotAuthenticError, BadDataError)):
             opened_octets(tmp_path, changed)
 
 
@@ -53,7 +53,7 @@ def test_a_chunk_of_another_backup_of_the_same_station_does_not_fit(station: Sta
     back_up(station, tmp_path / "a")
     back_up(station, tmp_path / "b")
     (head, _), (_, chunks) = ((tmp_path / name).read_bytes().split(b"\n", 1) for name in "ab")
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         opened_octets(tmp_path, head + b"\n" + chunks)
 
 
@@ -67,9 +67,9 @@ def test_any_length_goes_through_the_chunks(length: int) -> None:
     assert reader.read(length) == b"x" * length
     reader.require_end()
     assert reader.digest.digest() == writer.digest.digest()
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         reader.read(1)
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         ChunkReader(io.BytesIO(out.getvalue()), key, b"other").require_end()
 
 
@@ -79,7 +79,7 @@ def test_any_length_goes_through_the_chunks(length: int) -> None:
 def test_backups_of_version_1_are_refused_by_name(tmp_path: Path, line: str) -> None:
     file = tmp_path / "old.backup"
     file.write_text(line)
-    with pytest.raises(StoreFailure, match="before KeyAgreement 2"):
+    with pytest.raises(StoreError, match="before KeyAgreement 2"):
         SealedFile(file)
 
 
@@ -92,7 +92,7 @@ class Octets:
     def read(self, size: int) -> bytes:
         octets = self._octets.read(size)
         if len(octets) < size:
-            raise BadData("too early")
+            raise BadDataError("too early")
         return octets
 
     def read_line(self, limit: int) -> bytes:
@@ -129,18 +129,18 @@ def head(tables: dict[str, list[str]], schema: object = SCHEMA_VERSION) -> bytes
     ],
 )
 def test_rows_that_are_none_are_bad_data(octets: bytes) -> None:
-    with pytest.raises((BadData, StoreFailure)):
+    with pytest.raises((BadDataError, StoreError)):
         rows.load(Octets(octets))
 
 
 @given(st.binary(max_size=200))
 def test_no_octets_make_a_dump_raise_anything_foreign(octets: bytes) -> None:
-    with pytest.raises((BadData, StoreFailure)):
+    with pytest.raises((BadDataError, StoreError)):
         rows.load(Octets(head({"meta": ["name", "value"], "nodes": []}) + octets))
-    with pytest.raises((BadData, StoreFailure)):
+    with pytest.raises((BadDataError, StoreError)):
         rows.load(Octets(head({"meta": ["name", "value"]}) + octets))
 
 
 def test_a_newer_schema_is_not_guessed_at() -> None:
-    with pytest.raises(StoreFailure, match="knows up to"):
+    with pytest.raises(StoreError, match="knows up to"):
         rows.load(Octets(head({}, SCHEMA_VERSION + 1) + b"\xff\0\0\0\0"))

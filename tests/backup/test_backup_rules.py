@@ -13,7 +13,7 @@ import pytest
 from teds_provision.backup.backup import backup
 from teds_provision.backup.content import BackupHead
 from teds_provision.backup.restore import rebuild
-from teds_provision.errors import PolicyRefused, StoreFailure, StoreLocked, UsageFailure
+from teds_provision.errors import PolicyError, StoreError, StoreLockedError, UsageError
 from teds_provision.station.station import Station
 from teds_provision.store import StoreLock
 from teds_provision.vault.passphrase import THROWAWAY
@@ -27,7 +27,7 @@ def test_after_a_restore_every_key_has_to_be_rotated_by_a_person(station: Statio
     again = Station.open(tmp_path / "new", ask=ask)
     for uuid in (ONE, TWO):
         assert "restored from a backup" in (again.keys.rotation_due(uuid) or "")
-        with pytest.raises(PolicyRefused, match="restored from a backup"):
+        with pytest.raises(PolicyError, match="restored from a backup"):
             again.policy.require_not_restored(uuid)
     again.keys.rotated(ONE)
     again.policy.require_not_restored(ONE)
@@ -38,9 +38,9 @@ def test_no_module_path_goes_into_a_backup_or_comes_out_of_one(station: Station,
     with copy_of(station, tmp_path) as content:
         evil = replace(content, keystore="pkcs11:token=x?module-path=/tmp/evil.so")
         for asked in (None, "file"):
-            with pytest.raises((UsageFailure, PolicyRefused)):
+            with pytest.raises((UsageError, PolicyError)):
                 rebuild(tmp_path / "new", evil, ask, keystore=asked)
-        with pytest.raises(UsageFailure, match="no such keystore"):
+        with pytest.raises(UsageError, match="no such keystore"):
             rebuild(tmp_path / "new", replace(content, keystore="other"), ask)
     assert not (tmp_path / "new").exists()
 
@@ -54,7 +54,7 @@ def test_a_backup_beside_a_stuck_writer_says_so_and_leaves_no_file(
         Station, "lock", lambda self, command, notice: StoreLock(self.home, command=command, wait=1.0, notice=notice)
     )
     before = station.audit_log.check().count
-    with held, pytest.raises(StoreLocked):
+    with held, pytest.raises(StoreLockedError):
         backup(station, tmp_path / "b", ask, costs=THROWAWAY, notice=told.append)
     assert len(told) == 1
     assert "provision" in told[0]
@@ -66,7 +66,7 @@ def test_a_backup_that_does_not_open_again_is_not_kept(
     station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("teds_provision.backup.sealed_file.MAX_OCTETS", 1000)
-    with pytest.raises(StoreFailure, match="cannot be opened"):
+    with pytest.raises(StoreError, match="cannot be opened"):
         back_up(station, tmp_path / "b")
     assert list(tmp_path.glob("*b")) == []
     assert station.audit_log.check().count == 1 + 1  # init and ready
@@ -87,7 +87,7 @@ def test_a_backup_beside_a_writer_of_the_file_itself_says_what_it_waits_for(
     monkeypatch.setattr("teds_provision.store.connection.BUSY_SECONDS", 0.5)
     with closing(sqlite3.connect(station.home / "store.sqlite3", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
-        with pytest.raises(StoreLocked):
+        with pytest.raises(StoreLockedError):
             back_up(station, tmp_path / "b")
         assert told == ["Waiting up to 0 s for another process that is writing to the store."]
         assert not (tmp_path / "b").exists()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.backup.restore import open_present
-from teds_provision.errors import NotFound, StoreFailure
+from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.station.station import Station
 from teds_provision.store import Store
 from teds_provision.store.snapshot import place
@@ -43,7 +43,7 @@ def test_killed_between_vault_and_store_the_same_command_carries_on(
         patch.setattr("teds_provision.backup.restore.place", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             restored_into(home, opened(path))
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         Station.open(home, ask=ask)
     restored_into(home, opened(path))
     again = Station.open(home, ask=ask)
@@ -69,7 +69,7 @@ def test_a_damaged_store_is_kept_under_another_name(station: Station, tmp_path: 
 
 
 def test_a_store_is_never_put_over_another(station: Station, tmp_path: Path) -> None:
-    with copy_of(station, tmp_path) as content, pytest.raises(StoreFailure, match="already"):
+    with copy_of(station, tmp_path) as content, pytest.raises(StoreError, match="already"):
         place(content.copy, station.home)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import complete_vault, merge, open_present, rebuild
-from teds_provision.errors import PolicyRefused, UsageFailure, VaultFailure
+from teds_provision.errors import PolicyError, UsageError, VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station, initialise
 from teds_provision.store import Holder, NodeRecord, RevocationRecord, Store, Tombstone, WhitelistEntry
@@ -151,7 +151,7 @@ def test_states_that_went_different_ways_keep_both_sides_newest(station: Station
 def test_the_backup_of_another_station_is_refused(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
     other = make_station(tmp_path / "other")
-    with pytest.raises(PolicyRefused, match=r"the store in .* is of station") as caught:
+    with pytest.raises(PolicyError, match=r"the store in .* is of station") as caught:
         open_present(tmp_path / "other", opened(tmp_path / "b"))
     assert caught.value.exit_code == 6
     other.close()
@@ -234,10 +234,10 @@ def test_a_token_keeps_its_keys_and_opens_the_restored_station(tmp_path: Path, m
         done = backup(station, tmp_path / "b", pin, costs=THROWAWAY)
         assert "cannot leave the token" in done.warnings[0]
         content = opened(tmp_path / "b")
-        with pytest.raises(PolicyRefused, match="in a token"):
+        with pytest.raises(PolicyError, match="in a token"):
             rebuild(tmp_path / "file", content, pin, keystore="file", costs=THROWAWAY)
         forget_vaults()
-        with pytest.raises(UsageFailure, match="which module"):
+        with pytest.raises(UsageError, match="which module"):
             rebuild(tmp_path / "new", content, pin)
         assert rebuild(tmp_path / "new", content, pin, keystore=uri).keystore == uri
         again = Station.open(tmp_path / "new", ask=pin)
@@ -250,6 +250,6 @@ def test_a_token_keeps_its_keys_and_opens_the_restored_station(tmp_path: Path, m
 
 
 def test_a_passphrase_that_is_none_is_refused_before_anything_is_written(station: Station, tmp_path: Path) -> None:
-    with pytest.raises(VaultFailure, match="too short"):
+    with pytest.raises(VaultError, match="too short"):
         backup(station, tmp_path / "b", lambda prompt, confirm: "short", costs=THROWAWAY)
     assert not (tmp_path / "b").exists()

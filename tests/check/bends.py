@@ -22,7 +22,7 @@ from teds_provision.protocol import datasheet
 from teds_provision.protocol.agreement import NodeAgreement, RequestPayload
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER, PrivateKey, SoftwareKey, normalise_signature, verify
-from teds_provision.protocol.messages.frames import Command, Function, Reason, Refused, Reply
+from teds_provision.protocol.messages.frames import Command, CommandRefusedError, Function, Reason, Reply
 from teds_provision.protocol.operation import role
 from teds_provision.protocol.session import NodeSession, SessionKeys, pad
 from teds_provision.protocol.tim import agreeing, node, sessions, teds_access
@@ -267,7 +267,7 @@ def signature_before_points(patch: Patch) -> None:
         if len(payload) == 259:
             said = RequestPayload.decode(payload)
             if not verify(said.ca, b"TEDS1 station key\0" + said.station, said.station_signature):
-                raise Refused(Reason.BAD_SIGNATURE)
+                raise CommandRefusedError(Reason.BAD_SIGNATURE)
         return original(self, payload, origin, flash)
 
     patch.setattr(Agreeing, "request", request)
@@ -428,7 +428,7 @@ def a_bad_point_costs_no_c(patch: Patch) -> None:
         before = self._opens
         try:
             return original(self, *args)
-        except Refused:
+        except CommandRefusedError:
             self._opens = before
             raise
 
@@ -498,7 +498,7 @@ def _refused_drops(
 ) -> Reply:
     try:
         reply: Reply = original(self, flash, command, staging, *more, now=now)
-    except Refused:
+    except CommandRefusedError:
         staging._images.pop(_block(command), None)
         raise
     return reply
@@ -558,7 +558,7 @@ def listed_is_enough(patch: Patch) -> None:
     def listed(flash: Flash, staged: Any, signed: Any) -> dict[Any, bytes]:
         found = {block: staged.get(block) or flash.teds(block) for block in signed.signed_blocks}
         if None in found.values() or staged.keys() - {(0, 128)} - found.keys():
-            raise Refused(Reason.DIGEST_MISMATCH)
+            raise CommandRefusedError(Reason.DIGEST_MISMATCH)
         return {block: teds for block, teds in found.items() if teds is not None}
 
     patch.setattr(teds_access, "_listed_blocks", listed)
@@ -572,7 +572,7 @@ def digest_of_data_blocks(patch: Patch) -> None:
         blocks = {block: staged.get(block) or flash.teds(block) for block in signed.signed_blocks}
         for block, teds in blocks.items():
             if teds is None or sha(teds[4:-2]) != signed.signed_blocks[block]:
-                raise Refused(Reason.DIGEST_MISMATCH)
+                raise CommandRefusedError(Reason.DIGEST_MISMATCH)
         right = {block: sha(teds) for block, teds in blocks.items() if teds is not None}
         return original(flash, staged, replace(signed, signed_blocks=right))
 
@@ -585,7 +585,7 @@ def a_refused_commit_counts(patch: Patch) -> None:
     def committed(flash: Flash, *args: Any) -> Flash:
         try:
             return original(flash, *args)
-        except Refused:
+        except CommandRefusedError:
             object.__setattr__(flash, "sequence", flash.sequence + 1)
             raise
 
@@ -617,7 +617,7 @@ def _decoded(text: Callable[[bytes], bytes]) -> Bend:
         original = security.decode
 
         class Lax:
-            NotCanonical = security.NotCanonical
+            NotCanonical = security.NotCanonicalError
 
             @staticmethod
             def decode(teds: bytes) -> Any:
@@ -666,13 +666,13 @@ def refuses_111(patch: Patch) -> None:
     original = security.decode
 
     class Strict:
-        NotCanonical = security.NotCanonical
+        NotCanonical = security.NotCanonicalError
 
         @staticmethod
         def decode(teds: bytes) -> Any:
             shown = original(teds)
             if shown.extra:
-                raise security.NotCanonical("A field 111 is unknown here.")
+                raise security.NotCanonicalError("A field 111 is unknown here.")
             return shown
 
     patch.setattr(teds_access, "security", Strict)

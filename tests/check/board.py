@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.can import isotp
 from teds_provision.node.can import seat
 from teds_provision.node.can.server import CanServer
@@ -120,7 +120,7 @@ class OnLinks:
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
         if self.mute and frame[2:4] != IDENTIFY.encode()[2:4]:
-            raise LinkFailure("It is mute.")
+            raise LinkError("It is mute.")
         with self._turn:
             board = self.board
             board.seconds = time.monotonic()

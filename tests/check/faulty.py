@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from teds_provision.errors import NodeSilent
+from teds_provision.errors import NodeSilentError
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey
 from teds_provision.protocol.messages.frames import (
     COMMON,
@@ -99,14 +99,14 @@ class FaultyBus(FaultyLink):
     def exchange(self, frame: bytes) -> bytes:
         now = self.board.tim.can_address
         if self.address != now and not self.stays_at_the_old:
-            raise NodeSilent("Nobody answers at this address.")
+            raise NodeSilentError("Nobody answers at this address.")
         if self._pair != now and self.address == now:
             self._pair = now
             self.board.tim.link_lost(self.name)
             self.repetition.forget()
         reply = super().exchange(frame)
         if self.moves_too_soon and self.board.tim.can_address != now:
-            raise NodeSilent("The reply begins and does not end.")
+            raise NodeSilentError("The reply begins and does not end.")
         return reply
 
     def beside(self, source: int) -> FaultyBus:

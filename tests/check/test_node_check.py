@@ -11,7 +11,7 @@ import pytest
 from teds_provision.check.agreement import Explained
 from teds_provision.check.rule import RULES, Stage
 from teds_provision.check.run import CheckReport, check_node
-from teds_provision.errors import Garbled, NodeSilent, PolicyRefused, TooLongForNode
+from teds_provision.errors import GarbledError, MessageTooLongError, NodeSilentError, PolicyError
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -87,11 +87,11 @@ def agreed(station: Station, board: Board) -> None:
 
     def cut(_board: Board, octets: bytes, reference: faulty.Next) -> bytes:
         if board.state.key is not None:
-            raise NodeSilent("The power of the station went.")
+            raise NodeSilentError("The power of the station went.")
         return reference(octets)
 
     report = checked(station, board, fault=cut)
-    assert isinstance(report.lost, NodeSilent)
+    assert isinstance(report.lost, NodeSilentError)
     assert "power of the station" in report.lost.message
     assert board.state.state == NodeState.KEYED
 
@@ -134,7 +134,7 @@ def test_a_node_of_another_owner_is_left_alone(station: Station, tmp_path: Path,
     rival, board = make_station(tmp_path / "rival", "rival"), Board()
     agreed(rival, board)
     before, link = board.state, FaultyLink(board)
-    with pytest.raises(PolicyRefused, match="does not hold"):
+    with pytest.raises(PolicyError, match="does not hold"):
         check_node(station, talk(board, link), factory=factory)
     assert board.state == before
     assert [frame[2:4] for frame in link.frames] == [b"\x80\x07"], "nothing but Identify was asked"
@@ -151,7 +151,7 @@ def test_a_reply_that_is_torn_each_time_is_the_nodes_fault(station: Station, via
     class Torn(FaultyLink):
         def exchange(self, frame: bytes) -> bytes:
             if frame[2:4] == bytes([128, 99]):
-                raise Garbled("The node keeps asking for the same pieces.")
+                raise GarbledError("The node keeps asking for the same pieces.")
             return super().exchange(frame)
 
     report = check_node(station, talk(board := Board(), Torn(board, via=via)))
@@ -183,7 +183,7 @@ def test_a_board_that_refuses_what_it_announces_fails_and_is_not_skipped(
     class Short(FaultyLink):
         def exchange(self, frame: bytes) -> bytes:
             if len(frame) > 512:
-                raise TooLongForNode("The node refuses it (flow control: overflow).")
+                raise MessageTooLongError("The node refuses it (flow control: overflow).")
             return super().exchange(frame)
 
     board = Board(max_message=1024)
@@ -278,7 +278,7 @@ def test_a_node_that_falls_silent_loses_no_report(station: Station, via: str) ->
     def hangs(board: Board, octets: bytes, reference: faulty.Next) -> bytes:
         if board.max_message == 0 or octets[2:] == bytes([1, 1, 0, 1, 128]):
             board.max_message = 0
-            raise NodeSilent("The node no longer answers.")
+            raise NodeSilentError("The node no longer answers.")
         return reference(octets)
 
     report = checked(station, Board(), fault=hangs, via=via)

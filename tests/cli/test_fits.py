@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyError
 from teds_provision.steps.inventory import NodeFit, require
 from teds_provision.store import NodeRecord, Store
 from teds_provision.teds.calibration import fit
@@ -74,7 +74,7 @@ def test_a_group_that_does_not_suffice_is_refused_with_what_it_has() -> None:
     (named,) = parse_require('["Joint 3"]\nrate = "1 kHz"', "task.toml")
     good, bad = Fit(1, "a", "passed", "fine."), Fit(1, "a", "failed", "uncertainty is 5 °.")
     require([NodeFit(GOOD, requirement, bad), NodeFit(COARSE, requirement, good)])
-    with pytest.raises(PolicyRefused, match="uncertainty is 5 °"):
+    with pytest.raises(PolicyError, match="uncertainty is 5 °"):
         require([NodeFit(GOOD, requirement, bad)])
-    with pytest.raises(PolicyRefused, match="Joint 3"):
+    with pytest.raises(PolicyError, match="Joint 3"):
         require([NodeFit(GOOD, named, good), NodeFit(COARSE, named, bad)])

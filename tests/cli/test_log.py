@@ -16,9 +16,9 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.steps.batch_sheet import Declined
-from teds_provision.steps.board_type import WrongBoard
-from teds_provision.steps.build import NotNamed
+from teds_provision.steps.batch_sheet import DeclinedError
+from teds_provision.steps.board_type import WrongBoardError
+from teds_provision.steps.build import UnrequestedChangeError
 from teds_provision.store import Store
 from tests.terminal import on_terminal
 
@@ -155,7 +155,7 @@ def errors(kind: type[TedsProvisionError] = TedsProvisionError) -> set[str]:
 
 def test_what_ended_with_an_error_of_any_kind_is_among_the_failed(home: Path) -> None:
     """A "no" at the question, a board of another owner, one that fell silent: they were left out."""
-    codes = errors() | {NotNamed.code, Declined.code, WrongBoard.code}
+    codes = errors() | {UnrequestedChangeError.code, DeclinedError.code, WrongBoardError.code}
     assert {"declined", "not-named", "node-refused", "node-silent", "not-whitelisted", "bad-data"} <= codes
     with Store.open(home) as store:
         for code in sorted(codes):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NoNode, NoReader
+from teds_provision.errors import NoNodeError, NoReaderError
 from teds_provision.links.can import bus as can_bus
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.nfc.port import NfcPort
@@ -89,7 +89,7 @@ def test_a_kernel_without_can_is_called_that(monkeypatch: pytest.MonkeyPatch) ->
             raise OSError(number, "as the system says it")
 
         monkeypatch.setattr(can_bus, "_opened", fails)
-        with pytest.raises(NoReader) as told:
+        with pytest.raises(NoReaderError) as told:
             can_bus.Bus(parse_spec("socketcan:can7"))
         assert told.value.message == said
         assert cure in told.value.hint
@@ -103,7 +103,7 @@ def test_another_board_on_the_reader_is_named(tmp_path: Path) -> None:
     try:
         node = desk.node().start()
         port = NfcPort(desk.links.nfc)
-        with pytest.raises(NoNode) as told:
+        with pytest.raises(NoNodeError) as told:
             port.find(lambda identity: False, seconds=1.5, notice=lambda notice: None)
         port.close()
     finally:

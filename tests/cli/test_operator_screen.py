@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from teds_provision.cli.provision import BoardReporter, OperatorScreen
-from teds_provision.errors import NodeSilent, TedsProvisionError
-from teds_provision.steps.batch_sheet import BoardResult, Declined, SheetRow
+from teds_provision.errors import NodeSilentError, TedsProvisionError
+from teds_provision.steps.batch_sheet import BoardResult, DeclinedError, SheetRow
 from teds_provision.steps.build import BuildOrder, Prepared
 from teds_provision.talk.progress import Silent
 
@@ -91,7 +91,7 @@ def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> Non
     terminal = Terminal(Batch(next_row=row(1)))
     reporter = BoardReporter(Silent())
     reporter.begun = terminal.screen.begun
-    terminal.screen.ended(failed(1, NodeSilent("It is silent.")))
+    terminal.screen.ended(failed(1, NodeSilentError("It is silent.")))
     ended = terminal.lines
     assert any(line.startswith(">>> TAKE IT OFF. TAP THE BOARD FOR ROW 1") for line in ended)
     reporter.started("identify")
@@ -104,7 +104,7 @@ def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> Non
 
 def test_the_worst_board_of_many_fits_on_24_lines_with_its_cause_and_cure() -> None:
     terminal = Terminal(Batch(passed=48, next_row=row(1)))
-    error = NodeSilent("The node no longer answers. " * 9, hint="Put it back, and hold it flat.")
+    error = NodeSilentError("The node no longer answers. " * 9, hint="Put it back, and hold it flat.")
     for number in range(1, 8):
         terminal.screen.ended(failed(number, error))
     lines = terminal.lines
@@ -117,7 +117,7 @@ def test_the_worst_board_of_many_fits_on_24_lines_with_its_cause_and_cure() -> N
 
 def test_cause_and_cure_of_a_failure_are_both_told() -> None:
     terminal = Terminal(Batch(next_row=row(1)))
-    terminal.screen.ended(failed(3, NodeSilent("The node is silent.", hint="Put it back.")))
+    terminal.screen.ended(failed(3, NodeSilentError("The node is silent.", hint="Put it back.")))
     assert "The node is silent. → Put it back." in terminal.lines
-    terminal.screen.ended(failed(3, Declined("You said no.")))
+    terminal.screen.ended(failed(3, DeclinedError("You said no.")))
     assert any("SKIPPED" in line for line in terminal.lines)

@@ -13,7 +13,7 @@ from rich.spinner import Spinner
 from teds_provision.cli.context import App
 from teds_provision.cli.provision import _questions
 from teds_provision.cli.rendering import LiveReporter, tidy
-from teds_provision.errors import NotAuthentic
+from teds_provision.errors import NotAuthenticError
 from teds_provision.links import Notice
 from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.steps.agree import agree
@@ -33,7 +33,7 @@ ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 def test_a_result_and_its_error_are_one_object(capsys: pytest.CaptureFixture[str]) -> None:
     app = App(as_json=True)
     with pytest.raises(click.exceptions.Exit) as ended:
-        app.conclude({"verdict": "unsigned"}, None, NotAuthentic("Nobody signed it.", hint="Sign it."))
+        app.conclude({"verdict": "unsigned"}, None, NotAuthenticError("Nobody signed it.", hint="Sign it."))
     assert ended.value.exit_code == 4
     said = json.loads(capsys.readouterr().out)
     assert said["verdict"] == "unsigned"
@@ -41,8 +41,8 @@ def test_a_result_and_its_error_are_one_object(capsys: pytest.CaptureFixture[str
 
 
 def test_people_see_the_result_before_the_error(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(NotAuthentic):
-        App().conclude({}, "all checks", NotAuthentic("Nobody signed it."))
+    with pytest.raises(NotAuthenticError):
+        App().conclude({}, "all checks", NotAuthenticError("Nobody signed it."))
     assert capsys.readouterr().out == "all checks\n"
 
 
@@ -84,7 +84,7 @@ def test_nothing_that_a_tag_says_steers_the_terminal(capsys: pytest.CaptureFixtu
     app = App()
     app.note("a\x1b[2Jb\u202ec\u009b")
     app.warn("a\x1b[2Jb")
-    app.fail_line(NotAuthentic("a\x1b[2Jb\r", hint="c\x9bd"))
+    app.fail_line(NotAuthenticError("a\x1b[2Jb\r", hint="c\x9bd"))
     app.emit({}, "a\x1b[2Jb\nnext [line]")
     said = capsys.readouterr()
     assert said.out == "a?[2Jb\nnext [line]\n"

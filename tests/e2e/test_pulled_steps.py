@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import port
 from teds_provision.station.station import Station as BaseStation
@@ -64,7 +64,7 @@ def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str
             field.put(board)
             pulled = next(came)
             assert (pulled.uuid.hex(), pulled.result) == (uuid, "failed"), (point, pulled)
-            assert isinstance(pulled.failure, LinkFailure), (point, pulled.failure)
+            assert isinstance(pulled.failure, LinkError), (point, pulled.failure)
             for next_uuid, next_path in ((other, other_path), (uuid, board)):
                 field.put(next_path)
                 done = next(came)

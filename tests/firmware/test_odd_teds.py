@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.datasheet import own_values, passes_own_check
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame, unframe
@@ -37,7 +37,7 @@ def canonical(block: bytes) -> bool:
     """Whether the reference takes this data block for that of a signed Security TEDS with its own values."""
     try:
         teds = security.decode_block(block)
-    except BadData:
+    except BadDataError:
         return False
     signed = None not in (teds.signature, teds.station_key, teds.station_key_signature)
     return signed and own_values(teds)

@@ -59,7 +59,7 @@ def reads(*readers: Callable[[], object]) -> None:
 def check_teds(data: bytes) -> None:
     """The decoder; even first octet: as it is, odd: a data block that gets Length and checksum first."""
     from teds_provision import teds
-    from teds_provision.errors import BadData
+    from teds_provision.errors import BadDataError
     from teds_provision.teds.codec.frame import frame
 
     if not data:
@@ -72,18 +72,18 @@ def check_teds(data: bytes) -> None:
     try:
         teds.decode(octets, strict=True)
         assert not errors
-    except BadData:
+    except BadDataError:
         assert errors
     try:
         again = teds.recompose(decoded)
-    except BadData:
+    except BadDataError:
         assert decoded.verdict in {"malformed", "message"}
     else:
         assert again == octets or decoded.verdict not in {"clean", "block-clean"}
     for edition in (2007, 2024):
         try:
             other, findings = teds.convert(decoded, edition)
-        except BadData:
+        except BadDataError:
             continue
         if decoded.verdict == "clean" and not findings:
             assert teds.decode(other).edition == edition
@@ -192,7 +192,7 @@ def frame_seeds() -> Iterable[bytes]:
 
 def check_operation(data: bytes) -> None:
     """Payloads and data frames of measurement operation, as node and as station."""
-    from teds_provision.protocol.messages.frames import Refused
+    from teds_provision.protocol.messages.frames import CommandRefusedError
     from teds_provision.protocol.operation import can_frames, commands, datagram
 
     for read in (
@@ -205,7 +205,7 @@ def check_operation(data: bytes) -> None:
         lambda: commands.channel_list(data, 16),
         lambda: datagram.DatagramSealer(bytes(16)).open(data),
     ):
-        with suppress(TedsProvisionError, Refused):
+        with suppress(TedsProvisionError, CommandRefusedError):
             read()
     can_frames.read_ble_frame(data)
     assembly = can_frames.StreamAssembly(63, fd=bool(data[:1] and data[0] & 1))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyError
 from teds_provision.handover.incoming import prove_node
 from teds_provision.handover.pending import close
 from teds_provision.steps.agree import agree
@@ -64,7 +64,7 @@ def test_a_rotation_by_one_locks_the_other_out_and_is_told(pair: Pair) -> None:
     with talk(pair.board) as node:
         agree(pair.south, node, identify(pair.south, node), rotate=True)
     assert pair.south.keys.holders() == []
-    with talk(pair.board) as node, pytest.raises(PolicyRefused, match="knows none of the keys"):
+    with talk(pair.board) as node, pytest.raises(PolicyError, match="knows none of the keys"):
         agree(pair.north, node, identify(pair.north, node))
     assert session(pair.south, pair.board) == 2
 

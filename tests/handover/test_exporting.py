@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.handover.incoming import ImportPlan, plan_import
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.handover.pending import close, find_handover, undo
@@ -37,7 +37,7 @@ def test_a_bundle_file_is_private_and_never_overwritten(pair: Pair) -> None:
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     occupied = pair.folder / "occupied"
     occupied.write_text("a letter")
-    with pytest.raises(UsageFailure, match="already exists"):
+    with pytest.raises(UsageError, match="already exists"):
         pair.export("move", output=occupied)
     assert occupied.read_text() == "a letter"
     assert pair.north.policy.tombstones() == []
@@ -63,18 +63,18 @@ def test_only_a_proven_key_is_handed_over(pair: Pair) -> None:
     other = Board(uuid=bytes.fromhex("8d4d9da65281f700ffff"))
     pair.take(pair.export("copy")[0])
     trust(pair.south, pair.north)
-    with pytest.raises(PolicyRefused, match="never proven"):
+    with pytest.raises(PolicyError, match="never proven"):
         plan_export(pair.south, ExportOrder(("north",), (pair.board.uuid,)))
-    with pytest.raises(PolicyRefused, match="holds no key for it"):
+    with pytest.raises(PolicyError, match="holds no key for it"):
         plan_export(pair.north, ExportOrder(("south",), (other.uuid,)))
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         plan_export(pair.south, ExportOrder(("north",), None))
 
 
 def test_a_key_that_is_due_for_rotation_is_not_handed_over(pair: Pair) -> None:
     _, exported = pair.export("move")
     undo(pair.north, find_handover(pair.north, exported.plan.id))
-    with pytest.raises(PolicyRefused, match="must be rotated first"):
+    with pytest.raises(PolicyError, match="must be rotated first"):
         plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,)))
 
 
@@ -83,7 +83,7 @@ def test_a_moved_node_is_not_handed_to_someone_else(pair: Pair, tmp_path: Path) 
     west = make_station(tmp_path / "west", "west")
     trust(pair.north, west)
     for mode in ("copy", "move"):
-        with pytest.raises(PolicyRefused, match="was moved to station"):
+        with pytest.raises(PolicyError, match="was moved to station"):
             plan_export(pair.north, ExportOrder(("west",), (pair.board.uuid,), mode))  # type: ignore[arg-type]
     west.close()
 
@@ -91,7 +91,7 @@ def test_a_moved_node_is_not_handed_to_someone_else(pair: Pair, tmp_path: Path) 
 def test_without_the_ca_key_the_receiver_must_be_certified_already(pair: Pair) -> None:
     signature = pair.north.identity.certify(pair.south.point)
     pair.north.vault.drop_ca()  # type: ignore[attr-defined]
-    with pytest.raises(PolicyRefused, match="not certified by the CA"):
+    with pytest.raises(PolicyError, match="not certified by the CA"):
         pair.export("copy")
     pair.north.identity.keep_certificate(pair.north.ca, pair.south.point, signature)
     pair.take(pair.export("copy")[0])
@@ -103,7 +103,7 @@ def test_nodes_of_two_cas_go_in_two_bundles(pair: Pair) -> None:
     session(pair.south, pair.board)
     own = Board(uuid=bytes.fromhex("8d4d9da65281f700ffff"))
     key_up(pair.south, own)
-    with pytest.raises(PolicyRefused, match="2 different CA keys"):
+    with pytest.raises(PolicyError, match="2 different CA keys"):
         plan_export(pair.south, ExportOrder(("north",), None))
     from teds_provision.protocol.keys import fingerprint
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.handover import trust as fleet
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
@@ -80,7 +80,7 @@ def test_a_certified_station_has_the_owners_ca_and_no_ca_key(pair: tuple[Station
     for station in pair:
         assert station.ca == owner.ca
         assert station.vault.ca() is None
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundError):
             station.identity.certify(owner.point)
 
 
@@ -88,9 +88,9 @@ def test_until_it_is_certified_a_station_does_nothing(tmp_path: Path) -> None:
     home = tmp_path / "east"
     first = request(home, "east")
     assert read_request(request(home, "other name")) == read_request(first)
-    with pytest.raises(NotFound, match="waiting for its CA's certificate"):
+    with pytest.raises(NotFoundError, match="waiting for its CA's certificate"):
         Station.open(home, ask=ask)
-    with pytest.raises(NotFound, match="waiting for its CA's certificate"):
+    with pytest.raises(NotFoundError, match="waiting for its CA's certificate"):
         initialise(home, name=None, keystore="file", ask=ask)
 
 
@@ -113,16 +113,16 @@ def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
     provisioned(one, board)
     other.pins.put(WhitelistEntry(board.uuid))
     before, asked = board.state, list[str]()
-    with talk(board) as node, pytest.raises(PolicyRefused, match="lock out the current holder"):
+    with talk(board) as node, pytest.raises(PolicyError, match="lock out the current holder"):
         agree(other, node, identify(other, node))
 
     def no(question: str) -> None:
-        raise PolicyRefused("You said no.")
+        raise PolicyError("You said no.")
 
     for rotate in (False, True):
-        with talk(board) as node, pytest.raises(PolicyRefused, match="You said no"):
+        with talk(board) as node, pytest.raises(PolicyError, match="You said no"):
             agree(other, node, identify(other, node), rotate=rotate, take_over=no)
-    with pytest.raises(PolicyRefused, match="lock out the current holder"):
+    with pytest.raises(PolicyError, match="lock out the current holder"):
         provisioned(other, board)
     assert (board.state, other.keys.held(board.uuid)) == (before, False)
     with talk(board) as node:
@@ -142,7 +142,7 @@ def test_a_node_that_calls_itself_new_and_shows_a_signed_datasheet_is_not_taken_
     before = board.state
     with talk(board) as node:
         who = replace(identify(other, node), state=NodeState.FACTORY)  # Identify is a hint: anyone may have sent it
-        with pytest.raises(PolicyRefused, match="lock out the current holder"):
+        with pytest.raises(PolicyError, match="lock out the current holder"):
             agree(other, node, who)
     assert (board.state, other.keys.held(board.uuid)) == (before, False)
 
@@ -174,15 +174,15 @@ def test_the_station_that_was_locked_out_is_told_of_a_tap_elsewhere_and_then_who
         "epoch 2, after 1 here: keyed elsewhere by tap",
         "which station did so will show once it signs",
     ):
-        with pytest.raises(PolicyRefused, match=words):
+        with pytest.raises(PolicyError, match=words):
             session(one, board)
         assert words in why_unproven(one, board)
     assert provisioned(other, board).verified.verdict == "authentic"
     signed = f"signed by station {other.fingerprint[:16]}, which your CA certified"
-    with pytest.raises(PolicyRefused, match=signed):
+    with pytest.raises(PolicyError, match=signed):
         session(one, board)
     trust(one, other)
-    with pytest.raises(PolicyRefused, match=f"signed by west \\({other.fingerprint[:16]}\\)") as told:
+    with pytest.raises(PolicyError, match=f"signed by west \\({other.fingerprint[:16]}\\)") as told:
         session(one, board)
     assert "attack" not in told.value.message + (told.value.hint or "")
     assert "proves nothing" not in told.value.message
@@ -205,7 +205,7 @@ class Forgetful(MemoryLink):
         reply = super().exchange(frame)
         if frame[2:4] == bytes([128, 1]) and not self.lost:
             self.lost = True
-            raise NodeSilent("The reply was lost.")
+            raise NodeSilentError("The reply was lost.")
         return reply
 
 
@@ -237,7 +237,7 @@ def test_an_image_does_not_use_up_the_sequence_of_a_node_that_the_signer_knows(o
     image = provisioned(owner, board).image
     lie = replace(security.decode(image.blocks[SECURITY]), signature=None, sequence=2**32 - 2, station_key=None)
     forged = image.with_block(SECURITY, lie.encode())
-    with pytest.raises(PolicyRefused, match="the last one known here is 1"):
+    with pytest.raises(PolicyError, match="the last one known here is 1"):
         sign_image(owner, SignOrder(board.uuid, forged), None)
     record = owner.nodes.get(board.uuid)
     assert record is not None
@@ -254,7 +254,7 @@ def test_they_hand_over_once_they_have_each_others_certificate(
     trust(one, other)
     trust(other, one)
     order = ExportOrder((other.name,), None, "move")
-    with pytest.raises(PolicyRefused, match="not certified by the CA"):
+    with pytest.raises(PolicyError, match="not certified by the CA"):
         plan_export(one, order)
     path = tmp_path / "other.cert"
     known = sign_request(owner, read_request(fleet.make_request(other.name, other.vault.identity())))
@@ -283,27 +283,27 @@ def test_signing_a_request_again_gives_the_same_certificate(tmp_path: Path, owne
     first = sign_request(owner, asked)
     owner.vault.drop_ca()  # type: ignore[attr-defined]
     assert sign_request(owner, asked) == first
-    with pytest.raises(NotFound, match="CA key is not in this vault"):
+    with pytest.raises(NotFoundError, match="CA key is not in this vault"):
         sign_request(owner, read_request(request(tmp_path / "west", "west")))
 
 
 def test_a_request_proves_that_its_station_holds_the_key(tmp_path: Path) -> None:
     asked = request(tmp_path / "east", "east")
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         read_request(asked.replace(b'"east"', b'"evil"'))
     for bad in (b"", b"{}", b"[1]", asked[:-20], b"-----BEGIN PRIVATE KEY-----", asked.replace(b"P-256", b"P-384")):
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             read_request(bad)
 
 
 def test_a_certificate_is_for_one_station(tmp_path: Path, owner: Station) -> None:
     certificate = sign_request(owner, read_request(request(tmp_path / "east", "east")))
     request(tmp_path / "west", "west")
-    with pytest.raises(PolicyRefused, match="is for station"):
+    with pytest.raises(PolicyError, match="is for station"):
         adopt_certificate(tmp_path / "west", certificate, ask=ask)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         adopt_certificate(tmp_path / "nowhere", certificate, ask=ask)
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         read_certificate(forged())
 
 
@@ -339,11 +339,11 @@ def test_the_ca_key_is_kept_away_and_brought_back(tmp_path: Path, owner: Station
     fleet.export_ca(owner, owner.vault, path, "a long enough passphrase")
     assert fleet.drop_ca(owner)
     assert not fleet.drop_ca(owner)
-    with pytest.raises(PolicyRefused, match="is not in this vault"):
+    with pytest.raises(PolicyError, match="is not in this vault"):
         fleet.require_ca(owner)
     fleet.import_ca(owner, owner.vault, path, "a long enough passphrase")
     assert fleet.require_ca(owner).point == owner.ca
     other = make_station(tmp_path / "other", "other")
-    with pytest.raises(PolicyRefused, match="a CA key other than"):
+    with pytest.raises(PolicyError, match="a CA key other than"):
         fleet.import_ca(other, other.vault, path, "a long enough passphrase")
     other.close()

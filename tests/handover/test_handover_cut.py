@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyError
 from teds_provision.handover.pending import close
 from teds_provision.station.station import Station
 from teds_provision.vault import forget_vaults
@@ -85,7 +85,7 @@ def check_export(station: Station, bundle: Path, boards: list[Board]) -> None:
         assert not bundle.exists()
         assert session(station, boards[0]) == 1
         return
-    with pytest.raises(PolicyRefused, match="was moved"):
+    with pytest.raises(PolicyError, match="was moved"):
         session(station, boards[0])
 
 

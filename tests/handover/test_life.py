@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotFound, NotWhitelisted, PolicyRefused, UsageFailure
+from teds_provision.errors import NotFoundError, NotWhitelistedError, PolicyError, UsageError
 from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.life import is_finished, plan_takeover, retire, revoke, take_over
 from teds_provision.handover.outgoing import ExportOrder, plan_export
@@ -43,7 +43,7 @@ def test_a_revoked_node_gets_nothing_any_more(pair: Pair) -> None:
     assert revoke(pair.north, pair.board.uuid, "stolen").fresh
     assert held(pair.north, pair.board) == []
     assert pair.north.pins.entry(pair.board.uuid) is None
-    with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was revoked: stolen"):
+    with talk(pair.board) as node, pytest.raises(PolicyError, match="was revoked: stolen"):
         agree(pair.north, node, identify(pair.north, node))
     failed = list(verify_image(pair.north, Image(pair.board.uuid, done.image.blocks)))
     assert [check.name for check in failed if check.result == "failed"] == ["not revoked"]
@@ -53,13 +53,13 @@ def test_a_revoked_node_gets_nothing_any_more(pair: Pair) -> None:
 def test_whitelisting_a_revoked_node_anew_does_not_help(pair: Pair) -> None:
     revoke(pair.north, pair.board.uuid, "stolen")
     pair.north.pins.put(WhitelistEntry(pair.board.uuid))
-    with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was revoked"):
+    with talk(pair.board) as node, pytest.raises(PolicyError, match="was revoked"):
         agree(pair.north, node, identify(pair.north, node))
 
 
 def test_a_reason_is_needed(pair: Pair) -> None:
     for why in ("", "  ", "two\nlines", "\x1b[31mred"):
-        with pytest.raises(UsageFailure):
+        with pytest.raises(UsageError):
             revoke(pair.north, pair.board.uuid, why)
 
 
@@ -73,7 +73,7 @@ def test_the_deny_list_travels_in_every_bundle_and_is_honoured(pair: Pair) -> No
     assert isinstance(plan, ImportPlan)
     assert [one.why for one in plan.denied] == ["lost in transit"]
     import_bundle(pair.south, plan)
-    with talk(lost) as node, pytest.raises(PolicyRefused, match="was revoked: lost in transit"):
+    with talk(lost) as node, pytest.raises(PolicyError, match="was revoked: lost in transit"):
         agree(pair.south, node, identify(pair.south, node))
     assert session(pair.south, good) == 1
 
@@ -101,7 +101,7 @@ def test_a_deny_list_of_strangers_counts_for_nothing_and_is_passed_over(pair: Pa
 
 def test_a_revoked_node_is_not_handed_over(pair: Pair) -> None:
     revoke(pair.north, pair.board.uuid, "stolen")
-    with pytest.raises(PolicyRefused, match="it is revoked"):
+    with pytest.raises(PolicyError, match="it is revoked"):
         plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,)))
     plan = plan_export(pair.north, ExportOrder(("south",), None))
     assert [node.uuid for node in plan.nodes] == [pair.boards[1].uuid]
@@ -116,9 +116,9 @@ def test_a_node_out_of_service_signed_that_it_is_reset(pair: Pair) -> None:
     assert pair.board.state.state == NodeState.FACTORY
     assert held(pair.north, pair.board) == []
     assert is_finished(pair.north, pair.board.uuid)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         pair.north.nodes.resolve("finger 1")
-    with talk(pair.board) as node, pytest.raises(NotWhitelisted):
+    with talk(pair.board) as node, pytest.raises(NotWhitelistedError):
         agree(pair.north, node, identify(pair.north, node))
 
 
@@ -136,7 +136,7 @@ def test_a_node_that_does_not_answer_is_unconfirmed_and_can_be_tried_again(pair:
     record = pair.north.nodes.get(pair.board.uuid)
     assert record is not None
     assert record.retired == "decommissioned, unconfirmed"
-    with pytest.raises(PolicyRefused, match="out of service"):
+    with pytest.raises(PolicyError, match="out of service"):
         plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,)))
     retire(pair.north, pair.board.uuid, reset(pair.north, pair.board))
     assert is_finished(pair.north, pair.board.uuid)
@@ -193,14 +193,14 @@ def test_a_calibration_is_copied_only_when_told(pair: Pair, tmp_path: Path, copi
 
 def test_what_cannot_be_replaced(pair: Pair) -> None:
     first, second = (board.uuid for board in pair.boards)
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         plan_takeover(pair.north, first, first, copy_calibration=False)
-    with pytest.raises(NotFound, match="is not known here"):
+    with pytest.raises(NotFoundError, match="is not known here"):
         plan_takeover(pair.north, bytes(10), second, copy_calibration=False)
-    with pytest.raises(NotWhitelisted):
+    with pytest.raises(NotWhitelistedError):
         plan_takeover(pair.north, first, bytes(10), copy_calibration=False)
-    with pytest.raises(NotFound, match="No calibration"):
+    with pytest.raises(NotFoundError, match="No calibration"):
         plan_takeover(pair.north, first, second, copy_calibration=True)
     pair.export("move")
-    with pytest.raises(PolicyRefused, match="was moved"):
+    with pytest.raises(PolicyError, match="was moved"):
         plan_takeover(pair.north, first, second, copy_calibration=False)

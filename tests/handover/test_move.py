@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, UsageError
 from teds_provision.handover.incoming import ImportPlan, plan_import, prove_node, proven_of
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import content_digest
@@ -52,7 +52,7 @@ def test_what_lies_there_before_the_key_rests_opens_for_nobody(pair: Pair, monke
     assert not pair.north.policy.tombstones()
     assert b'"tag"' not in left[0]
     for closed in (left[0], left[0] + b'"}', left[0] + b'","tag":"AAAAAAAAAAAAAAAAAAAAAA"}'):
-        with pytest.raises((BadData, NotAuthentic)):
+        with pytest.raises((BadDataError, NotAuthenticError)):
             plan_import(pair.south, closed)
     assert isinstance(plan_import(pair.south, pair.export("move")[0].read_bytes()), ImportPlan)
 
@@ -60,7 +60,7 @@ def test_what_lies_there_before_the_key_rests_opens_for_nobody(pair: Pair, monke
 def test_a_move_rests_the_key_at_once(pair: Pair) -> None:
     _, exported = pair.export("move")
     for act in (session, key_again):
-        with pytest.raises(PolicyRefused, match="was moved to station") as refused:
+        with pytest.raises(PolicyError, match="was moved to station") as refused:
             act(pair.north, pair.board)
         assert f"handover undo {exported.plan.id}" in refused.value.hint
 
@@ -94,14 +94,14 @@ def test_the_receiver_of_a_move_rotates_at_its_first_contact(pair: Pair) -> None
 @pytest.mark.parametrize("lost", range(1, 9))
 @pytest.mark.parametrize("what", ["lose_request", "lose_reply"])
 def test_a_first_contact_cut_anywhere_is_carried_on(pair: Pair, what: str, lost: int) -> None:
-    from teds_provision.errors import NodeSilent
+    from teds_provision.errors import NodeSilentError
 
     pair.take(pair.export("move")[0])
     link = MemoryLink(pair.board, via="can", tapped=False, **{what: lost})
     try:
         with talk(pair.board, link) as node:
             prove_node(pair.south, node)
-    except NodeSilent:
+    except NodeSilentError:
         pass
     epoch = session(pair.south, pair.board)
     assert epoch >= 2
@@ -146,7 +146,7 @@ def test_a_reset_node_gets_its_new_stations_own_ca(pair: Pair) -> None:
 def test_a_move_has_one_receiver(pair: Pair, tmp_path: Path) -> None:
     west = make_station(tmp_path / "west", "west")
     trust(pair.north, west)
-    with pytest.raises(UsageFailure, match="exactly one receiver"):
+    with pytest.raises(UsageError, match="exactly one receiver"):
         pair.export("move", to=("south", "west"))
     west.close()
 
@@ -159,7 +159,7 @@ def test_a_node_goes_there_and_back(pair: Pair) -> None:
     pair.take(back, pair.north)
     assert session(pair.north, pair.board) == 3
     assert pair.north.policy.tombstone(pair.board.uuid) is None
-    with pytest.raises(PolicyRefused, match="was moved to station"):
+    with pytest.raises(PolicyError, match="was moved to station"):
         session(pair.south, pair.board)
 
 
@@ -172,7 +172,7 @@ def test_a_move_under_way_is_not_sealed_again_with_a_node_that_was_revoked_or_fo
     if revoked:
         pair.north.policy.deny(RevocationRecord(pair.board.uuid, None, "lost", "a statement"))
     pair.north.keys.remove(pair.board.uuid)
-    with pytest.raises(PolicyRefused, match="is revoked" if revoked else "this station holds no key for it") as refused:
+    with pytest.raises(PolicyError, match="is revoked" if revoked else "this station holds no key for it") as refused:
         plan_export(pair.north, ExportOrder((pair.south.name,), None, "move"))
     assert "handover undo" in (refused.value.hint or "")
 
@@ -180,7 +180,7 @@ def test_a_move_under_way_is_not_sealed_again_with_a_node_that_was_revoked_or_fo
 def test_no_command_opens_a_session_under_a_key_that_rests(pair: Pair) -> None:
     """``address`` asks for nothing but a session; every other command is refused before."""
     pair.export("move")
-    with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was moved to station"):
+    with talk(pair.board) as node, pytest.raises(PolicyError, match="was moved to station"):
         open_session(pair.north, node)
-    with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was moved to station"):
+    with talk(pair.board) as node, pytest.raises(PolicyError, match="was moved to station"):
         set_address(pair.north, node, 33)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.handover.pending import close, find_handover, list_handovers, undo
 from teds_provision.protocol.handover.receipt import open_receipt
 from teds_provision.steps.agree import agree
@@ -39,7 +39,7 @@ def test_a_receipt_is_for_this_bundle_from_its_receiver(pair: Pair, tmp_path: Pa
     path, _exported = pair.export("move")
     taken = pair.take(path)
     before = everything(pair.north)
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         close(pair.north, taken.receipt[:-4] + b"AAAA")
     stations = {pair.south.fingerprint: pair.south.point}
     receipt = open_receipt(taken.receipt, stations.get)
@@ -47,17 +47,17 @@ def test_a_receipt_is_for_this_bundle_from_its_receiver(pair: Pair, tmp_path: Pa
 
     key = pair.south.vault.identity()
     forged = {
-        "another file": (replace(receipt, bundle_sha256="0" * 64), NotAuthentic),
-        "other nodes": (replace(receipt, imported=(bytes(10),)), NotAuthentic),
-        "another sender of the bundle": (replace(receipt, to="0" * 64), PolicyRefused),
-        "unknown id": (replace(receipt, id="3d1a4d1c-52c4-4d0b-9d3c-0c8f4bd5a7f1"), NotFound),
+        "another file": (replace(receipt, bundle_sha256="0" * 64), NotAuthenticError),
+        "other nodes": (replace(receipt, imported=(bytes(10),)), NotAuthenticError),
+        "another sender of the bundle": (replace(receipt, to="0" * 64), PolicyError),
+        "unknown id": (replace(receipt, id="3d1a4d1c-52c4-4d0b-9d3c-0c8f4bd5a7f1"), NotFoundError),
     }
     for bad, error in forged.values():
         with pytest.raises(error):
             close(pair.north, seal_receipt(bad, key))
     west = make_station(tmp_path / "west", "west")
     trust(pair.north, west)
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         close(pair.north, seal_receipt(replace(receipt, sender=west.fingerprint), west.vault.identity()))
     west.close()
     assert everything(pair.north) == before
@@ -86,22 +86,22 @@ def test_an_undone_move_that_was_imported_all_the_same(pair: Pair) -> None:
     path, exported = pair.export("move")
     undo(pair.north, find_handover(pair.north, exported.plan.id))
     taken = pair.take(path)
-    with pytest.raises(PolicyRefused, match="took 1 keys in all the same"):
+    with pytest.raises(PolicyError, match="took 1 keys in all the same"):
         close(pair.north, taken.receipt)
     assert session(pair.north, pair.board) == 2
-    with pytest.raises(PolicyRefused, match="knows none of the keys"):
+    with pytest.raises(PolicyError, match="knows none of the keys"):
         session(pair.south, pair.board)
 
 
 def test_what_cannot_be_undone(pair: Pair) -> None:
     _, copied = pair.export("copy")
-    with pytest.raises(PolicyRefused, match="copy cannot be undone"):
+    with pytest.raises(PolicyError, match="copy cannot be undone"):
         undo(pair.north, find_handover(pair.north, copied.plan.id))
     path, moved = pair.export("move")
     close(pair.north, pair.take(path).receipt)
-    with pytest.raises(PolicyRefused, match="receipt of this move has arrived"):
+    with pytest.raises(PolicyError, match="receipt of this move has arrived"):
         undo(pair.north, find_handover(pair.north, moved.plan.id))
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         find_handover(pair.north, "ffffffff")
 
 
@@ -121,7 +121,7 @@ def test_a_node_refused_by_the_receiver_of_a_move_is_the_senders_again(tmp_path:
 def test_a_node_that_was_given_away_and_reset_may_be_keyed_again(pair: Pair) -> None:
     path, _ = pair.export("move")
     close(pair.north, pair.take(path).receipt)
-    with pytest.raises(PolicyRefused, match="was moved to station"):
+    with pytest.raises(PolicyError, match="was moved to station"):
         key_again(pair.north, pair.board)
     pair.board.tim.reset_by_hand()
     key_again(pair.north, pair.board)

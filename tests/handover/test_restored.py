@@ -9,7 +9,7 @@ import pytest
 from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import rebuild
 from teds_provision.backup.sealed_file import SealedFile
-from teds_provision.errors import NodeSilent, PolicyRefused
+from teds_provision.errors import NodeSilentError, PolicyError
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, open_session, require_session
 from teds_provision.steps.identify import identify
@@ -34,9 +34,9 @@ def test_over_a_bus_it_takes_a_persons_word_and_a_new_key(tmp_path: Path) -> Non
     station = restored(tmp_path, board)
     bus = MemoryLink(board, via="can", tapped=False)
     with talk(board, bus) as node:
-        with pytest.raises(PolicyRefused, match="restored from a backup"):
+        with pytest.raises(PolicyError, match="restored from a backup"):
             require_session(station, node)
-        with pytest.raises(PolicyRefused, match="restored from a backup"):
+        with pytest.raises(PolicyError, match="restored from a backup"):
             agree(station, node, identify(station, node))
     assert board.state.epoch == 1
     with talk(board, MemoryLink(board, via="can", tapped=False)) as node:
@@ -75,7 +75,7 @@ def test_a_pending_key_that_came_back_and_opens_is_no_rotation(tmp_path: Path) -
     station = make_station(tmp_path / "home")
     key_up(station, board)
     board.flash.die_after = True
-    with talk(board) as node, pytest.raises(NodeSilent):
+    with talk(board) as node, pytest.raises(NodeSilentError):
         agree(station, node, identify(station, node), rotate=True)
     assert [(state, epoch) for state, epoch, *_ in held(station, board)] == [("pending", 2), ("active", 1)]
     again = back(station, tmp_path)

@@ -11,7 +11,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.handover.trust import add, candidate, candidates_of, find_trusted, private_keys, remove, spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
 from teds_provision.station.station import Station
@@ -60,14 +60,14 @@ def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) 
     path = keys / "lab.pem"
     path.write_text(to_pem(OTHER.point))
     digits = fingerprint(OTHER.point)
-    with pytest.raises(PolicyRefused, match="is not trusted here"):
+    with pytest.raises(PolicyError, match="is not trusted here"):
         find_trusted(north, str(path))
     add(north, [candidate(north, "lab", path, "station")])
     for text in ("lab", digits, digits[:16].upper(), spoken(digits), str(path)):
         assert find_trusted(north, text, "station").name == "lab"
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         find_trusted(north, digits[:6])
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         find_trusted(north, "lab", "ca")
 
 
@@ -84,16 +84,16 @@ def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) 
 )
 def test_what_is_no_public_p256_key(north: Station, keys: Path, content, says: str) -> None:  # type: ignore[no-untyped-def]
     (keys / "bad.pem").write_text(content())
-    with pytest.raises(BadData, match=says):
+    with pytest.raises(BadDataError, match=says):
         candidate(north, "bad", keys / "bad.pem", "station")
 
 
 def test_its_own_key_needs_no_trust(north: Station, keys: Path) -> None:
     (keys / "self.pem").write_text(to_pem(north.point))
-    with pytest.raises(PolicyRefused, match="own key"):
+    with pytest.raises(PolicyError, match="own key"):
         candidate(north, "self", keys / "self.pem", "station")
     (keys / "ca.pem").write_text(to_pem(north.ca))
-    with pytest.raises(PolicyRefused, match="own key"):
+    with pytest.raises(PolicyError, match="own key"):
         candidate(north, "self", keys / "ca.pem", "ca")
 
 
@@ -101,9 +101,9 @@ def test_a_name_stands_for_one_key(north: Station, keys: Path) -> None:
     for number in (21, 22):
         (keys / f"{number}.pem").write_text(to_pem(SoftwareKey(number).point))
     add(north, [candidate(north, "lab", keys / "21.pem", "station")])
-    with pytest.raises(PolicyRefused, match="already stands for"):
+    with pytest.raises(PolicyError, match="already stands for"):
         candidate(north, "lab", keys / "22.pem", "station")
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         candidate(north, "a\x1b[31m", keys / "22.pem", "station")
 
 
@@ -135,7 +135,7 @@ def test_a_folder_that_holds_a_private_key_is_refused_whole(north: Station, keys
     (keys / "lab.pem").write_text(to_pem(OTHER.point))
     (keys / name).parent.mkdir(exist_ok=True)
     (keys / name).write_bytes(bad_files()[name])
-    with pytest.raises(PolicyRefused, match="is for public keys"):
+    with pytest.raises(PolicyError, match="is for public keys"):
         candidates_of(north, keys, "station")
     assert north.policy.trusted() == []
 
@@ -159,7 +159,7 @@ def test_no_private_key_is_under_version_control() -> None:
 
 def test_an_empty_or_missing_folder(north: Station, keys: Path) -> None:
     for folder in (keys, keys / "none"):
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundError):
             candidates_of(north, folder, "station")
 
 
@@ -168,7 +168,7 @@ def test_a_certificate_that_does_not_verify(north: Station, keys: Path) -> None:
 
     forged = Certificate("lab", OTHER.point, north.ca, OTHER.sign(b"something else"))
     (keys / "lab.cert").write_bytes(write_certificate(forged))
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         candidate(north, "lab", keys / "lab.cert", "station")
 
 

@@ -24,7 +24,7 @@ from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board
 from teds_provision.node.pulse import Pulse
 from teds_provision.node.virtual import VirtualNode
-from teds_provision.protocol.messages.frames import Reason, Refused
+from teds_provision.protocol.messages.frames import CommandRefusedError, Reason
 from teds_provision.protocol.operation.commands import EITHER, OPERATE_FUNCTION
 from teds_provision.protocol.operation.hardware import RawReading
 from teds_provision.protocol.operation.stream_commands import Clock, Subscribed
@@ -215,7 +215,7 @@ def refuses_claims(node: Faulty) -> None:
     """It says that somebody else has claimed its channels."""
 
     def operate(_inner: Any) -> bytes:
-        raise Refused(Reason.BUSY)
+        raise CommandRefusedError(Reason.BUSY)
 
     node.tim._role._commands[EITHER, OPERATE_FUNCTION] = operate  # type: ignore[union-attr]
 

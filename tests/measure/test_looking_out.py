@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import AddressConflict, LinkFailure
+from teds_provision.errors import AddressConflictError, LinkError
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.lookout import BELIEVED, LEAST, SOON, Lookout, Pace
@@ -130,7 +130,7 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
         sightings.saw(replace(one, at=time.monotonic()))
         asked_before, began = asked(hub)[0], time.monotonic()
         sightings.wrong(one)
-        with suppress(LinkFailure):
+        with suppress(LinkError):
             sightings.find(one.uuid, seconds=PATIENCE, stop=stop, fresh=time.monotonic())
         assert asked(hub)[0] > asked_before
         return time.monotonic() - began
@@ -159,7 +159,7 @@ def looked_for(lookout: Lookout) -> Iterator[None]:
     stop = threading.Event()
 
     def wait() -> None:
-        with suppress(LinkFailure):
+        with suppress(LinkError):
             lookout._sightings.find(ONE, seconds=PATIENCE, stop=stop)
 
     waiting = threading.Thread(target=wait)
@@ -207,7 +207,9 @@ def test_a_node_is_gone_when_it_does_not_answer_twice_and_not_before() -> None:
     known = {uuid.hex(): last_heard(uuid, number, 2 * CHECK) for number, uuid in uuids.items()}
     known["fresh"] = last_heard(ONE, 9, CHECK / 2)
     other = seen(b"\x63" * 10, 3).identity
-    bus = Bus(a1=None, a2=[None, seen(uuids[2], 2).identity], a3=other, a4=AddressConflict("two"), a5=LinkFailure("x"))
+    bus = Bus(
+        a1=None, a2=[None, seen(uuids[2], 2).identity], a3=other, a4=AddressConflictError("two"), a5=LinkError("x")
+    )
     names = {number: uuid.hex() for number, uuid in uuids.items()}
     assert asks(bus, known) == {
         names[1]: False, names[2]: True, names[3]: False, names[4]: True, names[5]: False,

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import AddressConflict, NodeRefused, NoNode, PolicyRefused
+from teds_provision.errors import AddressConflictError, NodeRefusedError, NoNodeError, PolicyError
 from teds_provision.links.ports import Contact
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.lookout import AirLookout
@@ -22,7 +22,7 @@ from teds_provision.measure.sightings import MOST, TWIN, Sighting, Sightings
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
-from teds_provision.store.lock import Mark, MarkTaken
+from teds_provision.store.lock import Mark, UsageLockTakenError
 from teds_provision.teds.fits import parse_require
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
@@ -54,7 +54,7 @@ def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile
     sightings = Sightings()
     sightings.saw(seen(ONE, 7))
     assert find(sightings, ONE).address == 7
-    with pytest.raises(NoNode):
+    with pytest.raises(NoNodeError):
         find(sightings, TWO)
     assert not sightings.missing()
     found: list[Sighting] = []
@@ -76,7 +76,7 @@ class EmptyAir:
 
     def everyone(self, **_more: object) -> Iterator[Contact]:
         self.rounds += 1
-        raise NoNode("Nobody advertises.")
+        raise NoNodeError("Nobody advertises.")
 
 
 def test_who_asks_a_look_out_that_has_nothing_to_do_waits_for_one_round_alone() -> None:
@@ -113,7 +113,7 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     sightings.wrong(copy)
     lost = time.monotonic()
     sightings.saw(seen(ONE, 7))
-    with pytest.raises(NoNode):
+    with pytest.raises(NoNodeError):
         find(sightings, ONE, fresh=lost)
     sightings.saw(seen(ONE, 8))
     assert find(sightings, ONE, fresh=lost).address == 8
@@ -126,7 +126,7 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
 
 def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhere() -> None:
     """Who gave himself a node's UUID, and said that he knows no key, ended its measurement before it began."""
-    sightings, unknown = Sightings(), PolicyRefused("It knows none of the keys.")
+    sightings, unknown = Sightings(), PolicyError("It knows none of the keys.")
     copy = seen(ONE, 7)
     sightings.saw(copy)
     sightings.wrong(copy)
@@ -136,12 +136,12 @@ def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhe
     assert not Patience(60.0).gives_up(unknown, proven=False, elsewhere=look)
     assert Patience(60.0).gives_up(unknown, proven=True, elsewhere=look), "said in a session it is the node's word"
     assert not Patience(None).gives_up(unknown, proven=True, elsewhere=look)
-    assert not Patience(60.0).gives_up(NodeRefused("busy", reason=17), proven=True, elsewhere=look)
-    assert Patience(0.0).gives_up(NodeRefused("busy", reason=17), proven=True, elsewhere=look)
+    assert not Patience(60.0).gives_up(NodeRefusedError("busy", reason=17), proven=True, elsewhere=look)
+    assert Patience(0.0).gives_up(NodeRefusedError("busy", reason=17), proven=True, elsewhere=look)
 
 
 def test_a_copy_that_refuses_while_the_node_is_silent_for_a_moment_is_no_reason_either() -> None:
-    sightings, unknown = Sightings(), PolicyRefused("It knows none of the keys.")
+    sightings, unknown = Sightings(), PolicyError("It knows none of the keys.")
     for silent_then_copy in (8, 7):
         sightings.saw(seen(ONE, silent_then_copy))
         sightings.wrong(seen(ONE, silent_then_copy))
@@ -165,7 +165,7 @@ def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
 def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
     sightings = Sightings()
     sightings.saw(seen(ONE, 7))
-    with pytest.raises(NoNode):
+    with pytest.raises(NoNodeError):
         find(sightings, ONE, fresh=time.monotonic())
 
 
@@ -174,7 +174,7 @@ def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
     sightings = Sightings(note=told.append)
     sightings.saw(seen(ONE, 7))
     sightings.conflict("can:x", 7)
-    with pytest.raises(AddressConflict):
+    with pytest.raises(AddressConflictError):
         find(sightings, ONE)
     assert told
 
@@ -252,7 +252,7 @@ def test_datasheets_are_judged_once_all_are_there_and_one_that_is_gone_is_not_wa
     required = Requirements(met, waiting=60)
     required.expect([ONE, TWO])
     threading.Timer(0.05, required.gone, [TWO]).start()
-    with pytest.raises(PolicyRefused):  # a profile without calibration gives no value
+    with pytest.raises(PolicyError):  # a profile without calibration gives no value
         required.offer(ONE, sheet(ONE), threading.Event())
     assert [fit["uuid"] for fit in required.fits] == [ONE.hex()]
 
@@ -262,15 +262,15 @@ def test_a_mark_names_its_holder_and_tells_of_one_that_was_killed(tmp_path: Path
     with Mark(place, command="measure crane") as held:
         assert not held.left_behind
         assert Mark(place, command="").is_taken
-        with pytest.raises(MarkTaken, match="measure crane"), Mark(place, command="set"):
+        with pytest.raises(UsageLockTakenError, match="measure crane"), Mark(place, command="set"):
             pass
-        with pytest.raises(MarkTaken), Mark(place, command="set", shared=True):
+        with pytest.raises(UsageLockTakenError), Mark(place, command="set", shared=True):
             pass
     assert not Mark(place, command="").is_taken
     with (
         Mark(place, command="set a", shared=True),
         Mark(place, command="set b", shared=True),
-        pytest.raises(MarkTaken, match="set b"),
+        pytest.raises(UsageLockTakenError, match="set b"),
         Mark(place, command="measure"),
     ):
         pass

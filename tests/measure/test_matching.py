@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import NoRoom, UsageFailure
+from teds_provision.errors import NoRoomError, UsageError
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.matching import Load, Match
 from teds_provision.measure.planning import BusShare, BusTime
@@ -23,7 +23,7 @@ def test_an_expression_is_terms_that_must_all_hold() -> None:
     "text", ["", "all,arm", "kind:x", "type:", "arm,,left", "angle >= much", "angle > 1 deg,mass < 1 kg"]
 )
 def test_what_says_no_nodes_is_refused_with_its_term(text: str) -> None:
-    with pytest.raises(UsageFailure) as refused:
+    with pytest.raises(UsageError) as refused:
         Match.parse(text)
     assert repr(text) in refused.value.message
 
@@ -65,5 +65,5 @@ def test_a_node_costs_the_topics_its_values_and_two_messages_for_each_row() -> N
     assert Load(0.1, channels=3, rate=50.0).messages(10.0, rows=True) == 3 * 10 + 2 * 50
     assert Load(0.1, channels=1, rate=5.0).messages(10.0, rows=True) == 5 + 10
     assert Load(0.1, channels=3, rate=50.0).messages(10.0, rows=False) == 3 * 10, "MQTT carries no rows"
-    assert issubclass(NoRoom, Exception)
-    assert NoRoom("x").exit_code == 6
+    assert issubclass(NoRoomError, Exception)
+    assert NoRoomError("x").exit_code == 6

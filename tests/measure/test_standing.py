@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadDatasheet, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDatasheetError, PolicyError, TedsProvisionError
 from teds_provision.measure.standing import NodeStanding, require_measurable
 from teds_provision.measure.trusting import open_trusted
 from teds_provision.station.station import Station
@@ -89,7 +89,7 @@ def test_a_node_whose_signer_is_trusted_no_more_is_measured_no_more(tmp_path: Pa
     assert pair.south.policy.distrust("north")
     pair.south.policy.end_ca(pair.north.ca)
     for standing in standings:
-        with pytest.raises(BadDatasheet, match="not authentic now") as refused:
+        with pytest.raises(BadDatasheetError, match="not authentic now") as refused:
             standing.require()
         assert "do not count" in refused.value.message
     beside.close()
@@ -113,5 +113,5 @@ def test_in_transparent_mode_a_node_off_the_whitelist_is_measured_on_and_not_mov
     driven = NodeStanding(measuring, pair.board.uuid)
     driven.drives = True
     pair.north.nodes.remember(pair.board.uuid, name="another")  # any change of the store is looked at
-    with pytest.raises(PolicyRefused, match="actuators are not moved"):
+    with pytest.raises(PolicyError, match="actuators are not moved"):
         driven.require()

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeRefused
+from teds_provision.errors import NodeRefusedError
 from teds_provision.measure.blocks import Block, SetPointCommand
 from teds_provision.measure.topic_actuators import WATCHED, TopicActuators
 from teds_provision.measure.trusting import Trusted
@@ -64,7 +64,7 @@ def reply(run: int, length: int = LENGTH) -> bytes:
 
 
 def refusal(reason: int) -> bytes:
-    raise NodeRefused("The node refused to be driven.", reason=reason)
+    raise NodeRefusedError("The node refused to be driven.", reason=reason)
 
 
 def test_fast_set_points_go_as_drive_messages() -> None:

@@ -20,11 +20,11 @@ from starlette.requests import Request
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.ncap.nodes.directory import for_reader
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import answer_error
-from teds_provision.ncap.web.guard import CALLER, Caller, Guard, Message, Receive, Refusal, Scope, Send
+from teds_provision.ncap.web.guard import CALLER, Caller, Guard, Message, Receive, RequestRefusedError, Scope, Send
 from teds_provision.ncap.web.tokens import Tokens
 from tests.e2e.desk import PASSPHRASE, Desk
 from tests.ncap.service import Answer, Service, virtual
@@ -125,7 +125,7 @@ def test_a_refusal_shown_as_a_page_is_text() -> None:
     """Whatever a message quotes: in a browser's address line it is text, not elements."""
 
     async def refusing(_scope: Scope, _receive: Receive, _send: Send) -> None:
-        raise Refusal(403, "refused", "<script>alert(1)</script>", "<b>")
+        raise RequestRefusedError(403, "refused", "<script>alert(1)</script>", "<b>")
 
     sent: list[Message] = []
 
@@ -187,7 +187,7 @@ def test_an_act_that_nobody_wrote_is_no_failure_of_the_store(service: Service, b
 
 
 def test_a_read_only_token_learns_no_folder_from_an_error() -> None:
-    error = StoreFailure(
+    error = StoreError(
         "The store /home/me/bench/store.sqlite3 cannot be used: the disk is full.", hint="See /api/v1/x."
     )
 

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.cli.config_file import brokers_of
 from teds_provision.client import ApiError
-from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, TedsProvisionError, UsageError
 from teds_provision.ncap.sinks import DaemonSinks, for_readers
 from teds_provision.store import KeptMeasurement
 from tests.e2e.desk import Desk
@@ -36,7 +36,7 @@ def test_a_request_names_a_sink_and_never_says_where_it_is(tmp_path: Path) -> No
         ".csv",
         "x.csv\n",
     ):
-        with pytest.raises(UsageFailure):
+        with pytest.raises(UsageError):
             sinks.whole(spec)
 
 
@@ -46,7 +46,7 @@ def test_a_name_stands_for_its_url_when_it_is_opened_and_is_told_where_it_is_gon
     kept = KeptMeasurement("m", sinks=("mqtt",))
     assert sinks.more(kept, None) == [], "the daemon's own broker is not served twice"
     assert [sink.name for sink in sinks.more(KeptMeasurement("m", sinks=("lab",)), None)] == ["mqtt://own"]
-    with pytest.raises(UsageFailure, match="'lab' is no longer configured"):
+    with pytest.raises(UsageError, match="'lab' is no longer configured"):
         DaemonSinks(tmp_path, actuators=True).open("lab")
 
 
@@ -65,7 +65,7 @@ def test_brokers_stand_in_config_toml(tmp_path: Path) -> None:
     file.write_text(f'[ncap.run]\nmetrics = true\n[ncap.brokers]\nlab = "{LAB}"\n')
     assert brokers_of(file) == {"lab": LAB}
     file.write_text("[ncap.brokers]\nlab = 5\n")
-    with pytest.raises(BadData, match="line 2"):
+    with pytest.raises(BadDataError, match="line 2"):
         brokers_of(file)
 
 

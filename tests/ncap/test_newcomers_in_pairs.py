@@ -207,7 +207,7 @@ def test_a_group_that_is_started_by_hand_and_measured_as_it_comes_has_each_node_
     with lab.service.client() as asked:
         with pytest.raises(ApiError) as refused:
             asked.measure(group="both", rate=20)
-        assert refused.value.status == 423, "NodeBusy"
+        assert refused.value.status == 423, "NodeBusyError"
         right.kill()
         until(lambda: lab.states(right)[-1] == "left")
         by_hand = asked.measure(right.uuid, rate=20)["id"]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFoundError
 from teds_provision.measure.blocks import Block
 from teds_provision.ncap.past import HOUR, Past
 
@@ -51,7 +51,7 @@ def test_a_second_has_its_least_its_greatest_and_its_count(monkeypatch: pytest.M
     assert said["time"] == [NOW - 10 + second for second in range(10)]
     assert (said["low"][3], said["high"][3], said["count"][3]) == (300.0, 399.0, 100)
     assert said["rate"] == pytest.approx(100)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         past.of(NODE, 2)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.ncap.measuring import Measuring, Running
 from teds_provision.ncap.nodes import watching
@@ -174,7 +174,7 @@ def test_a_reader_is_lent_again_while_it_is_being_opened(reader: Watch, monkeypa
 
 def test_a_reader_that_is_not_there_keeps_no_command_waiting(reader: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     def open_place(*_words: Any) -> Reader:
-        raise LinkFailure("No reader there.")
+        raise LinkError("No reader there.")
 
     monkeypatch.setattr(watching, "open_place", open_place)
     monkeypatch.setattr(watching, "FIRST_PAUSE", 20.0)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from teds_provision import client
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyError
 from tests.e2e.desk import ANGLE, Desk
 from tests.ncap.service import unix
 from tests.ncap.test_survives import Lab
@@ -184,7 +184,7 @@ def test_a_base_station_that_does_not_answer_is_6(tmp_path: Path, answer: str, m
 
         thread = threading.Thread(target=serve, daemon=True)
         thread.start()
-        with pytest.raises(PolicyRefused) as refused, client.connect(home=tmp_path).released("00" * 10, "write"):
+        with pytest.raises(PolicyError) as refused, client.connect(home=tmp_path).released("00" * 10, "write"):
             pass
         assert refused.value.exit_code == 6
         assert ("It is busy." in refused.value.message) == bool(answer)

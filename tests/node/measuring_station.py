@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from teds_provision.errors import NodeRefused
+from teds_provision.errors import NodeRefusedError
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.shared import Listener
@@ -48,10 +48,10 @@ class SealedLine:
         return decode_reply(self.link.exchange(command.encode()))
 
     def send(self, command: Command) -> bytes:
-        """Send sealed; the payload of a good reply, NodeRefused for a refusal."""
+        """Send sealed; the payload of a good reply, NodeRefusedError for a refusal."""
         reply = self.session.unseal(self._plain(self.session.seal(command)).payload)
         if not reply.ok:
-            raise NodeRefused("refused", reason=reply.payload[0])
+            raise NodeRefusedError("refused", reason=reply.payload[0])
         return reply.payload
 
     def teds(self) -> bytes:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, NotFound, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.node import described
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds import compose
@@ -64,7 +64,7 @@ def test_the_same_command_again_changes_nothing_and_another_is_refused(tmp_path:
         folder = tmp_path / ("node" + "".join(order))
         first = described.create(folder, **order).path.read_bytes()  # type: ignore[arg-type]
         assert described.create(folder, **order).path.read_bytes() == first  # type: ignore[arg-type]
-        with pytest.raises(UsageFailure, match="another node"):
+        with pytest.raises(UsageError, match="another node"):
             described.create(folder, profile="limit-switch")
 
 
@@ -85,18 +85,18 @@ def test_what_no_node_can_be_made_of_is_told(tmp_path: Path, image: Image) -> No
         ({}, "no TEDS"),
     ):
         path.write_text(Image(UUID, blocks).to_json())
-        with pytest.raises(BadData, match=match):
+        with pytest.raises(BadDataError, match=match):
             described.create(tmp_path / "node", teds=path)
     silent = compose(AccessCode.CHANNEL, {"ChanType": 0, "LowLimit": 0.0, "HiLimit": 1.0})
     path.write_text(Image(UUID, {(1, AccessCode.CHANNEL): silent}).to_json())
-    with pytest.raises(BadData, match="how a sample of channel 1 is coded"):
+    with pytest.raises(BadDataError, match="how a sample of channel 1 is coded"):
         described.create(tmp_path / "node", teds=path)
     path.write_text("junk")
-    with pytest.raises(BadData, match=r"node\.json"):
+    with pytest.raises(BadDataError, match=r"node\.json"):
         described.create(tmp_path / "node", teds=path)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         described.create(tmp_path / "node", teds=tmp_path / "nothing")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         described.create(tmp_path / "node", profile="nothing")
     assert not (tmp_path / "node").exists()
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.node.nfc.server import ETU, Air, answer_seconds, command_seconds
 from teds_provision.node.nfc.tags import IsoDepTag, NdefApplication, Type2Memory, Type4Memory
 from tests.node.tag_talk import Handler
@@ -183,7 +183,7 @@ def test_a_paced_exchange_lasts_as_long_as_on_air() -> None:
 def test_a_tag_that_cannot_be_is_refused() -> None:
     from teds_provision.node.nfc.server import NfcServer
 
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         NfcServer("udp:localhost:5000", Handler(), tag="2", uid=bytes(4))
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         NfcServer("udp:0.0.0.0:5000", Handler())

@@ -14,13 +14,13 @@ from typing import BinaryIO, cast
 
 import pytest
 
-from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked
+from teds_provision.errors import BadDataError, NotFoundError, StoreError, StoreLockedError
 from teds_provision.files import whole_file
 from teds_provision.node import flash_file
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import Delays, VirtualNode
 from teds_provision.protocol.agreement import StationAgreement
-from teds_provision.protocol.flash import FlashFailure
+from teds_provision.protocol.flash import FlashError
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import StationSession
@@ -61,7 +61,7 @@ def test_what_the_disk_took_and_reads_back_as_something_else_takes_no_place_of_t
             yield cast(BinaryIO, BadDisk(file, what))
 
     monkeypatch.setattr(flash_file, "whole_file", bad_disk)
-    with pytest.raises(FlashFailure):
+    with pytest.raises(FlashError):
         flash.commit(replace(before, epoch=9))
     assert (flash.load(), flash.path.read_bytes()) == (before, octets)
     monkeypatch.undo()
@@ -109,7 +109,7 @@ def _die_at(call: int, folder: Path) -> None:
 def test_a_running_node_is_refused_to_another_process(tmp_path: Path) -> None:
     FlashFile.create(tmp_path / "node")
     running = VirtualNode(tmp_path / "node", exclusive=True)
-    with pytest.raises(StoreLocked):
+    with pytest.raises(StoreLockedError):
         VirtualNode(tmp_path / "node", exclusive=True)
     running.flash_file.release()
     VirtualNode(tmp_path / "node", exclusive=True).flash_file.release()
@@ -141,15 +141,15 @@ def test_a_damaged_flash_is_bad_data(tmp_path: Path, document: str) -> None:
     if document == "damaged key":
         document = json.dumps(json.loads(path.read_text()) | {"key": "00" * 32})
     path.write_text(document)
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         FlashFile(tmp_path / "node")
 
 
 def test_a_folder_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreFailure, match="cannot be used"):
+    with pytest.raises(StoreError, match="cannot be used"):
         FlashFile.create(tmp_path / "file" / "node")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         FlashFile(tmp_path / "nothing", exclusive=True)
 
 

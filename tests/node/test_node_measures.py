@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NodeRefused
+from teds_provision.errors import NodeRefusedError
 from teds_provision.links.nfc.port import NfcPort
 from teds_provision.node.hardware.converter import Converter
 from teds_provision.node.sources import make_source
@@ -216,7 +216,7 @@ def test_an_actuator_shows_what_it_is_told_and_goes_safe_by_its_dead_man(scene: 
     converter = Converter(sheet, sheet.channels[0])
     half = converter.octets(Reading(value=(converter.low + converter.high) / 2))
     assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True])
-    with pytest.raises(NodeRefused) as refused:
+    with pytest.raises(NodeRefusedError) as refused:
         station.send(set_values([(1, half)]))
     assert refused.value.reason == 2
     station.operate(1, dead_man=400)
@@ -235,7 +235,7 @@ def test_a_raw_value_that_the_hardware_does_not_bear_is_refused(scene: Scene) ->
     scene.run("gripper", profile="gripper")
     station = scene.station("gripper")
     station.operate(1, dead_man=5000)
-    with pytest.raises(NodeRefused) as refused:
+    with pytest.raises(NodeRefusedError) as refused:
         station.send(set_values([(1, b"\xff\xff")]))
     assert refused.value.reason == 19
     station.send(set_values([(1, b"\x0f\xff")]))
@@ -322,7 +322,7 @@ def test_a_battery_tells_its_level_and_too_low_does_not_measure(scene: Scene) ->
     station = scene.station("angle")
     power = Power.decode(station.send(security_command(Function.POWER)))
     assert power.level == 3
-    with pytest.raises(NodeRefused) as refused:
+    with pytest.raises(NodeRefusedError) as refused:
         station.operate()
     assert refused.value.reason == 23
 
@@ -342,7 +342,7 @@ def test_values_on_demand_over_nfc_and_a_battery_that_the_field_charges(scene: S
         assert power.flags & PowerFlag.CHARGING
         assert power.current is not None
         assert power.current > 0
-        with pytest.raises(NodeRefused) as refused:
+        with pytest.raises(NodeRefusedError) as refused:
             line.send(StreamPlan.of(0, ((1, 2),), n=1, period=50 * MS).command())
         assert refused.value.reason == 21
         assert line.states().channels[1][1] == 1
@@ -411,7 +411,7 @@ def test_two_stations_share_sensors_and_not_an_actuator(scene: Scene) -> None:
     for station in (first, second):
         station.operate()
     first.operate(1, dead_man=10_000)
-    with pytest.raises(NodeRefused) as refused:
+    with pytest.raises(NodeRefusedError) as refused:
         second.operate(1, dead_man=10_000)
     assert refused.value.reason == 17
     plan = StreamPlan.of(0, ((2, 2),), n=2, period=20 * MS, gap=100)

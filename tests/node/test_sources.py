@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, NoReader, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, NoReaderError, NotFoundError, TedsProvisionError, UsageError
 from teds_provision.node.sources import SOURCES, make_source
 from teds_provision.node.sources.base import Place, Reading
 from teds_provision.node.sources.lines import Lines, StandardInput
@@ -64,17 +64,17 @@ def test_generated_values_keep_to_the_range_and_the_period() -> None:
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("sinus", UsageFailure),
-        ("sine:0", UsageFailure),
-        ("sine:-1", UsageFailure),
-        ("ramp:fast", UsageFailure),
-        ("ramp:nan", UsageFailure),
-        ("noise:3", UsageFailure),
-        ("unix:", UsageFailure),
-        ("exec:", UsageFailure),
-        ("exec:'a", UsageFailure),
-        ("file:", UsageFailure),
-        ("file:/nowhere.csv", NotFound),
+        ("sinus", UsageError),
+        ("sine:0", UsageError),
+        ("sine:-1", UsageError),
+        ("ramp:fast", UsageError),
+        ("ramp:nan", UsageError),
+        ("noise:3", UsageError),
+        ("unix:", UsageError),
+        ("exec:", UsageError),
+        ("exec:'a", UsageError),
+        ("file:", UsageError),
+        ("file:/nowhere.csv", NotFoundError),
     ],
 )
 def test_a_source_that_cannot_be_names_the_cure(text: str, error: type[TedsProvisionError]) -> None:
@@ -121,7 +121,7 @@ def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) ->
 def test_a_bad_file_is_told_with_its_line(tmp_path: Path, text: str, place: str) -> None:
     path = tmp_path / "run.csv"
     path.write_text(text)
-    with pytest.raises(BadData, match=place):
+    with pytest.raises(BadDataError, match=place):
         make_source(f"file:{path}", PLACES, print)
 
 
@@ -233,7 +233,7 @@ def test_simulations_come_and_go_at_a_unix_socket(tmp_path: Path) -> None:
     source.start(clock)
     try:
         assert path.stat().st_mode & 0o777 == 0o600
-        with pytest.raises(NoReader, match=r"hand\.sock"):
+        with pytest.raises(NoReaderError, match=r"hand\.sock"):
             make_source(f"unix:{path}", PLACES, print).start(Clock())
         assert clock.ended.wait(60)  # the second node knocked, and went away
         for value in (1.0, 2.0):
@@ -283,5 +283,5 @@ def test_a_program_gives_values_is_told_what_actuators_do_and_may_end(tmp_path: 
     assert source.at(1, 0.0) is None
     assert "ended with 3" in told[0]
     source.stop()
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         make_source("exec:/no/such/program", PLACES, print).start(clock)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from teds_provision import client
-from teds_provision.errors import NodeSilent
+from teds_provision.errors import NodeSilentError
 from teds_provision.plant.jobs import take_job
 from tests.bench import MemoryLink
 from tests.e2e.desk import Desk
@@ -40,7 +40,7 @@ def line(tmp_path: Path) -> Iterator[Lab]:
     allotted = {station.identity.fingerprint: 5, east.identity.fingerprint: 3}
     run = line_of(station, count=8, stations=allotted)
     one = board(1)
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         build(run, one, MemoryLink(one, lose_request=4))
     for number in (1, 2, 3):
         build(run, one if number == 1 else board(number))

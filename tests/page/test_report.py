@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import NodeSilent
+from teds_provision.errors import NodeSilentError
 from teds_provision.station.station import Station
 from teds_provision.steps.batch_sheet import About, BoardResult, Progress, read_sheet, write_report
 from teds_provision.steps.build import BuildOrder
@@ -36,7 +36,9 @@ def test_it_fits_a4_and_tears_no_word_apart(browser: Browser, station: Station, 
     for number, row in enumerate(progress.sheet.rows, 1):
         uuid = bytes([number]) * 10
         progress.take(row, uuid)
-        why = NodeSilent("Node 8d4d did not answer on udp_multicast:239.74.163.2?port=43113 within 3 s.", hint="x" * 80)
+        why = NodeSilentError(
+            "Node 8d4d did not answer on udp_multicast:239.74.163.2?port=43113 within 3 s.", hint="x" * 80
+        )
         progress.note(row, BoardResult(uuid, 4.2, error=why if number == 2 else None, row=number))
     about = About("bench north", "ab12cd34" * 8, "Ada Lovelace", "teds-provision 0.2.0, Python 3.11.7")
     write_report(tmp_path / "day.html", progress, about)

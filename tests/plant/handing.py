@@ -61,10 +61,10 @@ class MemoryPost:
         yield from [one for one in self.there.values() if one.to == to]
 
     def send(self, parcel: Parcel) -> None:
-        from teds_provision.errors import PolicyRefused
+        from teds_provision.errors import PolicyError
 
         if self.full:
-            raise PolicyRefused("full")
+            raise PolicyError("full")
         self.there.setdefault(parcel.id, parcel)
 
     def drop(self, parcel: str, to: str) -> None:

@@ -15,7 +15,7 @@ from in_toto_attestation.v1.statement import Statement
 from securesystemslib.dsse import Envelope
 from securesystemslib.signer import SSlibKey
 
-from teds_provision.errors import BadData, NodeSilent, NotAuthentic, TedsProvisionError
+from teds_provision.errors import BadDataError, NodeSilentError, NotAuthenticError, TedsProvisionError
 from teds_provision.plant.evidence import sign_evidence
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.protocol.plant import evidence as codec
@@ -149,10 +149,10 @@ def test_a_board_that_is_gone_leaves_the_stations_word_on_a_failed_attempt(stati
 def test_a_board_that_passed_must_sign(station: Station, board: Board) -> None:
     teds = run(station, board).image.blocks[SECURITY]
     claim = EvidenceClaim(board.uuid, teds, facts_of(station, teds))
-    with pytest.raises(NodeSilent), talk(board, MemoryLink(board, lose_request=1)) as node:
+    with pytest.raises(NodeSilentError), talk(board, MemoryLink(board, lose_request=1)) as node:
         sign_evidence(node, station.credentials(board.uuid), claim)
     other = Board()  # the same UUID, another key
-    with pytest.raises(NotAuthentic), talk(other) as node:
+    with pytest.raises(NotAuthenticError), talk(other) as node:
         sign_evidence(node, station.credentials(board.uuid), claim)
 
 
@@ -162,7 +162,7 @@ def test_a_board_that_passed_must_sign(station: Station, board: Board) -> None:
 def test_base64_has_one_spelling(text: object) -> None:
     """Spare bits, needless padding, white space: other texts for the same octets would be other documents."""
     assert [codec.base64_of(plain, "sig") for plain in ("", "QQ==", "QUI=", "QUJD")] == [b"", b"A", b"AB", b"ABC"]
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         codec.base64_of(text, "sig")
 
 
@@ -186,7 +186,7 @@ def test_a_row_of_the_facts_has_one_form(member: str, row: object) -> None:
     statement = json.loads(codec.base64_of(told["payload"], "payload"))
     statement["predicate"]["facts"][member][0] = row
     told["payload"] = base64.b64encode(json.dumps(statement).encode()).decode()
-    with pytest.raises(BadData, match=member[:-1]):
+    with pytest.raises(BadDataError, match=member[:-1]):
         codec.read(json.dumps(told).encode())
 
 

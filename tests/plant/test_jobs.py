@@ -13,7 +13,15 @@ from typing import Any
 import pytest
 
 from teds_provision import plant
-from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, OtherKey, PolicyRefused, RosterExpired
+from teds_provision.errors import (
+    BadDataError,
+    KeyMismatchError,
+    NodeSilentError,
+    NotAuthenticError,
+    NotFoundError,
+    PolicyError,
+    RosterExpiredError,
+)
 from teds_provision.plant import line as line_module
 from teds_provision.plant import owner as owning
 from teds_provision.plant import parcels
@@ -27,7 +35,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
 from teds_provision.station.station import Station
-from teds_provision.steps.board_type import WrongBoard
+from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, Prepared, prepare
 from teds_provision.steps.provision import Provisioned, inspect, provision
 from teds_provision.store.tables.parcels import ParcelRow
@@ -97,7 +105,7 @@ def test_one_board_too_many_is_refused_and_stays_what_it_is(owner: Station) -> N
     build(line, board(1))
     build(line, board(2))
     third = board(3)
-    with pytest.raises(PolicyRefused, match="one too many"):
+    with pytest.raises(PolicyError, match="one too many"):
         build(line, third)
     assert third.state.state == NodeState.FACTORY
     assert len(units(line)) == 2
@@ -113,14 +121,14 @@ def test_one_board_too_many_is_refused_and_stays_what_it_is(owner: Station) -> N
     ],
 )
 def test_what_can_be_refused_before_a_tap_is(owner: Station, changes: dict[str, Any], why: str) -> None:
-    with pytest.raises(PolicyRefused, match=why):
+    with pytest.raises(PolicyError, match=why):
         line_of(owner, **changes)
 
 
 def test_no_job_begins_once_the_roster_has_expired(tmp_path: Path) -> None:
     station = make_station(tmp_path / "home", "owner")
     join(station, roster_of(station, member(station, "owner", *ALL), expires=NOW - timedelta(hours=1)))
-    with pytest.raises(RosterExpired) as caught:
+    with pytest.raises(RosterExpiredError) as caught:
         take_job(station, job_of(station))
     assert (caught.value.exit_code, caught.value.code) == (6, "roster-expired")
     station.close()
@@ -148,16 +156,16 @@ def test_a_closed_job_is_refused(owner: Station) -> None:
     line = line_of(owner)
     assert line.job is not None
     owner.plant.line.set_job_state(line.job.id, "closed")
-    with pytest.raises(PolicyRefused, match="closed"):
+    with pytest.raises(PolicyError, match="closed"):
         LineRun(owner, line.job)
 
 
 def test_a_board_that_is_not_listed_or_has_another_key_costs_no_unit(owner: Station) -> None:
     one, other = board(1), board(2)
     line = line_of(owner, count=None, boards={one.uuid: fingerprint(one.key.point), other.uuid: "0" * 64})
-    with pytest.raises(OtherKey):
+    with pytest.raises(KeyMismatchError):
         build(line, other)
-    with pytest.raises(PolicyRefused, match="not on the job's list"):
+    with pytest.raises(PolicyError, match="not on the job's list"):
         build(line, board(3))
     assert units(line) == []
     build(line, one)
@@ -170,7 +178,7 @@ def test_a_board_of_another_type_costs_no_unit(tmp_path: Path, owner: Station) -
         order = BuildOrder(profile="tactile-finger-sensor")
         provision(other, node, order, accept=lambda who: None, reporter=Silent())
     line = line_of(owner)
-    with pytest.raises(WrongBoard):
+    with pytest.raises(WrongBoardError):
         build(line, one)
     assert units(line) == []
     other.close()
@@ -178,7 +186,7 @@ def test_a_board_of_another_type_costs_no_unit(tmp_path: Path, owner: Station) -
 
 def test_a_board_on_the_bus_is_not_enough_for_a_job_that_asks_for_taps(owner: Station) -> None:
     line, one = line_of(owner), board(1)
-    with pytest.raises(PolicyRefused, match="assurance 'tap'"):
+    with pytest.raises(PolicyError, match="assurance 'tap'"):
         build(line, one, MemoryLink(one, via="can", tapped=True))
     assert units(line) == []
     assert one.state.state == NodeState.FACTORY
@@ -194,10 +202,10 @@ def test_calibrations_are_those_that_the_job_names(tmp_path: Path, owner: Statio
         "list", by_uuid={uuid: hashlib.sha256(file.read_bytes()).hexdigest() for uuid in (one.uuid, two.uuid)}
     )
     line = line_of(owner, folder, calibration=rule)
-    with pytest.raises(NotFound, match="no file"):
+    with pytest.raises(NotFoundError, match="no file"):
         build(line, two)
     (folder / f"{two.uuid.hex()}.csv").write_text("raw, value\n0, 0\n16384, 6.28\n")
-    with pytest.raises(PolicyRefused, match="not the one the job specifies"):
+    with pytest.raises(PolicyError, match="not the one the job specifies"):
         build(line, two)
     assert units(line) == []
     build(line, one)
@@ -223,11 +231,11 @@ def test_a_calibration_that_is_rewritten_while_it_is_read_is_not_used(
         return prepare(*given, **more)
 
     monkeypatch.setattr(line_module, "prepare", rewritten)
-    with pytest.raises(PolicyRefused, match="changed while it was being read"):
+    with pytest.raises(PolicyError, match="changed while it was being read"):
         build(line, one)
     outside = LineRun(owner, None, BuildOrder(profile=ANGLE, calibration=file))
     file.write_text(TABLE)
-    with pytest.raises(PolicyRefused, match="changed while it was being read"):
+    with pytest.raises(PolicyError, match="changed while it was being read"):
         build(outside, one)
     assert units(line) == []
     assert one.state.state == NodeState.FACTORY
@@ -259,7 +267,7 @@ def test_a_profile_that_is_edited_beside_a_job_makes_no_board_of_it(tmp_path: Pa
     line = line_of(owner, tmp_path, calibration=any_date, profile_sha256=digest_of_file(own))
     build(line, boards[0])
     own.write_text(own.read_text() + "\n# edited\n")
-    with pytest.raises(PolicyRefused, match="not the one in the job"):
+    with pytest.raises(PolicyError, match="not the one in the job"):
         build(line, boards[1])
     assert len(units(line)) == 1
     assert boards[1].state.state == NodeState.FACTORY
@@ -272,7 +280,7 @@ def test_a_calibration_of_last_year_is_too_old_for_a_job_that_says_so(tmp_path: 
     table = "raw, value\n0, 0\n16384, 6.283185307\n"
     for dated, why in ((f"# date: {NOW - timedelta(days=31):%Y-%m-%d}\n", "is dated"), ("", "has no date")):
         file.write_text(dated + table)
-        with pytest.raises(PolicyRefused, match=why):
+        with pytest.raises(PolicyError, match=why):
             build(line, one)
     file.write_text(f"# date: {NOW - timedelta(days=3):%Y-%m-%d}\n{table}")
     build(line, one)
@@ -284,18 +292,18 @@ def test_a_job_is_a_keepers_word_and_its_id_means_one_job(tmp_path: Path, owner:
     job = take_job(owner, document)
     assert take_job(owner, document).hash == job.hash
     twin = seal_job(replace(job, title="another"), owner.credentials().key)
-    with pytest.raises(PolicyRefused, match="A different job"):
+    with pytest.raises(PolicyError, match="A different job"):
         take_job(owner, twin)
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         take_job(owner, seal_job(replace(job, id="11111111-2222-4333-8444-555555555555"), SoftwareKey(5)))
     join(owner, roster_of(owner, member(owner, "owner", "line", "sign"), version=2, previous="0" * 64))
-    with pytest.raises(PolicyRefused, match="not a keeper"):
+    with pytest.raises(PolicyError, match="not a keeper"):
         take_job(owner, document)
 
 
 def test_who_joined_no_registry_takes_no_job(tmp_path: Path, owner: Station) -> None:
     stranger = make_station(tmp_path / "stranger")
-    with pytest.raises(PolicyRefused, match="has not joined one"):
+    with pytest.raises(PolicyError, match="has not joined one"):
         take_job(stranger, job_of(owner))
     stranger.close()
 
@@ -312,14 +320,14 @@ def test_who_joined_no_registry_takes_no_job(tmp_path: Path, owner: Station) -> 
 )
 def test_a_job_that_does_not_add_up_is_never_signed(owner: Station, change: Callable[[Job], Job], why: str) -> None:
     job = open_job(job_of(owner), lambda kid: owner.point)
-    with pytest.raises(BadData, match=why):
+    with pytest.raises(BadDataError, match=why):
         seal_job(change(job), owner.credentials().key)
 
 
 def test_patterns_of_names() -> None:
     require_pattern("left {unit:03} {uuid}")
     for wrong in ("{unit:3}", "{unit:00}", "{0}", "{uuid", "}"):
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             require_pattern(wrong)
 
 
@@ -332,7 +340,7 @@ def test_cut_at_every_message_a_unit_is_neither_given_twice_nor_lost(tmp_path: P
         for lost in range(first, link.count, 2):
             home = alone(tmp_path / f"{half}{lost}")
             line, one = line_of(home), board(1)
-            with pytest.raises(NodeSilent):
+            with pytest.raises(NodeSilentError):
                 build(line, one, MemoryLink(one, **{half: lost}))  # type: ignore[arg-type]
             assert build(line, one).verified.verdict == "authentic", (half, lost)
             (unit,) = units(line)
@@ -378,7 +386,7 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
     with talk(other) as node:
         order = BuildOrder(profile="tactile-finger-sensor")
         provision(plant.north, node, order, accept=lambda who: None, reporter=Silent())
-    with talk(other) as node, pytest.raises(WrongBoard):
+    with talk(other) as node, pytest.raises(WrongBoardError):
         inspect(tester, node, tests, Silent())
     tampered = {**one.state.blocks, (0, 12): one.state.blocks[0, 12][:-3] + b"\0\0\0"}
     one.flash.state = replace(one.state, blocks=tampered)
@@ -395,17 +403,17 @@ def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> No
     line, one, two = line_of(owner), board(1), board(2)
     line.label_to = tmp_path / "labels" / "x.svg"
     line.scans = Scans([])
-    with pytest.raises(PolicyRefused, match="Scan the label"):
+    with pytest.raises(PolicyError, match="Scan the label"):
         build(line, one)
     line.scans.take(f"TEDS1:{one.uuid.hex()}:{fingerprint(one.key.point)}")
-    with pytest.raises(WrongBoard, match="label"):
+    with pytest.raises(WrongBoardError, match="label"):
         build(line, two)
     assert units(line) == []
     build(line, one)
     label = tmp_path / "labels" / f"{one.uuid.hex()}.svg"
     assert one.uuid.hex() in label.read_text()
     assert line.unit_to_json(one.uuid)["label"] == str(label)
-    with pytest.raises(PolicyRefused, match="Scan the label"):
+    with pytest.raises(PolicyError, match="Scan the label"):
         build(line, one)
     line.scans.take(one.uuid.hex())
     build(line, one)

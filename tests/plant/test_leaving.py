@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant
-from teds_provision.errors import KeyStolen
+from teds_provision.errors import KeyStolenError
 from teds_provision.measure.standing import NodeStanding
 from teds_provision.plant import leaving
 from teds_provision.protocol.plant.roster import Share, Why
@@ -180,7 +180,7 @@ def test_a_running_measurement_ends_for_a_thief_alone(scene: Scene, why: Why, cu
     scene.remove(scene.south, why)
     assert scene.marks(scene.north) == [uuid]
     if cut:
-        with pytest.raises(KeyStolen, match=r"stolen: south has held this key"):
+        with pytest.raises(KeyStolenError, match=r"stolen: south has held this key"):
             standing.require()
     standing.require()
     NodeStanding(measuring, uuid).require()  # a session that began since is not ended again

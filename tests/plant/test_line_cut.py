@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import files
-from teds_provision.errors import PolicyRefused, StoreFailure
+from teds_provision.errors import PolicyError, StoreError
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
@@ -194,7 +194,7 @@ def test_a_disk_that_is_full_loses_no_unit_and_gives_none_twice(tmp_path: Path, 
         pages_of(full, pages_of(full) + room)
         try:
             build(line, one)
-        except StoreFailure:
+        except StoreError:
             failed += 1
         pages_of(full, 1 << 20)
         assert build(line, one).verified.verdict == "authentic", room
@@ -225,14 +225,14 @@ def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_s
         back = homes["backup"]
         back.plant.begin_restored()
         line, third = LineRun(back, job), board(3)
-        with pytest.raises(PolicyRefused, match="was restored from a backup"):
+        with pytest.raises(PolicyError, match="was restored from a backup"):
             build(line, third)
         assert units(line) == [(1, 1, 1)]
         sync(back, FilesPost(plant.stick))
         assert units(line) == [(1, 1, 1), (2, 1, 1)]
         build(line, third)
         assert [unit for unit, _, _ in units(line)] == [1, 2, 3]
-        with pytest.raises(PolicyRefused, match="one too many"):
+        with pytest.raises(PolicyError, match="one too many"):
             build(line, board(4))
     plant.north.close()
 
@@ -241,7 +241,7 @@ def test_an_office_out_of_an_old_backup_answers_nobody_before_it_knows_its_pages
     plant = Plant(tmp_path)
     plant.north.unlock()
     plant.north.plant.begin_restored()
-    with pytest.raises(PolicyRefused, match="was restored from a backup"):
+    with pytest.raises(PolicyError, match="was restored from a backup"):
         answer(plant.north, b"")
     plant.sync(plant.north)
     assert answer(plant.north, b"") is None

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NotAuthentic, PolicyRefused
+from teds_provision.errors import NotAuthenticError, PolicyError
 from teds_provision.plant import jobs, office, parcels
-from teds_provision.plant.asking import NotAnswered, OfficeRefused, PostOffice, send
+from teds_provision.plant.asking import OfficeRefusedError, OfficeSilentError, PostOffice, send
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
@@ -83,7 +83,7 @@ class Desk:
     def request(self, run: LineRun, one: Board) -> SignRequest:
         """A good request for a board, as its line makes it, which nobody answers."""
         self.at_hand.away = True
-        with pytest.raises(NotAnswered):
+        with pytest.raises(OfficeSilentError):
             build(run, one)
         self.at_hand.away = False
         return self.at_hand.asked[-1]
@@ -225,7 +225,7 @@ def test_an_office_notices_that_what_its_profile_extends_was_edited(
     base = folder / "smart-sensor.toml"
     assert build(desk.run(), board(1)).verified.verdict == "authentic"
     base.write_text(base.read_text().replace('operation-timeout = "500 ms"', 'operation-timeout = "400 ms"'))
-    with pytest.raises(OfficeRefused, match=r"\(differs\)"):
+    with pytest.raises(OfficeRefusedError, match=r"\(differs\)"):
         build(desk.run(), board(2))
 
 
@@ -349,7 +349,7 @@ def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
 
     for lie in (forged, other, nonsense):
         run.office = Liar(lie)
-        with pytest.raises(NotAuthentic):
+        with pytest.raises(NotAuthenticError):
             build(run, one)
     run.office = office
     assert build(run, one).verified.verdict == "authentic"
@@ -372,7 +372,7 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
 
     leave(lies[0], "00000000")
     run.office = PostOffice(desk.line, post, 0.2)
-    with pytest.raises(NotAnswered):
+    with pytest.raises(OfficeSilentError):
         build(run, one)
     for n, lie in enumerate(lies):
         leave(lie, f"fffffff{n}")
@@ -405,7 +405,7 @@ def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: D
     run, one = desk.run(), board(1)
     assert run.job is not None
     desk.office.plant.line.set_job_state(run.job.id, "closed")
-    with pytest.raises(OfficeRefused, match=r"\(job\): .*closed here\.$"):
+    with pytest.raises(OfficeRefusedError, match=r"\(job\): .*closed here\.$"):
         build(run, one)
     desk.office.plant.line.set_job_state(run.job.id, "open")
     assert build(run, one).verified.verdict == "authentic"
@@ -413,7 +413,7 @@ def test_a_refusal_is_told_with_its_word_and_the_board_is_finished_later(desk: D
 
 def test_who_has_not_sign_is_no_office(desk: Desk) -> None:
     request = desk.request(desk.run(), board(1))
-    with pytest.raises(PolicyRefused, match="role 'sign'"):
+    with pytest.raises(PolicyError, match="role 'sign'"):
         answer(desk.line, request.octets)
 
 
@@ -448,7 +448,7 @@ def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(
     begins = NOW + timedelta(hours=23)
     today, one = desk.run(), board(1)
     tomorrow = {"not_before": begins, "ends": begins + timedelta(days=2), "title": "tomorrow"}
-    with pytest.raises(PolicyRefused, match="it begins"):
+    with pytest.raises(PolicyError, match="it begins"):
         desk.run(**tomorrow)
     waiting = desk.request(today, one)
 
@@ -459,7 +459,7 @@ def test_a_request_that_waited_a_day_is_judged_by_the_job_of_that_day(
 
     monkeypatch.setattr(jobs, "datetime", NextDay)
     assert desk.asks(waiting).refused == "job"
-    with pytest.raises(PolicyRefused, match="it ended"):
+    with pytest.raises(PolicyError, match="it ended"):
         build(today, one)
     run = desk.run(**tomorrow)
     assert build(run, one).verified.verdict == "authentic"

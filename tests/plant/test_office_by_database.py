@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.demo.cluster import Cluster
-from teds_provision.errors import RegistryFailure, TedsProvisionError
+from teds_provision.errors import RegistryError, TedsProvisionError
 from teds_provision.plant.asking import Inbox, PostOffice, send_job
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
@@ -110,11 +110,11 @@ def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
     away = PostOffice(west, plant.post(west, port=free_tcp_port()), 1)
     line = LineRun(west, find_job(west, job.id), office=away)
     first, second = board(1), board(2)
-    with pytest.raises(RegistryFailure):
+    with pytest.raises(RegistryError):
         build(line, first)
     line.office = AtHand(north)
     assert build(line, first).verified.verdict == build(line, second).verified.verdict == "authentic"
-    with pytest.raises(RegistryFailure):
+    with pytest.raises(RegistryError):
         sync(west, away.post)
     for _ in range(2):
         plant.sync(west, north)

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from teds_provision.demo.cluster import Cluster
-from teds_provision.errors import Fork, NotMember, PolicyRefused, RegistryFailure, StoreFailure, UsageFailure
+from teds_provision.errors import ForkError, NotMemberError, PolicyError, RegistryError, StoreError, UsageError
 from teds_provision.plant.postgres import Registry, parameters
 from tests.pace import PATIENCE
 from tests.plant.postgres import Database, Login, own_cluster
@@ -80,10 +80,10 @@ def test_pages_that_one_appends_another_reads(post: Registry, login: Login) -> N
 
 def test_a_page_that_does_not_follow_leaves_none_of_its_push(post: Registry, login: Login) -> None:
     first, second, _ = chain(3)
-    with pytest.raises(Fork):
+    with pytest.raises(ForkError):
         post.append([first, (2, "00" * 32, second[2])])
     assert post.look().heads[login.fingerprint][0] == 0
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         post.append([second])
     post.append([first, second])
 
@@ -100,7 +100,7 @@ def test_a_parcel_goes_to_its_receiver_and_is_taken_away(post: Registry, login: 
     receiver.remove([name])
     assert post.look().parcels == ()
     assert receiver.parcel(name) is None
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         post.send(str(uuid.uuid4()), to.fingerprint, b"", later(40))
     receiver.close()
 
@@ -159,7 +159,7 @@ def test_who_listens_is_woken_and_is_not_without_a_reason(post: Registry, login:
     ],
 )
 def test_a_url_says_only_where_the_registry_is(url: str) -> None:
-    with pytest.raises(UsageFailure) as refused:
+    with pytest.raises(UsageError) as refused:
         parameters(url, "ab" * 32, bytes(32))
     assert "secret" not in refused.value.message
 
@@ -179,19 +179,19 @@ def test_another_servers_certificate_is_refused(login: Login, tmp_path: Any) -> 
 
     stranger = tmp_path / "root.crt"
     stranger.write_bytes(_tls()[1])
-    with pytest.raises(RegistryFailure, match="certificate verify failed"):
+    with pytest.raises(RegistryError, match="certificate verify failed"):
         registry(login, sslrootcert=str(stranger)).look()
 
 
 def test_a_server_of_another_name_is_refused(login: Login) -> None:
-    with pytest.raises(RegistryFailure, match="does not match host name"):
+    with pytest.raises(RegistryError, match="does not match host name"):
         registry(login, host="elsewhere.example", hostaddr="127.0.0.1").look()
 
 
 def test_a_closed_station_is_told_that_it_is_no_member(post: Registry, login: Login) -> None:
     post.look()
     login.database.sql(f"update registry.member set open = false where role = '{login.role}'")
-    with pytest.raises(NotMember):
+    with pytest.raises(NotMemberError):
         post.append(chain(1))
 
 
@@ -199,10 +199,10 @@ def test_a_database_without_schema_and_one_of_a_newer_version_are_told(cluster: 
     database = Database.new(cluster)
     newer = registry(database.member())
     database.sql("update registry.meta set version = 3")
-    with pytest.raises(StoreFailure, match="schema 3"):
+    with pytest.raises(StoreError, match="schema 3"):
         newer.look()
     database.sql("drop schema registry cascade")
-    with pytest.raises(StoreFailure, match="does not contain a registry"):
+    with pytest.raises(StoreError, match="does not contain a registry"):
         newer.look()
     newer.close()
 
@@ -219,7 +219,7 @@ def test_what_a_restore_opened_is_named(cluster: Cluster) -> None:
 def test_a_connection_that_is_cut_is_made_again(far: Registry, way: Relay) -> None:
     far.look()
     way.cut()
-    with pytest.raises(RegistryFailure):
+    with pytest.raises(RegistryError):
         far.look()
     assert far.look().registry
 
@@ -228,7 +228,7 @@ def test_a_connection_that_is_half_open_is_given_up_in_time(far: Registry, way: 
     far.look()
     way.silent = True
     began = time.monotonic()
-    with pytest.raises(RegistryFailure, match="in time"):
+    with pytest.raises(RegistryError, match="in time"):
         far.look()
     assert time.monotonic() - began < PATIENCE / 2
     way.silent = False
@@ -237,7 +237,7 @@ def test_a_connection_that_is_half_open_is_given_up_in_time(far: Registry, way: 
 
 def test_a_server_that_never_greets_is_given_up_in_time(login: Login, way: Relay) -> None:
     way.silent = True
-    with pytest.raises(RegistryFailure):
+    with pytest.raises(RegistryError):
         registry(login, way.port, connect_timeout=2).look()
 
 
@@ -256,7 +256,7 @@ def test_a_server_that_dies_during_a_push_has_all_of_it_or_nothing(login: Login,
         stop.start()
         try:
             far.append(pages)
-        except RegistryFailure:
+        except RegistryError:
             n, _ = registry(login).look().heads[login.fingerprint]
             assert n in (0, 20)
         stop.join()
@@ -270,9 +270,9 @@ def test_no_server_at_all_and_one_that_comes_back() -> None:
         post = registry(database.member())
         post.append(chain(1))
         cluster.stop()
-        with pytest.raises(RegistryFailure):
+        with pytest.raises(RegistryError):
             post.look()
-        with pytest.raises(RegistryFailure, match="refused"):
+        with pytest.raises(RegistryError, match="refused"):
             post.look()
         cluster.start()
         assert post.look().heads

@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision import plant as plant_room
 from teds_provision.demo.cluster import Cluster
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.plant.returned import FORGED
 from teds_provision.plant.schema import close_sql, member_sql, mend_sql, registry_sql
 from teds_provision.plant.scram import verifier
@@ -280,7 +280,7 @@ def test_a_database_of_schema_1_is_used_as_before_and_the_cure_is_named(loss: Lo
 def test_a_newer_schema_is_refused_whatever_tables_it_has(loss: Loss) -> None:
     for change in ("alter table registry.handed rename to later", "drop table registry.found"):
         loss.database.sql(f"update registry.meta set version = 3; {change}")
-        with pytest.raises(StoreFailure, match="schema 3"):
+        with pytest.raises(StoreError, match="schema 3"):
             loss.sync(loss.south)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from teds_provision import plant as plant_room
 from teds_provision.demo.cluster import Cluster
-from teds_provision.errors import RegistryFailure
+from teds_provision.errors import RegistryError
 from teds_provision.plant.postgres import PostgresPost
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.plant.roster import Share
@@ -72,7 +72,7 @@ def survived(office: Office, cluster: Cluster, *steps: int) -> int:
 def died(office: Office, cluster: Cluster, station: Station, step: int) -> bool:
     post = office.post(station)
     mortal = Mortal(post, cluster, step)
-    with suppress(RegistryFailure):
+    with suppress(RegistryError):
         sync(station, mortal)  # type: ignore[arg-type]
     post.close()
     return mortal.left <= 0

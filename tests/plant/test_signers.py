@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant
-from teds_provision.errors import PolicyRefused, Unproven
+from teds_provision.errors import PolicyError, UnprovenError
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
@@ -79,7 +79,7 @@ def test_a_removal_without_the_pages_proves_nothing_until_they_come(plants: Plan
     plant.folding.take_rosters(south, [held.octets])
     found = judged(south, image)
     assert found.verdict == verdict(south, image) == "unproven"
-    with pytest.raises(Unproven, match="pages of west") as error:
+    with pytest.raises(UnprovenError, match="pages of west") as error:
         require_authentic(found)
     assert "registry sync" in error.value.hint
     plants.sync(plants.north)
@@ -93,9 +93,9 @@ def test_a_certificate_of_the_ca_alone_signs_nothing(plants: Plant) -> None:
     plants.change(plant.owner.with_roles(plants.north, "west", frozenset({"line"}), (0, "")))
     plants.round()
     assert verdict(south, image) == "not authentic"
-    with pytest.raises(PolicyRefused, match="role sign"):
+    with pytest.raises(PolicyError, match="role sign"):
         made_by(west, Board(bytes([9] * 10)))
-    with pytest.raises(PolicyRefused, match="role line"):
+    with pytest.raises(PolicyError, match="role line"):
         made_by(south, Board(bytes([8] * 10)))
 
 
@@ -115,7 +115,7 @@ def test_a_keeper_vouches_for_what_a_station_signed_that_never_joined(plants: Pl
     plants.round()
     assert plant.membership.vouch(plants.north, found) == 0
     assert (verdict(plants.north, image), verdict(south, image)) == ("authentic", "authentic")
-    with pytest.raises(PolicyRefused, match="keeper"):
+    with pytest.raises(PolicyError, match="keeper"):
         plant.membership.vouch(south, found)
 
 

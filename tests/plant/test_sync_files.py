@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant
-from teds_provision.errors import Fork, LinkFailure, NotMember, PolicyRefused, StoreLocked
+from teds_provision.errors import ForkError, LinkError, NotMemberError, PolicyError, StoreLockedError
 from teds_provision.plant.files import FilesPost
 from teds_provision.plant.folding import heads_digest, views
 from teds_provision.plant.sync import resume
@@ -91,7 +91,7 @@ def test_a_removed_station_hears_of_it_and_is_asked_for_nothing_more(plants: Pla
         plant.owner.without(plants.north, "west", "lost", plants.north.plant.tables.chain(west.fingerprint).counted[0])
     )
     plants.sync(plants.north)
-    with pytest.raises(NotMember, match="removed"):
+    with pytest.raises(NotMemberError, match="removed"):
         plants.sync(west)
 
 
@@ -106,7 +106,7 @@ def test_a_folder_of_another_registry_gives_nothing(plants: Plant, tmp_path: Pat
 
 
 def test_a_stick_that_is_not_plugged_in_is_said(plants: Plant) -> None:
-    with pytest.raises(LinkFailure, match="no folder"):
+    with pytest.raises(LinkError, match="no folder"):
         plants.sync(plants.north, plants.folder / "nothing")
 
 
@@ -136,7 +136,7 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     pin(copy, bytes(10))
     plants.sync(copy)
     pin(west, bytes([1] * 10))
-    with pytest.raises(Fork, match="copy of this home"):
+    with pytest.raises(ForkError, match="copy of this home"):
         plants.sync(west)
     assert west.plant.tables.unsent(west.fingerprint) >= 1
     assert resume(west, plant.files.FilesPost(plants.stick)) == 1
@@ -219,7 +219,7 @@ def test_a_rebuilt_home_waits_where_somebody_has_seen_more_of_it(plants: Plant) 
     plants.sync(back, old)  # it hears what north has seen of it
     back.unlock()
     back.plant.begin_restored()
-    with pytest.raises(PolicyRefused, match="has seen its page 2"):
+    with pytest.raises(PolicyError, match="has seen its page 2"):
         plants.sync(back, old)
     plants.sync(back)
     assert not back.plant.restored
@@ -296,7 +296,7 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
         try:
             plants.sync(station)
             ends.append("done")
-        except StoreLocked:  # another one had it for 10 s
+        except StoreLockedError:  # another one had it for 10 s
             ends.append("locked")
 
     threads = [threading.Thread(target=one, args=pair) for pair in zip(homes, nodes, strict=True)]

@@ -13,7 +13,7 @@ import pytest
 
 from teds_provision import plant as plant_room
 from teds_provision.demo.cluster import Cluster
-from teds_provision.errors import Fork, NotAuthentic, RegistryFailure
+from teds_provision.errors import ForkError, NotAuthenticError, RegistryError
 from teds_provision.plant.postgres import PostgresPost, Registry, parameters
 from teds_provision.plant.schema import member_sql, mend_sql, registry_sql
 from teds_provision.plant.scram import verifier
@@ -154,7 +154,7 @@ def test_rows_that_a_stolen_login_wrote_stop_the_push_until_they_are_mended(offi
     n, digest = post._look.heads[office.north.fingerprint]
     post.append(office.north.fingerprint, n + 1, digest, "", b"h." + b"x" * 200 + b".s")
     board_of(office.north, os.urandom(10))
-    with pytest.raises(NotAuthentic, match="its key did not sign") as refused:
+    with pytest.raises(NotAuthenticError, match="its key did not sign") as refused:
         office.sync(office.north)
     assert f"--mend north {n + 1}" in refused.value.hint
     office.database.sql(mend_sql(office.north.fingerprint, n + 1))
@@ -169,7 +169,7 @@ def test_a_database_without_room_is_told_and_nothing_is_lost(office: Office) -> 
         " create trigger no_room before insert on registry.page execute function registry.no_room()"
     )
     board_of(office.north, os.urandom(10))
-    with pytest.raises(RegistryFailure, match="full"):
+    with pytest.raises(RegistryError, match="full"):
         office.sync(office.north)
     office.database.sql("drop trigger no_room on registry.page")
     assert office.sync(office.north).pushed > 0
@@ -185,7 +185,7 @@ def test_a_sync_that_is_cut_anywhere_is_followed_by_the_same_sync(office: Office
             for station in (office.north, south):
                 post = office.post(station, port=way.port)
                 way.cut_after = way.sent + after
-                with suppress(RegistryFailure):
+                with suppress(RegistryError):
                     sync(station, post)
                 way.cut_after = 0
                 post.close()
@@ -228,14 +228,14 @@ def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(of
     for n, station in enumerate((copy, south), 1):
         station.pins.put(WhitelistEntry(bytes([n] * 10), "ab" * 32, assurance="tap"))
     office.sync(copy)
-    with pytest.raises(Fork, match="a copy of this home is in use"):
+    with pytest.raises(ForkError, match="a copy of this home is in use"):
         office.sync(south)
     assert office.database.sql("select count(*) from registry.page where n > 1") == [["0"]]
     post = office.post(south)
     assert resume(south, post) == 1
     post.close()
     office.sync(south)
-    with pytest.raises(Fork):
+    with pytest.raises(ForkError):
         office.sync(copy)
     office.sync(office.north)
     assert [alarm.code for alarm in office.north.plant.tables.alarms()] == []

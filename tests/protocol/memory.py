@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from teds_provision.protocol.flash import Flash, FlashFailure
+from teds_provision.protocol.flash import Flash, FlashError
 
 
 class PowerCut(Exception):
@@ -26,7 +26,7 @@ class RamFlash:
 
     def commit(self, state: Flash) -> None:
         if self.fail:
-            raise FlashFailure
+            raise FlashError
         if self.die_before:
             raise PowerCut
         if self.garbles:

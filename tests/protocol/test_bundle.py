@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import (
     CLOCK_TOLERANCE,
@@ -97,38 +97,38 @@ def test_no_link_key_stands_in_a_repr():
 
 def test_a_station_outside_the_recipients_is_told_so():
     octets = seal_bundle(bundle(), SENDER, [RECEIVER.point])
-    with pytest.raises(PolicyRefused, match="not sealed for this station"):
+    with pytest.raises(PolicyError, match="not sealed for this station"):
         opened(octets, by=THIRD)
 
 
 def test_a_payload_that_names_another_receiver_than_the_seal_is_refused():
     members = members_of(bundle())
     members["to"] = [fingerprint(THIRD.point)]
-    with pytest.raises(PolicyRefused, match="does not name this station"):
+    with pytest.raises(PolicyError, match="does not name this station"):
         opened(sealed(members))
 
 
 def test_an_unknown_sender_is_refused_before_the_payload_is_read():
-    with pytest.raises(NotAuthentic, match="Nobody trusted"):
+    with pytest.raises(NotAuthenticError, match="Nobody trusted"):
         opened(sealed(b"not even JSON", sender=STRANGER))
 
 
 def test_a_sender_that_claims_a_trusted_name_is_refused():
     header = {"alg": "ES256", "kid": fingerprint(SENDER.point), "typ": TYPE}
-    with pytest.raises(NotAuthentic, match="signature does not verify"):
+    with pytest.raises(NotAuthenticError, match="signature does not verify"):
         opened(sealed_jws(header, dump(members_of(bundle())), signer=STRANGER))
 
 
 def test_a_trust_store_that_gives_the_wrong_key_is_not_believed():
     octets = seal_bundle(bundle(), SENDER, [RECEIVER.point])
-    with pytest.raises(NotAuthentic, match="Nobody trusted"):
+    with pytest.raises(NotAuthenticError, match="Nobody trusted"):
         opened(octets, trusted=lambda _: STRANGER.point)
 
 
 def test_from_must_be_the_signer():
     members = members_of(bundle())
     members["from"] = fingerprint(THIRD.point)
-    with pytest.raises(NotAuthentic, match="another sender"):
+    with pytest.raises(NotAuthenticError, match="another sender"):
         opened(sealed(members))
 
 
@@ -136,19 +136,19 @@ def test_expiry_and_a_date_in_the_future():
     made = bundle()
     octets = seal_bundle(made, SENDER, [RECEIVER.point])
     assert opened(octets, now=made.expires - timedelta(seconds=1)).bundle == made
-    with pytest.raises(PolicyRefused, match="expired"):
+    with pytest.raises(PolicyError, match="expired"):
         opened(octets, now=made.expires)
     assert opened(octets, now=made.created - CLOCK_TOLERANCE).bundle == made
-    with pytest.raises(PolicyRefused, match="future"):
+    with pytest.raises(PolicyError, match="future"):
         opened(octets, now=made.created - CLOCK_TOLERANCE - timedelta(seconds=1))
 
 
 def test_a_move_has_one_receiver():
-    with pytest.raises(PolicyRefused, match="exactly one"):
+    with pytest.raises(PolicyError, match="exactly one"):
         seal_bundle(bundle(to=(RECEIVER, THIRD), mode="move"), SENDER, [RECEIVER.point, THIRD.point])
     members = members_of(bundle(mode="move"))
     members["to"].append(fingerprint(THIRD.point))
-    with pytest.raises(PolicyRefused, match="exactly one"):
+    with pytest.raises(PolicyError, match="exactly one"):
         opened(sealed(members))
     assert opened(seal_bundle(bundle(mode="move"), SENDER, [RECEIVER.point])).bundle.mode == "move"
 
@@ -157,10 +157,10 @@ def test_a_station_signature_of_another_ca_is_refused():
     members = members_of(bundle())
     wrong = STRANGER.sign(station_key_message(RECEIVER.point))
     members["station_signatures"] = {fingerprint(RECEIVER.point): encode_base64url(wrong)}
-    with pytest.raises(NotAuthentic, match="CA's signature"):
+    with pytest.raises(NotAuthenticError, match="CA's signature"):
         opened(sealed(members))
     made = bundle(station_signatures={fingerprint(RECEIVER.point): wrong})
-    with pytest.raises(NotAuthentic, match="CA's signature"):
+    with pytest.raises(NotAuthenticError, match="CA's signature"):
         seal_bundle(made, SENDER, [RECEIVER.point])
 
 
@@ -243,12 +243,12 @@ OFF_CURVE = {"kty": "EC", "crv": "P-256", "x": encode_base64url(bytes(31) + b"\5
 )
 def test_a_member_that_is_wrong_is_named(name, value, cause):
     payload = json.dumps(bent(name, value)).encode()
-    with pytest.raises(BadData, match=cause):
+    with pytest.raises(BadDataError, match=cause):
         opened(sealed(payload))
 
 
 def test_a_key_under_another_keys_id_is_not_authentic():
-    with pytest.raises(NotAuthentic, match="kid is not that"):
+    with pytest.raises(NotAuthenticError, match="kid is not that"):
         opened(sealed(bent("nodes.0.key.kid", "00" * 8)))
 
 
@@ -257,13 +257,13 @@ def test_a_key_under_another_keys_id_is_not_authentic():
     [b"", b"[]", b"null", b"{", b'{"a":1}x', b"\xff\xfe", b'{"format":NaN}', b"[" * 100_000, b'{"a":1,"a":1}'],
 )
 def test_a_payload_that_is_no_object_is_refused(payload):
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         opened(sealed(payload))
 
 
 def test_a_name_given_twice_is_refused_at_any_depth():
     payload = dump(members_of(bundle())).replace(b'"epoch":3', b'"epoch":9,"epoch":3')
-    with pytest.raises(BadData, match="twice"):
+    with pytest.raises(BadDataError, match="twice"):
         opened(sealed(payload))
 
 
@@ -302,12 +302,12 @@ def test_hex_may_stand_in_either_case():
     ],
 )
 def test_a_bundle_that_nobody_would_open_is_not_sealed(wrong):
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         seal_bundle(replace(bundle(), **wrong), SENDER, [RECEIVER.point])
 
 
 def test_a_recipient_that_is_no_point_is_refused():
-    with pytest.raises(BadData, match="recipient's key"):
+    with pytest.raises(BadDataError, match="recipient's key"):
         seal_bundle(bundle(), SENDER, [b"\x04" + bytes(64)])
 
 
@@ -326,7 +326,7 @@ def test_a_forged_statement_of_a_trusted_signer_spoils_the_bundle():
     mine = seal_revocation(SENDER, uuid=bytes(10), node=None, why="lost", created=NOW).statement
     other = seal_revocation(SENDER, uuid=b"\1" * 10, node=None, why="lost", created=NOW).statement
     forged = mine.rsplit(".", 1)[0] + "." + other.rsplit(".", 1)[1]
-    with pytest.raises(NotAuthentic, match="signature does not verify"):
+    with pytest.raises(NotAuthenticError, match="signature does not verify"):
         opened(seal_bundle(bundle(revoked=(forged,)), SENDER, [RECEIVER.point]))
 
 
@@ -335,7 +335,7 @@ def test_what_is_too_large_is_refused_unread():
     tracemalloc.start()
     try:
         for read in (opened, peek_bundle):
-            with pytest.raises(BadData, match=r"at most [0-9]+ are read"):
+            with pytest.raises(BadDataError, match=r"at most [0-9]+ are read"):
                 read(junk)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
@@ -346,7 +346,7 @@ def test_a_flood_of_tiny_values_within_the_limit_is_refused_unparsed():
     junk = b'{"recipients":[' + b"[]," * (20 << 20) + b"0]}"
     tracemalloc.start()
     try:
-        with pytest.raises(BadData, match="far more members"):
+        with pytest.raises(BadDataError, match="far more members"):
             opened(junk)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
@@ -354,7 +354,7 @@ def test_a_flood_of_tiny_values_within_the_limit_is_refused_unparsed():
 
 
 def test_another_signed_document_of_the_sender_is_no_bundle():
-    with pytest.raises(BadData, match="not teds-handover"):
+    with pytest.raises(BadDataError, match="not teds-handover"):
         opened(sealed(members_of(bundle()), typ="teds-receipt+jws"))
 
 
@@ -363,7 +363,7 @@ def test_a_bundle_sealed_by_hand_with_a_key_of_no_station_opens_only_in_its_name
     octets = jose.encrypt(
         jose.sign_compact(dump(members_of(bundle())), outsider, typ=TYPE), [RECEIVER.point], cty="JWS"
     )
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         opened(octets)
     assert OWNER.point == opened(seal_bundle(bundle(), SENDER, [RECEIVER.point])).bundle.ca
 

@@ -9,13 +9,13 @@ from contextlib import suppress
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
 from teds_provision.protocol.handover.bundle import BundleHeader, open_bundle, peek_bundle, seal_bundle
 from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
 from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, THIRD, bundle, members_of, sealed, trusts
 from tests.protocol.test_bundle_receipt import receipt
 
-LEAVES = (BadData, NotAuthentic, PolicyRefused)
+LEAVES = (BadDataError, NotAuthenticError, PolicyError)
 MADE = bundle(2, to=(RECEIVER, THIRD))
 SEALED = seal_bundle(MADE, SENDER, [RECEIVER.point, THIRD.point])
 RECEIPT = seal_receipt(receipt(), RECEIVER)
@@ -98,7 +98,7 @@ def test_a_trusted_sender_that_writes_anything_into_any_member(path, value):
 @settings(deadline=None)
 @given(st.integers(0, len(SEALED)), st.integers(0, 40), st.binary(max_size=40))
 def test_looking_at_a_bundle_never_fails_otherwise(at, length, octets):
-    with suppress(BadData):
+    with suppress(BadDataError):
         assert isinstance(peek_bundle(SEALED[:at] + octets + SEALED[at + length :]), BundleHeader)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.errors import BadDataError, NotAuthenticError
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
@@ -38,12 +38,12 @@ def test_the_same_receipt_is_the_same_octets():
 
 
 def test_a_receipt_of_a_stranger_is_refused():
-    with pytest.raises(NotAuthentic, match="Nobody trusted"):
+    with pytest.raises(NotAuthenticError, match="Nobody trusted"):
         open_receipt(seal_receipt(receipt(sender=fingerprint(STRANGER.point)), STRANGER), trusts(RECEIVER))
 
 
 def test_a_receipt_in_another_name_is_refused():
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         seal_receipt(receipt(), STRANGER)
     members = load_object(
         jose.verify_compact(
@@ -52,24 +52,24 @@ def test_a_receipt_in_another_name_is_refused():
         "it",
     )
     forged = jose.sign_compact(dump(members), STRANGER, typ="teds-receipt+jws")
-    with pytest.raises(NotAuthentic, match="another sender"):
+    with pytest.raises(NotAuthenticError, match="another sender"):
         open_receipt(forged, trusts(RECEIVER, STRANGER))
 
 
 def test_a_node_is_imported_or_refused_not_both():
     both = receipt(refused=(RefusedNode(bytes(10), "late"),))
-    with pytest.raises(BadData, match="twice"):
+    with pytest.raises(BadDataError, match="twice"):
         open_receipt(seal_receipt(both, RECEIVER), trusts(RECEIVER))
 
 
 @pytest.mark.parametrize("typ", ["teds-handover+jws", "teds-revocation+jws", ""])
 def test_no_other_document_of_the_same_signer_is_a_receipt(typ):
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         open_receipt(jose.sign_compact(b"{}", RECEIVER, typ=typ), trusts(RECEIVER))
 
 
 def test_a_huge_receipt_is_refused_unread():
-    with pytest.raises(BadData, match=r"at most [0-9]+ are read"):
+    with pytest.raises(BadDataError, match=r"at most [0-9]+ are read"):
         open_receipt(b" " * (65 << 20), trusts(RECEIVER))
 
 
@@ -81,10 +81,10 @@ def test_a_revocation_comes_out_as_it_went_in():
 
 def test_a_revocation_of_a_stranger_or_with_a_cut_end_counts_for_nothing():
     statement = seal_revocation(STRANGER, uuid=bytes(10), node=None, why="mischief", created=NOW).statement
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         open_revocation(statement, trusts(SENDER))
     for text in (statement[:-1], statement.rsplit(".", 1)[0], "", "é"):
-        with pytest.raises((BadData, NotAuthentic)):
+        with pytest.raises((BadDataError, NotAuthenticError)):
             open_revocation(text, trusts(STRANGER))
 
 
@@ -93,5 +93,5 @@ def test_the_reason_is_short_printable_text(why):
     if why == "":
         assert seal_revocation(SENDER, uuid=bytes(10), node=None, why=why, created=NOW).why == ""
         return
-    with pytest.raises(BadData, match="printable"):
+    with pytest.raises(BadDataError, match="printable"):
         seal_revocation(SENDER, uuid=bytes(10), node=None, why=why, created=NOW)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, open_bundle
 from teds_provision.protocol.handover.jose import link_key_of, point_of, public_jwk
@@ -68,7 +68,7 @@ def test_base64url_of_rfc_7515_appendix_c():
 
 @pytest.mark.parametrize("text", ["A", "AA==", "AB", "AAB", "A+__", "A/__", "AA A", "AA\n", "é", "AAAAA", "=", "*AAA"])
 def test_base64url_has_one_spelling(text):
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         decode_base64url(text, "it")
 
 
@@ -83,7 +83,7 @@ def test_base64url_round_trip(octets):
 def test_what_decodes_encodes_to_the_same(text):
     try:
         octets = decode_base64url(text, "it")
-    except BadData:
+    except BadDataError:
         return
     assert encode_base64url(octets) == text
 
@@ -94,7 +94,7 @@ def test_the_test_of_the_curve_agrees_with_the_library(octets):
     for point in (b"\x04" + octets, SoftwareKey(1 + octets[0]).point):
         try:
             found = point_of(public_jwk(point), "it")
-        except BadData:
+        except BadDataError:
             assert not is_point(point)
         else:
             assert found == point
@@ -121,7 +121,7 @@ def test_either_s_is_accepted():
 @pytest.mark.parametrize("raw", [b"", bytes(64), b"\xff" * 64, bytes(63), bytes(65), bytes(31) + b"\1" + bytes(32)])
 def test_signatures_out_of_range_do_not_verify(raw):
     message = jose.sign_compact(PAYLOAD, SENDER, typ="note").rpartition(b".")[0]
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         verified(message + b"." + base64url(raw))
 
 
@@ -129,15 +129,15 @@ def test_signatures_out_of_range_do_not_verify(raw):
     "algorithm", ["none", "None", "HS256", "RS256", "PS256", "ES384", "ES256K", "EdDSA", "", None, 7, []]
 )
 def test_no_other_signature_algorithm(algorithm):
-    with pytest.raises(PolicyRefused, match="signature algorithm"):
+    with pytest.raises(PolicyError, match="signature algorithm"):
         verified(signed(header(alg=algorithm)))
 
 
 def test_an_unsigned_document_is_refused():
     message = base64url(dump(header(alg="none"))) + b"." + base64url(PAYLOAD) + b"."
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         verified(message)
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         verified(base64url(dump(header())) + b"." + base64url(PAYLOAD) + b".")
 
 
@@ -146,7 +146,7 @@ def test_a_public_key_as_hmac_secret_is_refused():
 
     message = base64url(dump(header(alg="HS256"))) + b"." + base64url(PAYLOAD)
     forged = message + b"." + base64url(hmac.digest(SENDER.point, message, "sha256"))
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         verified(forged)
 
 
@@ -154,20 +154,20 @@ def test_a_public_key_as_hmac_secret_is_refused():
     "extension", [{"crit": ["exp"], "exp": 1}, {"crit": []}, {"b64": False, "crit": ["b64"]}, {"zip": "DEF"}]
 )
 def test_nothing_critical_is_accepted(extension):
-    with pytest.raises(PolicyRefused, match="is not accepted"):
+    with pytest.raises(PolicyError, match="is not accepted"):
         verified(signed(header(**extension)))
 
 
 def test_a_key_inside_the_header_is_not_trusted():
-    with pytest.raises(NotAuthentic, match="Nobody trusted"):
+    with pytest.raises(NotAuthenticError, match="Nobody trusted"):
         verified(signed(header(kid=fingerprint(STRANGER.point), jwk=public_jwk(STRANGER.point)), signer=STRANGER))
-    with pytest.raises(NotAuthentic, match="does not verify"):
+    with pytest.raises(NotAuthenticError, match="does not verify"):
         verified(signed(header(jwk=public_jwk(STRANGER.point)), signer=STRANGER))
 
 
 @pytest.mark.parametrize("kid", [None, 7, "", "../../etc/passwd"])
 def test_a_signer_without_a_name_is_refused(kid):
-    with pytest.raises((BadData, NotAuthentic)):
+    with pytest.raises((BadDataError, NotAuthenticError)):
         verified(signed(header(kid=kid)))
 
 
@@ -178,13 +178,13 @@ def test_the_type_as_rfc_7515_spells_it(typ):
 
 @pytest.mark.parametrize("typ", ["other", None, 7, ""])
 def test_another_type_is_refused(typ):
-    with pytest.raises(BadData, match="not note"):
+    with pytest.raises(BadDataError, match="not note"):
         verified(signed(header(typ=typ)))
 
 
 def test_a_name_twice_in_the_header_is_refused():
     twice = b'{"alg":"none","alg":"ES256","kid":"x","typ":"note"}'
-    with pytest.raises(BadData, match="twice"):
+    with pytest.raises(BadDataError, match="twice"):
         verified(base64url(twice) + b".AA.AA")
 
 
@@ -192,14 +192,14 @@ def test_a_name_twice_in_the_header_is_refused():
     "token", [b"", b".", b"..", b"...", b"a.b.c.d", b"\xff.\xff.\xff", b"e30.e30", b"{}", b"W10.AA.AA"]
 )
 def test_what_is_no_compact_jws(token):
-    with pytest.raises((BadData, PolicyRefused)):
+    with pytest.raises((BadDataError, PolicyError)):
         verified(token)
 
 
 def test_a_long_header_and_a_long_document_are_refused_unread():
-    with pytest.raises(BadData, match="longer than"):
+    with pytest.raises(BadDataError, match="longer than"):
         verified(signed(header(pad="x" * 9000)))
-    with pytest.raises(BadData, match=r"at most [0-9]+ are read"):
+    with pytest.raises(BadDataError, match=r"at most [0-9]+ are read"):
         verified(b"a" * (LIMIT + 1))
 
 
@@ -227,7 +227,7 @@ def test_each_recipient_opens_and_nobody_else(receivers):
     keys = [SoftwareKey(1000 + number) for number in range(receivers)]
     octets = jose.encrypt(PAYLOAD, [key.point for key in keys], cty="JWS")
     assert all(opened(octets, key) == PAYLOAD for key in keys)
-    with pytest.raises(PolicyRefused, match="not sealed for this station"):
+    with pytest.raises(PolicyError, match="not sealed for this station"):
         opened(octets, STRANGER)
 
 
@@ -242,7 +242,7 @@ def test_the_flattened_form_of_one_recipient_is_read():
     members = jwe()
     entry = members.pop("recipients")[0]
     assert opened(dump(members | entry)) == PAYLOAD
-    with pytest.raises(BadData, match="not in both"):
+    with pytest.raises(BadDataError, match="not in both"):
         opened(dump(members | entry | {"recipients": [entry]}))
 
 
@@ -250,18 +250,18 @@ def test_a_recipient_without_a_name_is_tried():
     members = jwe()
     members["recipients"][0]["header"].pop("kid")
     assert opened(dump(members)) == PAYLOAD
-    with pytest.raises(NotAuthentic, match="does not open"):
+    with pytest.raises(NotAuthenticError, match="does not open"):
         opened(dump(members), STRANGER)
 
 
 def test_no_other_recipient_count():
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         jose.encrypt(PAYLOAD, [], cty="JWS")
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         jose.encrypt(PAYLOAD, [RECEIVER.point] * 257, cty="JWS")
-    with pytest.raises(BadData, match="recipients"):
+    with pytest.raises(BadDataError, match="recipients"):
         opened(dump(jwe(recipients=[])))
-    with pytest.raises(BadData, match="recipients"):
+    with pytest.raises(BadDataError, match="recipients"):
         opened(dump(jwe(recipients=[{}] * 257)))
 
 
@@ -269,21 +269,21 @@ def test_no_other_recipient_count():
     "alg", ["none", "dir", "ECDH-ES", "ECDH-ES+A128KW", "RSA-OAEP", "RSA1_5", "A256KW", "PBES2-HS512+A256KW", 5]
 )
 def test_no_other_key_management(alg):
-    with pytest.raises(PolicyRefused, match="key management"):
+    with pytest.raises(PolicyError, match="key management"):
         opened(protected(alg=alg))
 
 
 @pytest.mark.parametrize("enc", ["none", "A128GCM", "A128CBC-HS256", "A256CBC-HS512", "", None])
 def test_no_other_content_encryption(enc):
-    with pytest.raises(PolicyRefused, match="content encryption"):
+    with pytest.raises(PolicyError, match="content encryption"):
         opened(protected(enc=enc))
 
 
 @pytest.mark.parametrize("extension", [{"zip": "DEF"}, {"crit": ["x"]}, {"b64": True}])
 def test_no_compression_and_nothing_critical(extension):
-    with pytest.raises(PolicyRefused, match="is not accepted"):
+    with pytest.raises(PolicyError, match="is not accepted"):
         opened(protected(**extension))
-    with pytest.raises(PolicyRefused, match="is not accepted"):
+    with pytest.raises(PolicyError, match="is not accepted"):
         opened(dump(jwe(unprotected=extension)))
 
 
@@ -291,22 +291,22 @@ def test_a_compressed_bomb_is_never_inflated():
     import zlib
 
     bomb = zlib.compress(bytes(50 << 20))[2:-4]
-    with pytest.raises(PolicyRefused, match="zip"):
+    with pytest.raises(PolicyError, match="zip"):
         opened(dump(jwe(unprotected={"zip": "DEF"}, ciphertext=encode_base64url(bomb))))
 
 
 @pytest.mark.parametrize("cty", ["JWT", "text/plain", ..., 3])
 def test_other_content_is_refused(cty):
-    with pytest.raises(BadData, match="not JWS"):
+    with pytest.raises(BadDataError, match="not JWS"):
         opened(protected(cty=cty))
 
 
 def test_enc_must_be_protected_and_no_parameter_stands_twice():
-    with pytest.raises(BadData, match="no content encryption"):
+    with pytest.raises(BadDataError, match="no content encryption"):
         opened(protected(enc=...))
-    with pytest.raises(BadData, match="two headers"):
+    with pytest.raises(BadDataError, match="two headers"):
         opened(dump(jwe(unprotected={"enc": "A256GCM"})))
-    with pytest.raises(BadData, match="two headers"):
+    with pytest.raises(BadDataError, match="two headers"):
         opened(dump(jwe(unprotected={"kid": "x"})))
 
 
@@ -322,45 +322,45 @@ SHORT = public_jwk(THIRD.point) | {"x": "AAAA"}
 def test_a_one_time_key_must_be_a_public_p256_point(epk):
     members = jwe()
     members["recipients"][0]["header"]["epk"] = epk
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         opened(dump(members))
 
 
 @pytest.mark.parametrize("name", ["iv", "tag", "ciphertext", "protected"])
 @pytest.mark.parametrize("value", [..., None, 7, "", "AAAA", "A", "not base64!", {}])
 def test_members_of_the_wrong_form(name, value):
-    with pytest.raises((BadData, NotAuthentic)):
+    with pytest.raises((BadDataError, NotAuthenticError)):
         opened(dump(jwe(**{name: value})))
 
 
 def test_a_shortened_tag_is_refused():
     members = jwe()
     short = decode_base64url(members["tag"], "it")[:12]
-    with pytest.raises(BadData, match="the tag 16"):
+    with pytest.raises(BadDataError, match="the tag 16"):
         opened(dump(jwe(tag=encode_base64url(short))))
 
 
 def test_what_stands_in_aad_is_authenticated():
-    with pytest.raises(NotAuthentic, match="tag does not fit"):
+    with pytest.raises(NotAuthenticError, match="tag does not fit"):
         opened(dump(jwe(aad="AAAA")))
 
 
 def test_party_info_enters_the_key():
-    with pytest.raises(NotAuthentic, match="does not open"):
+    with pytest.raises(NotAuthenticError, match="does not open"):
         opened(dump(jwe(unprotected={"apu": "QWxpY2U"})))
-    with pytest.raises(BadData, match="longer than"):
+    with pytest.raises(BadDataError, match="longer than"):
         opened(dump(jwe(unprotected={"apu": "A" * 400})))
 
 
 def test_every_truncation_is_refused():
     octets = jose.encrypt(PAYLOAD, [RECEIVER.point], cty="JWS")
     for length in range(len(octets)):
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             opened(octets[:length])
 
 
 def test_a_header_that_asks_for_none_inside_a_good_seal():
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         open_bundle(sealed_jws({"alg": "none", "typ": TYPE}), RECEIVER, trusts(SENDER), NOW)
 
 
@@ -368,7 +368,7 @@ def test_a_header_that_asks_for_none_inside_a_good_seal():
 @given(st.binary(max_size=200))
 def test_any_octets_end_in_a_leaf(octets):
     for read in (opened, verified, lambda junk: jose.read_header(junk, max_octets=LIMIT)):
-        with pytest.raises((BadData, PolicyRefused, NotAuthentic)):
+        with pytest.raises((BadDataError, PolicyError, NotAuthenticError)):
             read(octets)
 
 
@@ -384,7 +384,7 @@ JSON = st.recursive(
 @settings(deadline=None)
 @given(st.dictionaries(st.sampled_from([*jwe(), "aad", "header", "unprotected", "encrypted_key"]), JSON, min_size=1))
 def test_members_of_any_type_end_in_a_leaf_or_change_nothing(changes):
-    with suppress(BadData, PolicyRefused, NotAuthentic):
+    with suppress(BadDataError, PolicyError, NotAuthenticError):
         assert opened(dump(jwe(**changes))) == PAYLOAD
 
 
@@ -392,5 +392,5 @@ def test_members_of_any_type_end_in_a_leaf_or_change_nothing(changes):
 @given(JSON)
 def test_any_json_where_a_key_belongs(value):
     for read in (point_of, link_key_of):
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             read(value, "it")

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from teds_provision.errors import NotAuthentic
+from teds_provision.errors import NotAuthenticError
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, open_bundle, payload_of, seal_bundle
 from teds_provision.protocol.handover.jose import public_jwk
@@ -145,5 +145,5 @@ def test_the_other_verifies_our_receipt_and_we_theirs(other):
 
 def test_a_name_of_a_sender_on_the_others_signature_does_not_help(other):
     octets = other.encrypt(other.sign(payload_of(bundle()), THIRD, HEADER), RECEIVERS[:1], PROTECTED)
-    with pytest.raises(NotAuthentic):
+    with pytest.raises(NotAuthenticError):
         open_bundle(octets, RECEIVER, trusts(SENDER), NOW)

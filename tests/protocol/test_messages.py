@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.messages.arguments import size_of, words
 from teds_provision.protocol.messages.message import (
     compose_command,
@@ -183,13 +183,13 @@ def test_error_codes_of_replies_say_where_and_what():
 
 
 def test_composing_names_the_argument_at_fault():
-    with pytest.raises(BadData, match="'offset'"):
+    with pytest.raises(BadDataError, match="'offset'"):
         compose_command(1, 1, 2, {"access_code": 3})
-    with pytest.raises(BadData, match="'access_code'"):
+    with pytest.raises(BadDataError, match="'access_code'"):
         compose_command(1, 1, 1, {"access_code": 300})
-    with pytest.raises(BadData, match="'colour'"):
+    with pytest.raises(BadDataError, match="'colour'"):
         compose_command(1, 1, 1, {"access_code": 3, "colour": 1})
-    with pytest.raises(BadData, match=r"no command 1\.99"):
+    with pytest.raises(BadDataError, match=r"no command 1\.99"):
         compose_command(1, 1, 99)
 
 
@@ -253,7 +253,7 @@ def test_every_command_comes_back_as_it_was_composed(number, channel, data):
 
 def test_a_duration_that_does_not_fit_is_refused():
     for timeout in (1e6, float("inf"), float("nan")):
-        with pytest.raises(BadData, match="'timeout'"):
+        with pytest.raises(BadDataError, match="'timeout'"):
             compose_service(2, 1, 1, {**SAMPLE_READ, "timeout": timeout})
 
 

@@ -219,7 +219,7 @@ def test_canonical_form_as_published(document: Entry, entry: Entry) -> None:
     try:
         shown = security.decode(teds)
         form_good = shown.signed and shown.values == security.OUR_VALUES
-    except security.NotCanonical:
+    except security.NotCanonicalError:
         form_good = False
     assert form_good == (entry["reason"] != 4), entry["note"]
     if form_good:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, TedsProvisionError
 from teds_provision.protocol.handover import envelope, jose, strict_json
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from tests.protocol.handover_parts import LIMIT, RECEIVER, SENDER, THIRD, trusts
@@ -72,7 +72,7 @@ def test_a_long_member_beside_the_ciphertext_is_passed_over(size, monkeypatch):
     monkeypatch.setattr(envelope, "PIECE", size)
     members = json.loads(seal([NOTE * 9])[0])
     members.pop("tag"), members.pop("iv")
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         unseal(json.dumps(members).encode())
     members = json.loads(seal([NOTE * 9])[0])
     for changed in ({"comment": "A" * 999} | members, members | {"comment": "A" * 999}):
@@ -92,14 +92,14 @@ def test_an_escape_is_read_wherever_a_piece_of_the_file_ends(size, monkeypatch):
 @pytest.mark.parametrize("value", [None, 7, [], "", "A", "ü" * 40, "A" * 99, "=" * 64])
 def test_a_ciphertext_that_is_none_is_refused(value):
     members = json.loads(seal([NOTE])[0]) | {"ciphertext": value}
-    with pytest.raises((BadData, NotAuthentic)):
+    with pytest.raises((BadDataError, NotAuthenticError)):
         unseal(json.dumps(members).encode())
 
 
 def test_a_bundle_that_is_cut_off_anywhere_is_no_bundle():
     octets, _ = seal([NOTE * 2000])
     for at in (*range(400), *range(400, len(octets), 997), *range(len(octets) - 60, len(octets))):
-        with pytest.raises((BadData, NotAuthentic)):
+        with pytest.raises((BadDataError, NotAuthenticError)):
             unseal(octets[:at])
 
 
@@ -107,7 +107,7 @@ def test_what_was_written_before_the_end_opens_for_nobody():
     made = envelope.Sealing([NOTE * 2000], SENDER, [RECEIVER.point], typ="note", cty="JWS")
     body = b"".join(made.body())
     for closed in (body, body + b'"}', body + b'","tag":"' + strict_json.base64url(bytes(16)) + b'"}'):
-        with pytest.raises((BadData, NotAuthentic)):
+        with pytest.raises((BadDataError, NotAuthenticError)):
             unseal(closed)
     assert bytes(unseal(body + made.end()).payload) == NOTE * 2000
 
@@ -127,7 +127,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
             late = self.reads > 12 and len(piece) > 9
             return piece[:5] + (b"B" if piece[5:6] == b"A" else b"A") + piece[6:] if late else piece
 
-    with Turned(path) as file, pytest.raises(NotAuthentic):
+    with Turned(path) as file, pytest.raises(NotAuthenticError):
         unseal(file)
 
 
@@ -137,9 +137,9 @@ def test_the_tag_is_looked_at_before_anything_that_came_out():
     members = json.loads(signature_of_other)
     text = members["ciphertext"]
     members["ciphertext"] = text[:-8] + ("A" if text[-8] != "A" else "B") + text[-7:]
-    with pytest.raises(NotAuthentic, match="tag does not fit"):
+    with pytest.raises(NotAuthenticError, match="tag does not fit"):
         unseal(json.dumps(members).encode())
-    with pytest.raises(PolicyRefused, match="not sealed for this station"):
+    with pytest.raises(PolicyError, match="not sealed for this station"):
         unseal(signature_of_other, THIRD)
 
 
@@ -173,7 +173,7 @@ def long_or_whole(octets, window=5):
             patch.setattr(strict_json, "_WINDOW", window)
             try:
                 results.append(read())
-            except BadData as error:
+            except BadDataError as error:
                 results.append(error.message)
     assert results[0] == results[1]
     return results[0]

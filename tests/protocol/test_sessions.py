@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import Garbled, NotAuthentic
+from teds_provision.errors import GarbledError, NotAuthenticError
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, refusal, security_command
@@ -24,7 +24,7 @@ def opening(desk: Desk, *, one_time: SoftwareKey | None = None) -> tuple[Station
 
 @pytest.mark.parametrize("size", [0, 7, 9])
 def test_the_station_takes_eight_octets_for_c(size: int) -> None:
-    with pytest.raises(Garbled, match="counter for Open"):
+    with pytest.raises(GarbledError, match="counter for Open"):
         StationSession(bytes(16), UUID).open(bytes(size))
 
 
@@ -34,7 +34,7 @@ def test_the_station_checks_the_nodes_one_time_point(point: bytes | str) -> None
     session = StationSession(bytes(16), UUID, one_time=own)
     session.open(bytes(8))
     shown = own.point if isinstance(point, str) else point
-    with pytest.raises(NotAuthentic, match="is no one-time key"):
+    with pytest.raises(NotAuthenticError, match="is no one-time key"):
         session.accept(shown + bytes(16))
 
 
@@ -43,7 +43,7 @@ def test_a_static_key_at_hand_is_no_one_time_key_of_an_open() -> None:
     for static in (STATION, NODE):
         session = StationSession(desk.key, UUID, statics=(STATION.point, NODE.point))
         session.open(bytes(8))
-        with pytest.raises(NotAuthentic, match="is no one-time key"):
+        with pytest.raises(NotAuthenticError, match="is no one-time key"):
             session.accept(static.point + bytes(16))
         counter = desk.plain(session.ask()).payload
         wrong = StationSession(desk.key, UUID, one_time=static).open(counter)
@@ -54,7 +54,7 @@ def test_a_static_key_at_hand_is_no_one_time_key_of_an_open() -> None:
 def test_the_station_refuses_a_reply_of_another_length(size: int) -> None:
     session = StationSession(bytes(16), UUID)
     session.open(bytes(8))
-    with pytest.raises(Garbled):
+    with pytest.raises(GarbledError):
         session.accept(bytes(size))
 
 
@@ -63,7 +63,7 @@ def test_a_node_without_the_key_is_caught_by_its_tag() -> None:
     session, _ = opening(desk)
     reply = thief.plain(session_command(thief, SoftwareKey(29)))
     assert reply.ok
-    with pytest.raises(NotAuthentic, match="does not hold the key"):
+    with pytest.raises(NotAuthenticError, match="does not hold the key"):
         session.accept(reply.payload)
 
 
@@ -88,7 +88,7 @@ def test_a_recorded_reply_is_not_taken_for_the_reply_to_a_later_command() -> Non
     recorded = desk.plain(desk.session.seal(IDENTIFY)).payload
     desk.session.unseal(recorded)
     desk.session.seal(IDENTIFY)
-    with pytest.raises(NotAuthentic, match="does not belong to the command"):
+    with pytest.raises(NotAuthenticError, match="does not belong to the command"):
         desk.session.unseal(recorded)
 
 
@@ -167,7 +167,7 @@ def test_the_station_ends_a_session_whose_counters_are_used_up() -> None:
     assert desk.session is not None
     desk.session._counter = 0xFFFFFFFE
     assert desk.sealed(IDENTIFY).ok, "the last one"
-    with pytest.raises(Garbled, match="used up its counters"):
+    with pytest.raises(GarbledError, match="used up its counters"):
         desk.session.seal(IDENTIFY)
 
 
@@ -179,5 +179,5 @@ def test_a_sealed_reply_whose_padding_is_wrong_is_not_told_as_a_wrong_tag() -> N
     station.seal(IDENTIFY)
     inner = Reply(True, bytes(13)).encode()
     assert len(inner) % 16 == 0
-    with pytest.raises(NotAuthentic, match="padding of a sealed reply is wrong; its tag is right"):
+    with pytest.raises(NotAuthenticError, match="padding of a sealed reply is wrong; its tag is right"):
         station.unseal(_seal_padded(node._keys.to_station, 1, inner))

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import Garbled, NotAuthentic, OtherKey, PolicyRefused
+from teds_provision.errors import GarbledError, KeyMismatchError, NotAuthenticError, PolicyError
 from teds_provision.protocol.agreement import (
     AgreedKey,
     Credentials,
     NodeAgreement,
-    OtherTranscript,
     RequestPayload,
     StationAgreement,
+    TranscriptMismatchError,
     transcript,
 )
 from teds_provision.protocol.keys import (
@@ -186,7 +186,7 @@ def test_the_station_refuses_an_epoch_that_is_not_greater_than_that_of_its_key(h
     if taken:
         assert agreement.accept(reply, desk.flash.security_teds(), pinned=None, epoch=held).epoch == 1
     else:
-        with pytest.raises(PolicyRefused, match=f"offers key epoch 1; this station already holds epoch {held}"):
+        with pytest.raises(PolicyError, match=f"offers key epoch 1; this station already holds epoch {held}"):
             agreement.accept(reply, desk.flash.security_teds(), pinned=None, epoch=held)
 
 
@@ -195,7 +195,7 @@ def test_the_station_refuses_another_key_than_the_pinned_one_in_the_agreement_it
     desk = Desk()
     agreement = StationAgreement(CREDENTIALS, UUID)
     reply = desk.plain(agreement.request()).payload
-    with pytest.raises(OtherKey):
+    with pytest.raises(KeyMismatchError):
         agreement.accept(reply, desk.flash.security_teds(), pinned=fingerprint(SoftwareKey(17).point), epoch=0)
 
 
@@ -205,7 +205,7 @@ def test_the_station_refuses_a_key_that_is_not_signed_for_this_uuid_in_the_agree
     desk.memory.state = replace(desk.flash, node_key_signature=elsewhere)
     desk.restart()
     agreement = StationAgreement(CREDENTIALS, UUID)
-    with pytest.raises(NotAuthentic, match="field 102"):
+    with pytest.raises(NotAuthenticError, match="field 102"):
         agreement.accept(desk.plain(agreement.request()).payload, desk.flash.security_teds(), pinned=None, epoch=0)
 
 
@@ -248,15 +248,15 @@ TAG_AT = 85
 def test_the_station_checks_length_point_tag_proof_and_epoch_in_this_order() -> None:
     answered = Answered()
     everything = with_en(bent(bent(answered.reply(signer=CA), TAG_AT), 19), OFF_CURVE)
-    with pytest.raises(Garbled, match="164 octets, not 165"):
+    with pytest.raises(GarbledError, match="164 octets, not 165"):
         answered.accept(everything[:-1], epoch=1)
-    with pytest.raises(NotAuthentic, match="one-time key"):
+    with pytest.raises(NotAuthenticError, match="one-time key"):
         answered.accept(everything, epoch=1)
-    with pytest.raises(OtherTranscript):
+    with pytest.raises(TranscriptMismatchError):
         answered.accept(bent(answered.reply(signer=CA), TAG_AT), epoch=1)
-    with pytest.raises(NotAuthentic, match="sigN"):
+    with pytest.raises(NotAuthenticError, match="sigN"):
         answered.accept(answered.reply(signer=CA), epoch=1)
-    with pytest.raises(PolicyRefused, match="offers key epoch 1"):
+    with pytest.raises(PolicyError, match="offers key epoch 1"):
         answered.accept(answered.reply(), epoch=1)
     assert answered.accept(answered.reply()).epoch == 1
 
@@ -270,7 +270,7 @@ def test_en_is_a_one_time_key_of_the_node_and_nothing_else(whose: str) -> None:
         reply = answered.reply(one_time=holders[whose])  # right in everything else
     else:
         reply = with_en(answered.reply(), OFF_CURVE if whose == "off the curve" else bytes(65))
-    with pytest.raises(NotAuthentic, match="one-time key"):
+    with pytest.raises(NotAuthenticError, match="one-time key"):
         answered.accept(reply)
 
 
@@ -278,14 +278,14 @@ def test_a_high_s_in_the_proof_of_an_agreement_is_refused() -> None:
     answered = Answered()
     reply = answered.reply()
     high = GROUP_ORDER - int.from_bytes(reply[-32:], "big")
-    with pytest.raises(NotAuthentic, match="sigN"):
+    with pytest.raises(NotAuthenticError, match="sigN"):
         answered.accept(reply[:-32] + high.to_bytes(32, "big"))
 
 
 def test_a_thief_of_the_station_key_cannot_pose_as_a_node() -> None:
     """Under KeyAgreement 1 he could: ECDH(station, node) was known to him as well."""
     answered = Answered()
-    with pytest.raises(NotAuthentic, match="sigN"):
+    with pytest.raises(NotAuthenticError, match="sigN"):
         answered.accept(answered.reply(signer=STATION))
 
 
@@ -293,7 +293,7 @@ def test_the_datasheet_that_the_station_read_is_part_of_what_is_agreed_on() -> N
     answered = Answered()
     reply = answered.reply()
     answered.teds = security.initial(NODE.point, Desk().flash.node_key_signature, sequence=1, key_epoch=0)
-    with pytest.raises(OtherTranscript):
+    with pytest.raises(TranscriptMismatchError):
         answered.accept(reply)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from teds_provision.protocol.agreement import StationAgreement, key_id
-from teds_provision.protocol.flash import ChipFailure
+from teds_provision.protocol.flash import ChipError
 from teds_provision.protocol.keys import prove_message, reset_message, verify
 from teds_provision.protocol.messages.frames import (
     Command,
@@ -229,7 +229,7 @@ def test_what_flash_took_and_reads_back_as_something_else_gets_11_and_does_not_c
 @pytest.mark.parametrize("chip", ["random", "one_time", "key"])
 def test_a_chip_that_does_not_work_gets_11_and_nothing_has_happened(chip: str) -> None:
     def broken(*_: object) -> Any:
-        raise ChipFailure
+        raise ChipError
 
     desk = Desk()
     if chip == "key":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import NodeRefused, NodeSilent
+from teds_provision.errors import NodeRefusedError, NodeSilentError
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.commands import set_address
@@ -33,7 +33,7 @@ def test_over_the_bus_it_takes_a_session(station: Station, board: Board) -> None
 
 
 def test_over_the_bus_without_a_key_it_is_refused(station: Station, board: Board) -> None:
-    with talk(board, MemoryLink(board, via="can", tapped=False)) as node, pytest.raises(NodeRefused):
+    with talk(board, MemoryLink(board, via="can", tapped=False)) as node, pytest.raises(NodeRefusedError):
         set_address(station, node, 0x23)
     assert board.state.can_address != 0x23
 
@@ -71,7 +71,7 @@ def test_a_board_that_moves_at_once_and_loses_its_reply_is_found_at_the_new_addr
 
 def test_a_node_that_is_not_at_the_new_address_is_silent(station: Station, board: Board) -> None:
     run(station, board)
-    with talk(board, OneBus(board, via="can", tapped=False, lose_request=3)) as node, pytest.raises(NodeSilent):
+    with talk(board, OneBus(board, via="can", tapped=False, lose_request=3)) as node, pytest.raises(NodeSilentError):
         set_address(station, node, 0x22)
     record = station.nodes.get(board.uuid)
     assert record is not None

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from teds_provision import teds
-from teds_provision.errors import BadData, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board as Hardware
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.station.station import Station
-from teds_provision.steps.adopting import Brought, NotAdopted
+from teds_provision.steps.adopting import Brought, NotAdoptedError
 from teds_provision.steps.agree import require_session, reset_node
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
@@ -75,11 +75,11 @@ def test_a_board_with_a_good_datasheet_is_in_service_after_a_tap_and_one_yes(sta
 
 def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> None:
     node = board(tmp_path / "n", factory())
-    with pytest.raises(PolicyRefused, match="no thanks"):
-        adopted(station, node, says=PolicyRefused("no thanks"))
+    with pytest.raises(PolicyError, match="no thanks"):
+        adopted(station, node, says=PolicyError("no thanks"))
     with (
         Conversation(on_reader(node), notice=lambda _notice: None) as talk,
-        pytest.raises(NotAdopted, match="nobody has approved"),
+        pytest.raises(NotAdoptedError, match="nobody has approved"),
     ):
         provision(station, talk, ADOPT, accept=lambda _who: None, reporter=Silent())
     assert node.tim.flash.sequence == 0
@@ -110,7 +110,7 @@ def test_an_adopted_node_that_was_reset_is_asked_about_again(station: Station, t
 
 def test_what_the_guard_finds_needs_a_reason_and_that_is_logged(station: Station, tmp_path: Path) -> None:
     node = board(tmp_path / "n", factory(slope=800.0))  # goes round more than twice
-    with pytest.raises(NotAdopted, match="refused") as refused:
+    with pytest.raises(NotAdoptedError, match="refused") as refused:
         adopted(station, node)
     assert refused.value.brought.errors
     assert "--accept-calibration" in refused.value.hint
@@ -149,7 +149,7 @@ def test_a_hostile_datasheet_is_never_signed(
 ) -> None:
     node = board(tmp_path / "n", blocks)
     for order in (ADOPT, BuildOrder(adopt=True, accept_calibration="because")):
-        with pytest.raises(BadData, match=said):
+        with pytest.raises(BadDataError, match=said):
             adopted(station, node, order)
     assert node.tim.flash.sequence == 0
 
@@ -166,7 +166,7 @@ def test_another_nodes_name_needs_another_one(station: Station, tmp_path: Path, 
     with station.durable("test"):
         station.nodes.remember(other, name="elbow")
     node = board(tmp_path / "n", named(factory(), 0, name))
-    with pytest.raises(PolicyRefused, match=f"node {other.hex()} already has that name") as refused:
+    with pytest.raises(PolicyError, match=f"node {other.hex()} already has that name") as refused:
         adopted(station, node)
     assert "--name" in refused.value.hint
     done, _ = adopted(station, node, BuildOrder(adopt=True, name="mine"))
@@ -182,5 +182,5 @@ def test_two_hundred_channels_are_shown_and_signed(station: Station, tmp_path: P
 
 
 def test_adopt_and_a_profile_exclude_each_other(station: Station, tmp_path: Path) -> None:
-    with pytest.raises(UsageFailure, match="--adopt"):
+    with pytest.raises(UsageError, match="--adopt"):
         adopted(station, board(tmp_path / "n", factory()), BuildOrder(ANGLE, adopt=True))

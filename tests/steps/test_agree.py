@@ -9,13 +9,13 @@ from datetime import timedelta
 import pytest
 
 from teds_provision.errors import (
-    BadData,
-    NodeRefused,
-    NodeSilent,
-    NotAuthentic,
-    NotWhitelisted,
-    OtherKey,
-    PolicyRefused,
+    BadDataError,
+    KeyMismatchError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    NotWhitelistedError,
+    PolicyError,
 )
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.messages.frames import Command, Reason, Reply, refusal
@@ -76,7 +76,7 @@ def test_over_a_bus_a_node_that_has_a_key_is_never_pinned(station: Station, boar
     whitelist(station, board)
     run(station, board)
     whitelist(station, board)
-    with pytest.raises(PolicyRefused, match="can only be pinned by tap"):
+    with pytest.raises(PolicyError, match="can only be pinned by tap"):
         run(station, board, MemoryLink(board, via="can", tapped=False), rotate=True)
     entry = station.pins.entry(board.uuid)
     assert entry is not None
@@ -98,7 +98,7 @@ def test_a_board_that_replaces_another_begins_at_its_own_epoch(station: Station,
 
 
 def test_an_unknown_node_is_refused_before_any_key(station: Station, board: Board) -> None:
-    with pytest.raises(NotWhitelisted):
+    with pytest.raises(NotWhitelistedError):
         run(station, board)
     assert board.state.epoch == 0
 
@@ -106,7 +106,7 @@ def test_an_unknown_node_is_refused_before_any_key(station: Station, board: Boar
 def test_a_known_uuid_with_another_key_is_refused(station: Station, board: Board) -> None:
     whitelist(station, board)
     run(station, board)
-    with pytest.raises(OtherKey):
+    with pytest.raises(KeyMismatchError):
         run(station, Board())
 
 
@@ -115,7 +115,7 @@ def test_a_station_of_another_owner_cannot_rekey_a_node(station: Station, board:
     first = run(station, board)
     stranger = make_station(tmp_path / "stranger")
     whitelist(stranger, board)
-    with pytest.raises(NodeRefused) as refused:
+    with pytest.raises(NodeRefusedError) as refused:
         run(stranger, board, rotate=True)
     assert refused.value.reason == Reason.UNTRUSTED_STATION
     assert board.state.key is not None
@@ -124,7 +124,7 @@ def test_a_station_of_another_owner_cannot_rekey_a_node(station: Station, board:
 
 def test_over_the_bus_a_node_with_nfc_refuses_its_first_key(station: Station, board: Board) -> None:
     whitelist(station, board)
-    with pytest.raises(NodeRefused) as refused:
+    with pytest.raises(NodeRefusedError) as refused:
         run(station, board, MemoryLink(board, via="can", tapped=False))
     assert refused.value.reason == Reason.NOT_PERMITTED
 
@@ -170,7 +170,7 @@ def test_after_a_wrong_node_tag_the_teds_is_read_again_and_a_new_request_is_made
 def test_a_second_wrong_node_tag_ends_it_and_is_no_key(station: Station, board: Board) -> None:
     whitelist(station, board)
     link = MemoryLink(board, tamper=flipped(TAG))
-    with pytest.raises(NotAuthentic, match="tagN"):
+    with pytest.raises(NotAuthenticError, match="tagN"):
         run(station, board, link)
     assert (len(requests(link)), held(station, board)) == (2, [])
 
@@ -178,7 +178,7 @@ def test_a_second_wrong_node_tag_ends_it_and_is_no_key(station: Station, board: 
 def test_a_wrong_proof_of_the_agreement_is_not_asked_for_again(station: Station, board: Board) -> None:
     whitelist(station, board)
     link = MemoryLink(board, tamper=flipped(PROOF))
-    with pytest.raises(NotAuthentic, match="does not hold the key that it shows"):
+    with pytest.raises(NotAuthenticError, match="does not hold the key that it shows"):
         run(station, board, link)
     assert (len(requests(link)), held(station, board)) == (1, [])
     entry = station.pins.entry(board.uuid)
@@ -209,7 +209,7 @@ def test_a_node_that_shows_another_key_after_a_wrong_tag_gets_no_second_request(
         return reply
 
     link = MemoryLink(board, tamper=two_boards)
-    with pytest.raises(OtherKey):  # identify has pinned the first one
+    with pytest.raises(KeyMismatchError):  # identify has pinned the first one
         run(station, board, link)
     assert (len(requests(link)), held(station, board)) == (1, [])
 
@@ -230,7 +230,7 @@ def test_a_node_of_another_wire_is_named_and_gets_no_request(
         return whole if len(reply) == len(whole) else reply
 
     link = MemoryLink(board, tamper=older)
-    with pytest.raises(BadData, match=name):
+    with pytest.raises(BadDataError, match=name):
         run(station, board, link)
     assert (requests(link), held(station, board)) == ([], [])
 
@@ -261,7 +261,7 @@ def test_whatever_message_is_lost_the_same_command_carries_on(
     station: Station, board: Board, half: str, lost: int
 ) -> None:
     whitelist(station, board)
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
     agreed = run(station, board)
     assert board.state.key is not None
@@ -276,7 +276,7 @@ def test_a_cut_rotation_leaves_a_working_key(
 ) -> None:
     whitelist(station, board)
     run(station, board)
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board, MemoryLink(board, **{half: lost}), rotate=True)  # type: ignore[arg-type]
     run(station, board)
     later(monkeypatch)
@@ -316,7 +316,7 @@ def test_a_node_that_dies_inside_confirm_heals(
     whitelist(station, board)
     run(station, board)
     setattr(board.flash, when, True)
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board, rotate=True)
     assert len(held(station, board)) == 2
     run(station, board)
@@ -329,10 +329,10 @@ def test_a_forged_refusal_of_open_deletes_nothing(station: Station, board: Board
     whitelist(station, board)
     run(station, board)
     board.flash.die_after = True
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board, rotate=True)
     forged = refusal(Reason.UNKNOWN_KEY).encode()
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         run(station, board, MemoryLink(board, tamper=lambda n, reply: forged if n > 2 else reply))
     assert len(held(station, board)) == 2
     assert run(station, board).epoch == 2
@@ -341,9 +341,9 @@ def test_a_forged_refusal_of_open_deletes_nothing(station: Station, board: Board
 def test_a_second_agreement_whose_confirm_is_lost_keeps_every_pending_key(station: Station, board: Board) -> None:
     whitelist(station, board)
     board.flash.die_after = True
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board)  # K1 is on the node, pending here
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board, MemoryLink(board, lose_request=5), rotate=True)
     assert run(station, board).epoch == 1
     assert held(station, board) == [("active", 1)]
@@ -354,7 +354,7 @@ def test_a_rotation_by_another_station_is_told_never_healed_by_itself(station: S
     run(station, board)
     board.flash.state = board.flash.state.__class__(**{**vars(board.flash.state), "key": bytes(16)})
     board.power_on()
-    with pytest.raises(PolicyRefused, match="knows none of the keys"):
+    with pytest.raises(PolicyError, match="knows none of the keys"):
         run(station, board)
     assert held(station, board) == [("active", 1)]
     assert run(station, board, rotate=True).epoch == 2
@@ -364,7 +364,7 @@ def test_a_lost_store_is_healed_by_a_tap_where_identity_and_ca_were_kept(station
     whitelist(station, board)
     run(station, board)
     station.keys.remove(board.uuid)
-    with pytest.raises(PolicyRefused, match="has a key that this station does not hold"):
+    with pytest.raises(PolicyError, match="has a key that this station does not hold"):
         run(station, board)  # whose key it is nobody knows: a person says that it is nobody else's
     assert run(station, board, rotate=True).epoch == 2
 
@@ -373,7 +373,7 @@ def test_a_pending_key_made_before_a_rotation_became_due_does_not_end_it(station
     whitelist(station, board)
     run(station, board)
     board.flash.die_after = True
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board, rotate=True)
     assert [state for state, _ in held(station, board)] == ["pending", "active"]
     station.keys.demand_rotation(board.uuid, "others may have it")

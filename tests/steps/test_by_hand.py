@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import NodeRefused, NodeSilent, UsageFailure
+from teds_provision.errors import NodeRefusedError, NodeSilentError, UsageError
 from teds_provision.links import Contact
 from teds_provision.protocol.messages.frames import Reason, refusal
 from teds_provision.station.station import Station
@@ -36,7 +36,7 @@ def test_a_datasheet_signed_by_hand_after_a_cut_agreement_is_taken(
         with talk(board) as node:
             agree(station, node, identify(station, node))
         lost += 1  # Open under the present key
-    with pytest.raises(NodeSilent), talk(board, MemoryLink(board, lose_reply=lost)) as node:
+    with pytest.raises(NodeSilentError), talk(board, MemoryLink(board, lose_reply=lost)) as node:
         agree(station, node, identify(station, node), rotate=rotate)
     with talk(board) as node:
         agree(station, node, identify(station, node))
@@ -68,7 +68,7 @@ def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station
     with talk(board, link) as node:
         require_session(station, node)
         present = Survey(Image(board.uuid, signed.unsigned_blocks()), frozenset(), board.tim.identity())
-        with pytest.raises(NodeRefused) as refused:
+        with pytest.raises(NodeRefusedError) as refused:
             write(station, node, signed, present=present)
     assert (lost, refused.value.reason) == (0, Reason.DIGEST_MISMATCH)
 
@@ -98,7 +98,7 @@ def test_a_digest_that_never_fits_is_told_and_nothing_is_sent_a_third_time(stati
     wrong = signed.with_block((1, 3), signed.blocks[0, 12])
     with talk(board) as node:
         require_session(station, node)
-        with pytest.raises(NodeRefused):
+        with pytest.raises(NodeRefusedError):
             write(station, node, wrong)
     assert board.state.sequence == 1
 
@@ -110,7 +110,7 @@ def _at(board: Board, address: int) -> Contact:
 def test_of_several_nodes_the_one_that_is_not_finished_is_meant(station: Station) -> None:
     boards = [Board(uuid=bytes([number]) * 10) for number in range(3)]
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
-    with pytest.raises(UsageFailure, match="3 nodes answer"):
+    with pytest.raises(UsageError, match="3 nodes answer"):
         the_one(station, contacts)
     provision(station, boards[0])
     provision(station, boards[2])
@@ -118,7 +118,7 @@ def test_of_several_nodes_the_one_that_is_not_finished_is_meant(station: Station
     assert the_one(station, contacts).identity.uuid == boards[1].uuid
     provision(station, boards[1])
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
-    with pytest.raises(UsageFailure, match="3 nodes answer"):
+    with pytest.raises(UsageError, match="3 nodes answer"):
         the_one(station, contacts)
     assert the_one(station, contacts[1:2]).identity.uuid == boards[1].uuid
 

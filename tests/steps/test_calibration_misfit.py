@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import CalibrationMisfit
+from teds_provision.errors import CalibrationMisfitError
 from teds_provision.handover.life import plan_takeover, take_over
 from teds_provision.station.station import Station
-from teds_provision.steps.board_type import WrongBoard
+from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.document import plan_sheet, write_sheet
 from teds_provision.steps.provision import Provisioned, provision
@@ -49,11 +49,11 @@ def test_degrees_are_never_published_as_something_else(
     station: Station, board: Board, calibrated: Path, profile: str
 ) -> None:
     before = board.state
-    with pytest.raises(CalibrationMisfit, match="channel 1") as refused:
+    with pytest.raises(CalibrationMisfitError, match="channel 1") as refused:
         provisioned(station, board, BuildOrder(profile, retype=True))
     assert (refused.value.exit_code, refused.value.code) == (6, "calibration-misfit")
     assert "--no-calibration" in refused.value.hint
-    with pytest.raises(CalibrationMisfit):
+    with pytest.raises(CalibrationMisfitError):
         build(station, board.uuid, BuildOrder(profile, retype=True))
     assert board.state == before, "nothing is written"
 
@@ -83,7 +83,7 @@ def test_a_draft_that_was_never_written_is_kept_for_its_own_type_alone(
     station: Station, board: Board, calibrated: Path
 ) -> None:
     build(station, board.uuid, BuildOrder(ANGLE, calibrated))
-    with pytest.raises(CalibrationMisfit):
+    with pytest.raises(CalibrationMisfitError):
         build(station, board.uuid, BuildOrder("load-cell", retype=True))
 
 
@@ -109,12 +109,12 @@ def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
     with talk(board) as node:
         blocks = dict(station.nodes.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
         blocks[1, AccessCode.CHANNEL] = load_profile("load-cell").build(board.uuid).blocks[1, AccessCode.CHANNEL]
-        with pytest.raises(WrongBoard, match="in rad, not in N"):
+        with pytest.raises(WrongBoardError, match="in rad, not in N"):
             write_sheet(station, node, blocks, Silent())
-        with pytest.raises(CalibrationMisfit):
+        with pytest.raises(CalibrationMisfitError):
             write_sheet(station, node, blocks, Silent(), retype=True)
         del blocks[1, AccessCode.CALIBRATION]
-        with pytest.raises(WrongBoard):
+        with pytest.raises(WrongBoardError):
             plan_sheet(station, node, blocks)
         assert plan_sheet(station, node, blocks, retype=True).changes
     assert station.nodes.draft(board.uuid) is None, "nothing was begun"

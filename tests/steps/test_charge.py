@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyError
 from teds_provision.links.hints import Charging
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
@@ -30,7 +30,7 @@ def run(
 
 
 def test_below_ten_per_cent_nothing_is_written_without_a_word(station: Station, board: Board) -> None:
-    with pytest.raises(PolicyRefused, match="is at 9 %") as refused:
+    with pytest.raises(PolicyError, match="is at 9 %") as refused:
         run(station, board, 9)
     assert "Charge it first" in refused.value.hint
     assert board.state.sequence == 0

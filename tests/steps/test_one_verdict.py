@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadDatasheet, NotAuthentic
+from teds_provision.errors import BadDatasheetError, NotAuthenticError
 from teds_provision.measure.rest import Rest
 from teds_provision.measure.trusting import open_trusted
 from teds_provision.station.station import Station
@@ -175,7 +175,7 @@ def test_verify_reads_all_and_every_screen_says_what_it_found(station: Station, 
     assert shown(station, board) == ("not authentic", "session")
     for _ in range(2):  # in this power-up, and after another restart: what spoke against it is not forgotten
         assert looked(station, board).verified.verdict == "not authentic"
-        with talk(board, over_the_bus(board)) as node, pytest.raises(NotAuthentic):
+        with talk(board, over_the_bus(board)) as node, pytest.raises(NotAuthenticError):
             open_trusted(station, node, by="sample")
         board.power_on()
 
@@ -304,7 +304,7 @@ def test_the_rest_is_read_behind_the_measurement(station: Station, board: Board)
 
 def test_a_change_that_is_found_behind_a_measurement_ends_it(station: Station, board: Board) -> None:
     changed_in_flash(board)
-    with pytest.raises(BadDatasheet, match=r"since .* do not count"):
+    with pytest.raises(BadDatasheetError, match=r"since .* do not count"):
         read_behind(station, board)
     assert shown(station, board) == ("not authentic", "session")
 
@@ -324,6 +324,6 @@ def test_a_node_without_its_key_is_not_authentic_by_any_row(station: Station, bo
     """A failed challenge is part of what was read: it stays in the row."""
     with talk(board) as node:
         require_session(station, node)
-        failed = possession(lambda: (_ for _ in ()).throw(NotAuthentic("It does not hold the key.")))  # type: ignore[arg-type, return-value]
+        failed = possession(lambda: (_ for _ in ()).throw(NotAuthenticError("It does not hold the key.")))  # type: ignore[arg-type, return-value]
         reading.keep(station, node, read_image(node), by="verify", known=None, more=[failed])
     assert shown(station, board) == ("not authentic", "session")

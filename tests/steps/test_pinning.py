@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import Garbled, PolicyRefused, VaultFailure
+from teds_provision.errors import GarbledError, PolicyError, VaultError
 from teds_provision.station.station import Station
 from teds_provision.steps import read as reading
 from teds_provision.steps.identify import identify
@@ -40,7 +40,7 @@ def test_one_damaged_key_does_not_hide_the_good_one(station: Station, board: Boa
     station._store._database.execute("UPDATE keys SET wrapped = x'00' WHERE state = 'pending'")
     assert agree(station, board).epoch == 1
     station._store._database.execute("UPDATE keys SET wrapped = x'00'")
-    with pytest.raises(VaultFailure):
+    with pytest.raises(VaultError):
         agree(station, board)
 
 
@@ -48,7 +48,7 @@ def test_a_node_that_hands_out_its_teds_too_slowly_is_left(
     station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reading, "READING_SECONDS", -1.0)
-    with talk(board) as node, pytest.raises(Garbled, match="too slowly"):
+    with talk(board) as node, pytest.raises(GarbledError, match="too slowly"):
         reading.read_image(node)
 
 
@@ -67,7 +67,7 @@ def test_a_node_given_away_and_provisioned_elsewhere_does_not_come_back_on_a_hin
     station.keys.remove(board.uuid)
     station.handovers.put(Handover("one", "out", "move", ("ab" * 32,), "closed", "{}"))
     station._store.put_tombstone(Tombstone(board.uuid, "ab" * 32, "one"))
-    with talk(board) as node, pytest.raises(PolicyRefused, match="was moved"):
+    with talk(board) as node, pytest.raises(PolicyError, match="was moved"):
         step(station, node, replace(identify(station, node), state=NodeState.FACTORY))
     assert station.policy.tombstone(board.uuid) is not None
     board.tim.reset_by_hand()

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import (
-    LinkFailure,
-    NodeRefused,
-    NodeSilent,
-    NotAuthentic,
-    NotWhitelisted,
-    PolicyRefused,
+    LinkError,
+    NodeRefusedError,
+    NodeSilentError,
+    NotAuthenticError,
+    NotWhitelistedError,
+    PolicyError,
     TedsProvisionError,
 )
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, TedsFunction
@@ -83,9 +83,9 @@ def test_a_small_node_takes_its_datasheet_in_many_segments(station: Station) -> 
 
 def test_without_a_yes_an_unknown_node_is_left_alone(station: Station, board: Board) -> None:
     def no(who: Identified) -> None:
-        raise NotWhitelisted("no")
+        raise NotWhitelistedError("no")
 
-    with pytest.raises(NotWhitelisted):
+    with pytest.raises(NotWhitelistedError):
         run(station, board, accept=no)
     assert board.state.state == NodeState.FACTORY
     assert station.pins.whitelist() == []
@@ -116,7 +116,7 @@ def exchanges_of_a_whole_run(tmp_path: Path) -> int:
 def test_cut_at_every_message_the_same_command_carries_on(tmp_path: Path, half: str) -> None:
     for lost in range(1, exchanges_of_a_whole_run(tmp_path) + 1):
         station, board = make_station(tmp_path / f"{half}{lost}"), Board()
-        with pytest.raises(NodeSilent):
+        with pytest.raises(NodeSilentError):
             run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
         assert run(station, board).verified.verdict == "authentic", f"{half} {lost}"
         assert [record.state for record in station.keys.of(board.uuid)] == ["active"]
@@ -131,7 +131,7 @@ def test_power_cut_at_every_flash_commit(station: Station, board: Board, when: s
         board.flash.state = replace(board.flash.state, provisioned=False)
         board.power_on()
     setattr(board.flash, when, True)
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         run(station, board, order=replace(ANGLE, name="another") if commit == 2 else ANGLE)
     assert run(station, board).verified.verdict == "authentic"
 
@@ -176,7 +176,7 @@ def test_read_only_teds_are_signed_as_they_are(station: Station, board: Board) -
 def test_a_sequence_far_behind_is_caught_up_in_steps_once_a_person_says_so(station: Station, board: Board) -> None:
     run(station, board)
     station.nodes.remember(board.uuid, sequence=200_000)
-    with pytest.raises(PolicyRefused, match="far ahead"):
+    with pytest.raises(PolicyError, match="far ahead"):
         run(station, board, order=replace(ANGLE, name="far ahead"))
     draft = station.nodes.draft(board.uuid)
     assert draft is not None
@@ -200,16 +200,16 @@ def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
 
     run(station, board)
     station.policy.deny(RevocationRecord(board.uuid, None, "stolen", ""))
-    with pytest.raises(PolicyRefused, match="stolen"):
+    with pytest.raises(PolicyError, match="stolen"):
         run(station, board)
 
 
 def test_another_owners_station_is_refused(station: Station, board: Board, tmp_path: Path) -> None:
     run(station, board)
     before, stranger = board.state, make_station(tmp_path / "stranger")
-    with pytest.raises(PolicyRefused, match="has a key that this station does not hold"):
+    with pytest.raises(PolicyError, match="has a key that this station does not hold"):
         run(stranger, board)
-    with talk(board) as node, pytest.raises(NodeRefused) as refused:  # a person's word does not help either
+    with talk(board) as node, pytest.raises(NodeRefusedError) as refused:  # a person's word does not help either
         provision(stranger, node, ANGLE, accept=accept, reporter=Silent(), take_over=lambda question: None)
     assert refused.value.reason == Reason.UNTRUSTED_STATION
     assert board.state == before
@@ -217,7 +217,7 @@ def test_another_owners_station_is_refused(station: Station, board: Board, tmp_p
 
 def test_a_broken_flash_is_told(station: Station, board: Board) -> None:
     board.flash.fail = True
-    with pytest.raises(NodeRefused) as refused:
+    with pytest.raises(NodeRefusedError) as refused:
         run(station, board)
     assert refused.value.reason == Reason.FLASH_FAILURE
 
@@ -231,12 +231,12 @@ def test_a_read_back_that_differs_is_not_believed(station: Station, board: Board
         state.blocks[0, 12] = state.blocks[0, 12][:-3] + b"\0" + state.blocks[0, 12][-2:]
 
     board.flash.commit = corrupting  # type: ignore[method-assign]
-    with pytest.raises(NotAuthentic, match="reads back differently"):
+    with pytest.raises(NotAuthenticError, match="reads back differently"):
         run(station, board, order=replace(ANGLE, name="renamed"))
 
 
 def test_the_link_error_is_a_link_error() -> None:
-    assert issubclass(NodeSilent, LinkFailure)
+    assert issubclass(NodeSilentError, LinkError)
 
 
 @pytest.mark.parametrize("orders", ["no such profile", "no profile", "broken calibration", "no calibration file"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import Garbled, NodeRefused
+from teds_provision.errors import GarbledError, NodeRefusedError
 from teds_provision.protocol.messages.frames import Reason, Reply, refusal
 from teds_provision.steps.read import LARGEST_SECURITY, read_block
 from teds_provision.teds.codec.frame import frame
@@ -20,7 +20,7 @@ def test_a_teds_that_claims_to_be_endless_is_not_read(board: Board, block: tuple
         return Reply(True, (0).to_bytes(4, "big") + most.to_bytes(4, "big")).encode()
 
     link = MemoryLink(board, tamper=claim)
-    with pytest.raises(Garbled, match=f"at most {most} are read"):  # outside a session anyone can say so: 5, not 8
+    with pytest.raises(GarbledError, match=f"at most {most} are read"):  # outside a session anyone can say so: 5, not 8
         read_block(talk(board, link), block)
     assert link.count == 1
 
@@ -48,7 +48,7 @@ def test_noise_on_a_plain_read_is_read_again_and_a_teds_that_is_bad_stays_bad(bo
     assert read_block(talk(board, bad), SECURITY) == good[:-1] + bytes([good[-1] ^ 1])
 
     restless = MemoryLink(board, tamper=lambda count, reply: reply[:-1] + bytes([reply[-1] ^ count]))
-    with pytest.raises(Garbled, match="noisy"):
+    with pytest.raises(GarbledError, match="noisy"):
         read_block(talk(board, restless), SECURITY)
 
 
@@ -59,7 +59,7 @@ def test_a_refusal_that_nobody_vouches_for_is_asked_for_again(board: Board) -> N
     assert read_block(talk(board, disturbed), SECURITY) == good
 
     steady = MemoryLink(board, tamper=lambda _count, _reply: REFUSED)
-    with pytest.raises(NodeRefused, match="no such TEDS"):
+    with pytest.raises(NodeRefusedError, match="no such TEDS"):
         read_block(talk(board, steady), SECURITY)
     assert steady.count == 3
 
@@ -73,6 +73,6 @@ def test_an_offset_that_nobody_asked_for_is_asked_again_outside_a_session(board:
 
     assert read_block(talk(board, MemoryLink(board, tamper=stale)), SECURITY) == good
     steady = MemoryLink(board, tamper=lambda _count, _reply: stale(1, b""))
-    with pytest.raises(Garbled, match="different offset"):
+    with pytest.raises(GarbledError, match="different offset"):
         read_block(talk(board, steady), SECURITY)
     assert steady.count == 3

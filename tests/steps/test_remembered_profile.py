@@ -9,7 +9,7 @@ import pytest
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import reset_node
-from teds_provision.steps.build import BuildOrder, NotNamed, build, nobody
+from teds_provision.steps.build import BuildOrder, UnrequestedChangeError, build, nobody
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.talk.progress import Silent
@@ -59,7 +59,7 @@ def test_a_profile_that_changed_since_is_told_and_asked(station: Station, board:
     assert any("has changed since this node's datasheet was built" in text for text in told)
     station.nodes.drop_draft(board.uuid)
     reset(station, board)
-    with pytest.raises(NotNamed):
+    with pytest.raises(UnrequestedChangeError):
         provisioned(station, board, BuildOrder())
     assert provisioned(station, board, BuildOrder("./own.toml")).verified.verdict == "authentic"
     reset(station, board)

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, NodeBusy, NodeSilent, NoNode
+from teds_provision.errors import BadDataError, NodeBusyError, NodeSilentError, NoNodeError
 from teds_provision.station.station import Station
 from teds_provision.steps.batch_sheet import (
     About,
     BatchSheet,
     BoardResult,
-    Declined,
+    DeclinedError,
     Progress,
     SheetRow,
     read_sheet,
@@ -30,7 +30,7 @@ def read(station: Station, folder: Path, text: str | bytes) -> BatchSheet:
 
 def test_a_mistake_of_many_lines_is_told_once_with_all_of_them(station: Station, tmp_path: Path) -> None:
     rows = "".join(f",b{number},none.csv\n" for number in range(30))
-    with pytest.raises(BadData) as told:
+    with pytest.raises(BadDataError) as told:
         read(station, tmp_path, f"uuid,name,calibration\n{rows}")
     assert told.value.message.count("There is no calibration file") == 1
     assert told.value.message.startswith("boards.csv:2, 3, 4, ")
@@ -44,7 +44,7 @@ def test_a_spreadsheet_separates_by_comma_semicolon_or_tab(station: Station, tmp
 
 
 def test_a_sheet_that_is_not_utf8_is_told_with_the_line_and_the_cure(station: Station, tmp_path: Path) -> None:
-    with pytest.raises(BadData, match=r"boards.csv:3: it is not UTF-8 .*CSV UTF-8"):
+    with pytest.raises(BadDataError, match=r"boards.csv:3: it is not UTF-8 .*CSV UTF-8"):
         read(station, tmp_path, b"uuid,name\n,a\n,caf\xe9\n,b\n,c\n")
 
 
@@ -59,7 +59,7 @@ def test_rows_without_the_calibration_that_their_type_asks_for_are_told_before_t
 
 
 def test_a_name_is_one_line(station: Station, tmp_path: Path) -> None:
-    with pytest.raises(BadData, match="one line of printable characters"):
+    with pytest.raises(BadDataError, match="one line of printable characters"):
         read(station, tmp_path, 'uuid,name\n,"a\nb"\n')
 
 
@@ -72,7 +72,7 @@ def test_a_label_scanned_into_a_cell_says_uuid_and_key(station: Station, tmp_pat
     for other in ("", same):
         (row,) = read(station, tmp_path, f"{columns}\n{label},a,{other}\n").rows
         assert (row.uuid, row.fingerprint) == (bytes.fromhex(uuid), key)
-    with pytest.raises(BadData, match="and the label in"):
+    with pytest.raises(BadDataError, match="and the label in"):
         read(station, tmp_path, f"{columns}\n{label},a,{'ab' * (len(same) // 2)}\n")
 
 
@@ -83,7 +83,7 @@ def board_of(number: int) -> bytes:
 def test_rows_go_to_boards_in_the_order_of_the_taps_and_to_a_spare_at_last(station: Station, tmp_path: Path) -> None:
     """A board that failed keeps its row for another try; its spare was told that no row is left."""
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
-    for number, error in ((1, None), (2, NodeSilent("It was pulled.")), (3, None)):
+    for number, error in ((1, None), (2, NodeSilentError("It was pulled.")), (3, None)):
         row = progress.row_for(board_of(number), "")
         assert row is not None
         assert row.number == number
@@ -110,12 +110,12 @@ def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station
     first, second, third = sheet.rows
     one.take(first, board_of(1))
     assert other.row_for(board_of(2), "") is first, "it does not know yet"
-    with pytest.raises(NodeBusy, match="by another run of this sheet"):
+    with pytest.raises(NodeBusyError, match="by another run of this sheet"):
         other.take(first, board_of(2))
     assert other.row_for(board_of(2), "") is second
     other.take(second, board_of(2))
-    other.note(second, BoardResult(board_of(2), 1.0, error=NodeSilent("It was pulled."), row=2))
-    one.note(first, BoardResult(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
+    other.note(second, BoardResult(board_of(2), 1.0, error=NodeSilentError("It was pulled."), row=2))
+    one.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
     one.take(third, board_of(3))
     again = Progress(station.home, sheet)
     assert [again.board_of(row) for row in sheet.rows] == [board_of(number).hex() for number in (1, 2, 3)]
@@ -126,7 +126,7 @@ def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station
 def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tmp_path: Path) -> None:
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
     progress.take(progress.sheet.rows[0], board_of(1))
-    progress.note(progress.sheet.rows[0], BoardResult(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
+    progress.note(progress.sheet.rows[0], BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
     row = progress.row_for(board_of(2), "")
     assert row is not None
     assert row.number == 2
@@ -197,7 +197,7 @@ def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Pa
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
     first, second, _ = progress.sheet.rows
     progress.turn_away(first, board_of(1))
-    progress.note(first, BoardResult(board_of(1), 1.0, error=NodeSilent("Its name is another's."), row=1))
+    progress.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("Its name is another's."), row=1))
     assert progress.row_for(board_of(1), "") is first, "held there again it is tried for the same row"
     assert progress.row_for(board_of(2), "") is second
     assert progress.next_row is second
@@ -209,7 +209,7 @@ def test_a_no_is_no_try_of_a_board(station: Station, tmp_path: Path) -> None:
     """A board that passed when it was held there again counted as one that needed two tries."""
     progress = Progress(station.home, read(station, tmp_path, "name\na\n"))
     (row,) = progress.sheet.rows
-    progress.note(row, BoardResult(board_of(1), 1.0, error=Declined("You said no."), row=1))
+    progress.note(row, BoardResult(board_of(1), 1.0, error=DeclinedError("You said no."), row=1))
     assert (progress.rows[1].result, progress.rows[1].tries) == ("skipped", 0)
     progress.rows[1].result = ""
     progress.note(row, BoardResult(board_of(1), 1.0, row=1))
@@ -222,14 +222,14 @@ def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
     progress.ran_out("was tapped within 30 s")
     error = progress.totals().error
-    assert isinstance(error, NoNode)
+    assert isinstance(error, NoNodeError)
     assert error.message == "0 passed, 0 failed, 2 skipped. No board was tapped within 30 s for row 1, 2."
 
 
 def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(station: Station, tmp_path: Path) -> None:
     progress = Progress(station.home, read(station, tmp_path, "name\n<b>\nb\n"))
     progress.take(progress.sheet.rows[0], bytes(10))
-    progress.note(progress.sheet.rows[0], BoardResult(bytes(10), 1.23, error=NodeSilent("It is <silent>."), row=1))
+    progress.note(progress.sheet.rows[0], BoardResult(bytes(10), 1.23, error=NodeSilentError("It is <silent>."), row=1))
     about = About("bench <1>", "ab" * 32, "Ada", "teds-provision 9")
     write_report(tmp_path / "day.html", progress, about)
     text = (tmp_path / "day.html").read_text()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from teds_provision.errors import AddressConflict, NodeRefused, NotAuthentic, PolicyRefused, Unproven
+from teds_provision.errors import AddressConflictError, NodeRefusedError, NotAuthenticError, PolicyError, UnprovenError
 from teds_provision.links import Contact, LinkSettings, Notice
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import COMMON, Function, Reason, Reply, refusal, security_command
@@ -86,7 +86,7 @@ def test_the_very_datasheet_of_the_node_without_a_session_is_unproven(
     attacker = Attacker(board, recorded, state, reason)
     verified = looked_at(station, attacker)
     assert verified.verdict == "unproven"
-    with pytest.raises(Unproven) as told:
+    with pytest.raises(UnprovenError) as told:
         require_authentic(verified)
     assert told.value.exit_code == 5
     assert (Function.RESET in attacker.asked) == (state == NodeState.FACTORY)
@@ -101,7 +101,7 @@ def test_an_old_datasheet_without_a_session_is_not_authentic(station: Station, b
     run(station, board, order=replace(ANGLE, name="renamed"))
     verified = looked_at(station, Attacker(board, old))
     assert verified.verdict == "not authentic"
-    with pytest.raises(NotAuthentic, match="sequence 1 is older than the 2"):
+    with pytest.raises(NotAuthenticError, match="sequence 1 is older than the 2"):
         require_authentic(verified)
 
 
@@ -136,7 +136,7 @@ def test_a_node_that_was_reset_shows_it_by_its_signature(station: Station, board
 
 def test_a_proof_of_reset_with_another_key_is_none(station: Station, board: Board) -> None:
     board.tim.reset_by_hand()
-    with talk(board) as node, pytest.raises(NotAuthentic):
+    with talk(board) as node, pytest.raises(NotAuthenticError):
         proof_of_reset(node, Board().key.point)
 
 
@@ -156,7 +156,7 @@ def test_in_its_session_a_node_is_held_against_what_this_station_saw(station: St
 
 def test_one_uuid_at_two_addresses_is_a_conflict_that_names_both(board: Board) -> None:
     here, there = (replace(contact(board, MemoryLink(board, via="can")), address=at) for at in (0x11, 0x22))
-    with pytest.raises(AddressConflict, match=f"{board.uuid.hex()} answers at 0x11 and at 0x22"):
+    with pytest.raises(AddressConflictError, match=f"{board.uuid.hex()} answers at 0x11 and at 0x22"):
         refuse_twins([here, there])
     other = replace(contact(Board(uuid=bytes(10))), address=0x22)
     assert refuse_twins([here, other]) == [here, other]
@@ -169,7 +169,7 @@ def test_a_copied_uuid_costs_its_own_node_alone(board: Board) -> None:
     told: list[Notice] = []
     assert without_twins([here, other, there], told.append) == [other]
     assert [notice.uuid for notice in told] == [board.uuid]
-    with pytest.raises(AddressConflict):
+    with pytest.raises(AddressConflictError):
         without_twins([here, there], told.append)
 
 
@@ -191,10 +191,10 @@ def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
 
     monkeypatch.setattr("teds_provision.steps.commands.at_node", contextmanager(refuses))
     done = verify_at(station, LinkSettings(), board.uuid.hex(), Silent())
-    assert (done.verified.verdict, type(done.error)) == ("unproven", Unproven)
+    assert (done.verified.verdict, type(done.error)) == ("unproven", UnprovenError)
 
     stranger = bytes(9) + b"\1"
-    with pytest.raises(NodeRefused):
+    with pytest.raises(NodeRefusedError):
         verify_at(station, LinkSettings(), stranger.hex(), Silent())
 
 
@@ -217,7 +217,7 @@ def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
     attacker = Attacker(board, recorded)
     met(Conversation(Contact(attacker.identity, attacker, address=FORGED_ADDRESS), notice=lambda notice: None))
     forged = read()
-    assert (forged.image, type(forged.error)) == (recorded, Unproven)
+    assert (forged.image, type(forged.error)) == (recorded, UnprovenError)
     met(talk(board))
     assert read().error is None, "in a session"
     board.tim.reset_by_hand()
@@ -252,9 +252,9 @@ def test_a_refusal_outside_a_session_is_told_as_heard_and_not_proven(station: St
     run(station, board)
     board.flash.state = replace(board.flash.state, key=bytes(16))
     board.power_on()
-    with talk(board) as node, pytest.raises(PolicyRefused, match="proves nothing"):
+    with talk(board) as node, pytest.raises(PolicyError, match="proves nothing"):
         require_session(station, node)
-    with talk(board) as node, pytest.raises(NodeRefused, match="Not verified"):
+    with talk(board) as node, pytest.raises(NodeRefusedError, match="Not verified"):
         node.plain(security_command(Function.CLOSE), "to close")
 
 
@@ -262,7 +262,7 @@ def test_a_refusal_in_a_session_is_the_nodes_own_word(station: Station, board: B
     run(station, board)
     with talk(board) as node:
         require_session(station, node)
-        with pytest.raises(NodeRefused, match="The node refused to do the unknown"):
+        with pytest.raises(NodeRefusedError, match="The node refused to do the unknown"):
             node.send(security_command(99), "to do the unknown")
 
 
@@ -277,7 +277,7 @@ def test_who_does_not_prove_the_key_that_he_shows_is_not_identified(
 
     with (
         talk(board, MemoryLink(board, tamper=forged)) as node,
-        pytest.raises(NotAuthentic, match="cannot prove that it holds the key"),
+        pytest.raises(NotAuthenticError, match="cannot prove that it holds the key"),
     ):
         identify(station, node)
     assert station.nodes.get(board.uuid) is None

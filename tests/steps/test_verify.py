@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotWhitelisted, PolicyRefused
+from teds_provision.errors import NotWhitelistedError, PolicyError
 from teds_provision.protocol.datasheet import sign_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.messages.identity import Identity
@@ -235,7 +235,7 @@ def test_what_a_stranger_signed_is_no_floor_for_sequence_and_epoch(
 
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:
     station.pins.remove(board.uuid)
-    with pytest.raises(NotWhitelisted):
+    with pytest.raises(NotWhitelistedError):
         sign_image(station, SignOrder(board.uuid, image), None)
 
 
@@ -274,6 +274,6 @@ def test_a_datasheet_signed_before_a_rotation_is_refused_before_anything_is_stag
     draft = sign_image(station, SignOrder(board.uuid), None).signed
     with talk(board) as node:
         agree(station, node, identify(station, node), rotate=True)
-        with pytest.raises(PolicyRefused, match="epoch") as refused:
+        with pytest.raises(PolicyError, match="epoch") as refused:
             write(station, node, draft.image)
-    assert refused.type is PolicyRefused, "said here, not by the node after its flash was written"
+    assert refused.type is PolicyError, "said here, not by the node after its flash was written"

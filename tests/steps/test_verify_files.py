@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFoundError
 from teds_provision.files import json_files
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, station_key_message, to_pem
@@ -190,7 +190,7 @@ def test_images_without_a_calibration_load_no_guard(home: Path, tmp_path: Path) 
 
 
 def test_a_folder_without_images_is_said_and_doubles_count_once(tmp_path: Path) -> None:
-    with pytest.raises(NotFound, match="no image"):
+    with pytest.raises(NotFoundError, match="no image"):
         json_files([tmp_path], "image")
     one = write(tmp_path, "1.json", signed(1))
     assert json_files([one, tmp_path, one], "image") == [str(one)]

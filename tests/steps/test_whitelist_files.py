@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, NotFound, OtherKey, PolicyRefused
+from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError, PolicyError
 from teds_provision.station.station import Station
 from teds_provision.steps.whitelist import FORMATS, ListedNode, add, plan_addition, read_whitelist, remove, render
 from teds_provision.store import RevocationRecord, WhitelistEntry
@@ -95,7 +95,7 @@ def test_an_empty_whitelist_is_one(tmp_path: Path, text: str) -> None:
     ],
 )  # fmt: skip
 def test_every_wrong_line_is_named(tmp_path: Path, text: str, places: list[str]) -> None:
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         read(tmp_path, text)
     for place in places:
         assert place in caught.value.message
@@ -103,7 +103,7 @@ def test_every_wrong_line_is_named(tmp_path: Path, text: str, places: list[str])
 
 
 def test_the_first_ten_of_many_wrong_lines_are_shown(tmp_path: Path) -> None:
-    with pytest.raises(BadData, match=r"list\.txt:10: .*and 20 more") as caught:
+    with pytest.raises(BadDataError, match=r"list\.txt:10: .*and 20 more") as caught:
         read(tmp_path, "x\n" * 30)
     assert "list.txt:11" not in caught.value.message
 
@@ -123,17 +123,17 @@ BOMB = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa">' + "".join(
     ],
 )
 def test_entity_bombs_and_external_entities_are_refused(tmp_path: Path, text: str) -> None:
-    with costs_at_most(1.0), pytest.raises(BadData, match="DTD"):
+    with costs_at_most(1.0), pytest.raises(BadDataError, match="DTD"):
         read(tmp_path, text)
 
 
 def test_a_missing_file_and_other_encodings_are_told(tmp_path: Path) -> None:
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         read_whitelist(tmp_path / "none.xml")
-    with pytest.raises(NotFound, match="is a folder"):
+    with pytest.raises(NotFoundError, match="is a folder"):
         read_whitelist(tmp_path)
     (tmp_path / "latin.csv").write_bytes(b"uuid,name\n\xe4")
-    with pytest.raises(BadData, match=r"latin\.csv:2: the text is not UTF-8"):
+    with pytest.raises(BadDataError, match=r"latin\.csv:2: the text is not UTF-8"):
         read_whitelist(tmp_path / "latin.csv")
 
 
@@ -169,7 +169,7 @@ def test_no_octets_make_anything_but_entries_or_one_of_our_errors(tmp_path: Path
     path.write_bytes(octets)
     try:
         listed = read_whitelist(path, form)
-    except BadData:
+    except BadDataError:
         return
     assert all(len(entry.uuid) == 10 for entry in listed)
 
@@ -189,7 +189,7 @@ def test_a_hundred_thousand_entries_are_quick(tmp_path: Path, station: Station) 
 
 @pytest.mark.slow
 def test_more_entries_than_a_whitelist_has_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadData, match="more than 250000 entries"):
+    with pytest.raises(BadDataError, match="more than 250000 entries"):
         read(tmp_path, "".join(f"{number:020x}\n" for number in range(250_001)))
 
 
@@ -202,7 +202,7 @@ def put(station: Station, *listed: ListedNode) -> None:
 
 def test_a_pinned_key_is_never_replaced_and_one_conflict_refuses_all(station: Station) -> None:
     put(station, ListedNode(1, ONE, KEY))
-    with pytest.raises(OtherKey, match="pinned to the key abababababababab") as caught:
+    with pytest.raises(KeyMismatchError, match="pinned to the key abababababababab") as caught:
         plan_addition(station, [ListedNode(1, TWO), ListedNode(2, ONE, OTHER)])
     assert caught.value.exit_code == 6
     assert station.pins.entry(TWO) is None
@@ -222,7 +222,7 @@ def test_an_unpinned_entry_gains_a_key_and_keeps_the_rest(station: Station) -> N
 
 def test_the_key_that_a_node_has_proved_counts_as_pinned(station: Station) -> None:
     station.nodes.remember(ONE, point=station.point)
-    with pytest.raises(OtherKey):
+    with pytest.raises(KeyMismatchError):
         plan_addition(station, [ListedNode(1, ONE, KEY)])
     put(station, ListedNode(1, ONE, station.fingerprint))
     assert remove(station, ONE)
@@ -241,7 +241,7 @@ def test_removing_keeps_epoch_and_sequence(station: Station) -> None:
 
 def test_a_revoked_node_is_not_whitelisted_again(station: Station) -> None:
     station.policy.deny(RevocationRecord(ONE, None, "stolen", "{}"))
-    with pytest.raises(PolicyRefused, match="stolen"):
+    with pytest.raises(PolicyError, match="stolen"):
         plan_addition(station, [ListedNode(1, ONE)])
 
 
@@ -252,7 +252,7 @@ def test_a_list_of_many_pages_is_held_against_what_is_known_on_each(station: Sta
     plan = plan_addition(station, listed)
     assert (plan.new, plan.unchanged, len(plan.write)) == (201, 1000, 201)
     other = [*listed[:999], ListedNode(999, listed[999].uuid, OTHER), *listed[1000:]]
-    with pytest.raises(OtherKey, match=listed[999].uuid.hex()):
+    with pytest.raises(KeyMismatchError, match=listed[999].uuid.hex()):
         plan_addition(station, other)
 
 
@@ -271,5 +271,5 @@ def test_an_eui_64_gets_the_uuid_of_the_written_rule_in_every_format(tmp_path: P
     assert found[0].uuid != bytes.fromhex("00000011223344556677")
     for wrong in ("00112233445566", "001122334455667788"):
         (tmp_path / "wrong.csv").write_text(f"uuid\n{wrong}\n")
-        with pytest.raises(BadData, match="20 hex digits"):
+        with pytest.raises(BadDataError, match="20 hex digits"):
             read_whitelist(tmp_path / "wrong.csv")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import OtherKey
+from teds_provision.errors import KeyMismatchError
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.steps.identify import identify
@@ -38,7 +38,7 @@ def test_another_board_under_the_same_uuid_is_refused_until_the_entry_is_removed
     add(station, plan_addition(station, [ListedNode(0, board.uuid)]))
     identify(station, talk(board))
     replaced = Board(board.uuid)
-    with pytest.raises(OtherKey):
+    with pytest.raises(KeyMismatchError):
         identify(station, talk(replaced))
     remove(station, board.uuid)
     add(station, plan_addition(station, [ListedNode(0, board.uuid)]))

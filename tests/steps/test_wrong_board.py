@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NodeRefused, PolicyRefused
+from teds_provision.errors import NodeRefusedError, PolicyError
 from teds_provision.links import Contact, LinkSettings
 from teds_provision.node.described import create
 from teds_provision.node.flash_file import FlashFile
@@ -18,7 +18,7 @@ from teds_provision.protocol.operation.commands import OPERATION, ChannelState, 
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session, reset_node
 from teds_provision.steps.batch import Boards, ProvisionRequest, Questions
-from teds_provision.steps.board_type import WrongBoard, bears, differences, operate
+from teds_provision.steps.board_type import WrongBoardError, bears, differences, operate
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, provision
@@ -68,7 +68,7 @@ def test_a_factory_board_of_another_type_is_refused_before_it_becomes_ours(
     station: Station, angle: VirtualNode, tmp_path: Path
 ) -> None:
     """A factory angle sensor tapped for a load cell's row of the sheet had passed, 100 %."""
-    with pytest.raises(WrongBoard, match="is in rad, not in N") as caught:
+    with pytest.raises(WrongBoardError, match="is in rad, not in N") as caught:
         given(station, on_reader(angle), order(tmp_path, FORCE))
     assert (caught.value.code, caught.value.exit_code) == ("wrong-board", 6)
     assert angle.tim.flash.state == NodeState.FACTORY
@@ -83,10 +83,10 @@ def test_a_finished_board_does_not_silently_become_another_one(
 ) -> None:
     given(station, on_reader(angle), order(tmp_path, ANGLE))
     before = angle.tim.flash
-    with pytest.raises(WrongBoard):
+    with pytest.raises(WrongBoardError):
         given(station, on_reader(angle), order(tmp_path, named))
     assert angle.tim.flash == before
-    with pytest.raises(WrongBoard):
+    with pytest.raises(WrongBoardError):
         build(station, before.uuid, order(tmp_path, named))
     assert station.nodes.draft(before.uuid) is None
 
@@ -95,13 +95,13 @@ def test_with_retype_it_becomes_one_and_the_hardware_has_the_last_word(
     station: Station, angle: VirtualNode, tmp_path: Path
 ) -> None:
     given(station, on_reader(angle), order(tmp_path, ANGLE))
-    with pytest.raises(WrongBoard, match=r"Channel 1 .* of the board does not match this datasheet"):
+    with pytest.raises(WrongBoardError, match=r"Channel 1 .* of the board does not match this datasheet"):
         given(station, on_reader(angle), order(tmp_path, GRIPPER, retype=True))
 
 
 def test_at_a_terminal_a_yes_to_the_differences_is_enough(station: Station, angle: VirtualNode, tmp_path: Path) -> None:
     asked: list[tuple[str, ...]] = []
-    with pytest.raises(WrongBoard, match="does not match"):
+    with pytest.raises(WrongBoardError, match="does not match"):
         given(station, on_reader(angle), order(tmp_path, GRIPPER), retype=lambda _uuid, told: asked.append(told))
     assert len(asked) == 1, "once, not before and after the key agreement"
     assert any("is a sensor, not an actuator" in text for text in asked[0])
@@ -114,7 +114,7 @@ def test_what_was_merely_built_for_a_board_makes_it_no_board_of_that_type(
     with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
         identify(station, node)
     build(station, uuid, BuildOrder(FORCE))
-    with pytest.raises(WrongBoard):
+    with pytest.raises(WrongBoardError):
         given(station, on_reader(angle), BuildOrder())
 
 
@@ -181,7 +181,9 @@ def test_reason_6_and_23_of_operate_have_words_of_their_own(
     given(station, on_reader(angle), order(tmp_path, ANGLE))
     with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
         require_session(station, node)
-        with pytest.raises(NodeRefused, match=r"does not match its datasheet on channel 1.*\(reason 6\)") as caught:
+        with pytest.raises(
+            NodeRefusedError, match=r"does not match its datasheet on channel 1.*\(reason 6\)"
+        ) as caught:
             operate(node, 1, bytes(16), lease=5)
         assert caught.value.reason == Reason.DIGEST_MISMATCH
         assert "TEDS does not match its signed digest" not in caught.value.message
@@ -216,7 +218,7 @@ def test_a_node_that_keeps_no_session_is_told_and_is_no_bug(
 
         monkeypatch.setattr(node, "open", lost_at_once)
         angle.lost("nfc")
-        with pytest.raises(NodeRefused, match="reason 2"):
+        with pytest.raises(NodeRefusedError, match="reason 2"):
             bears(node, image)
 
 
@@ -234,13 +236,13 @@ def test_a_row_of_a_sheet_waits_for_its_own_board(station: Station, angle: Virtu
         with Conversation(contact, notice=lambda _notice: None) as node:
             try:
                 done = boards._provision(node, asked)
-            except PolicyRefused as error:
+            except PolicyError as error:
                 return Ended(node.uuid, 1.0, None, error, boards._rows.pop(node.uuid).number)
             return Ended(node.uuid, 1.0, done, None, boards._rows.pop(node.uuid).number)
 
     wrong = tap(on_reader(angle))
     boards._note(wrong)
-    assert isinstance(wrong.error, WrongBoard)
+    assert isinstance(wrong.error, WrongBoardError)
     assert [row.number for row in boards.progress.open] == [1]  # type: ignore[union-attr]
     right = tap(on_reader(virtual(tmp_path / "force", FORCE)))
     boards._note(right)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.store import Store
 
 NODE = bytes(range(10))
@@ -146,5 +146,5 @@ def test_an_unreadable_detail_is_shown_and_found_bad(logged: Store, home: Path) 
 
 def test_a_closed_store_says_so(store: Store) -> None:
     store.close()
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         store.audit.append("write", NODE, "done")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import LinkFailure, StoreFailure
+from teds_provision.errors import LinkError, StoreError
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
@@ -125,7 +125,7 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
 def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, synced: list[str]) -> None:
     """Identify is written to the log and not waited for: the next step was to do that."""
     link = MemoryLink(Board(), lose_request=3)
-    with pytest.raises(LinkFailure), talk(link.board, link) as node:
+    with pytest.raises(LinkError), talk(link.board, link) as node:
         provision(watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=Silent())
     assert synced == ["store.sqlite3-wal"]
 
@@ -263,7 +263,7 @@ def test_a_step_that_fails_behind_a_run_fails_the_run(watched: Watched) -> None:
     station, went_on = watched.station, []
 
     def full() -> None:
-        raise StoreFailure("The disk is full.")
+        raise StoreError("The disk is full.")
 
     def ask() -> None:
         with station.run():
@@ -277,9 +277,9 @@ def test_a_step_that_fails_behind_a_run_fails_the_run(watched: Watched) -> None:
             went_on.append("at the end")
 
     for run in (ask, end):
-        with pytest.raises(StoreFailure, match="full"):
+        with pytest.raises(StoreError, match="full"):
             run()
-    with pytest.raises(StoreFailure, match="full"):
+    with pytest.raises(StoreError, match="full"):
         station.behind(full)
     assert went_on == ["at the end"]
 

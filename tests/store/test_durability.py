@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.store import NodeRecord, Store
 
 NODE = bytes(range(10))
@@ -118,7 +118,7 @@ FILLER = """
 import os, resource, sys
 sys.dont_write_bytecode = True
 from pathlib import Path
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.store import Draft, Store
 from teds_provision.teds.image import Image
 store = Store.open(Path(sys.argv[1]), create=True)
@@ -129,7 +129,7 @@ try:
     for number in range(1000):
         store.put_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, {(0, 1): os.urandom(20000)})))
         done += 1
-except StoreFailure as failure:
+except StoreError as failure:
     print(done, failure.exit_code, failure.message, failure.hint)
     print(len(store.nodes()), store.damage())
 """
@@ -175,7 +175,7 @@ def test_a_read_only_disk_gives_a_clear_error(store: Store, home: Path) -> None:
     store.put_node(NodeRecord(NODE))
     store.close()
     code = (
-        "import sys; from pathlib import Path; from teds_provision.errors import StoreFailure\n"
+        "import sys; from pathlib import Path; from teds_provision.errors import StoreError\n"
         "from teds_provision.store import NodeRecord, Store, StoreLock\n"
         "def write():\n"
         "    with Store.open(Path(sys.argv[1]), create=True) as store: store.put_node(NodeRecord(bytes(10)))\n"
@@ -183,7 +183,7 @@ def test_a_read_only_disk_gives_a_clear_error(store: Store, home: Path) -> None:
         "    with StoreLock(Path(sys.argv[1]), command='write'): pass\n"
         "for act in (write, lock):\n"
         "    try: act()\n"
-        "    except StoreFailure as failure: print(failure.message, failure.hint)\n"
+        "    except StoreError as failure: print(failure.message, failure.hint)\n"
     )
     script = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
     mounted = ["unshare", "--mount", "--map-root-user", "sh", "-c", script, str(home)]
@@ -202,7 +202,7 @@ def test_sqlite_running_out_of_pages_is_a_full_disk(store: Store) -> None:
             for number in range(2000):
                 store.put_node(NodeRecord(number.to_bytes(10, "big"), name="x" * 100))
 
-    with pytest.raises(StoreFailure, match="no space left"):
+    with pytest.raises(StoreError, match="no space left"):
         fill()
     assert store.nodes() == []
     store._database.execute("PRAGMA max_page_count = 100000")
@@ -240,18 +240,18 @@ def test_a_directory_where_others_may_write_is_refused(tmp_path: Path) -> None:
     home.mkdir()
     (home / "file").write_text("x")
     home.chmod(0o777)
-    with pytest.raises(StoreFailure, match="Other users can write"):
+    with pytest.raises(StoreError, match="Other users can write"):
         Store.open(home, create=True)
     assert not (home / "store.sqlite3").exists()
 
 
 def test_a_missing_store_names_the_cure_and_makes_nothing(home: Path) -> None:
-    with pytest.raises(StoreFailure) as caught:
+    with pytest.raises(StoreError) as caught:
         Store.open(home)
     assert "init" in caught.value.hint
     assert not home.exists()
     home.mkdir()
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         Store.open(home)
     assert list(home.iterdir()) == []
 
@@ -259,7 +259,7 @@ def test_a_missing_store_names_the_cure_and_makes_nothing(home: Path) -> None:
 def test_an_empty_file_is_no_store_until_init(home: Path) -> None:
     home.mkdir(mode=0o700)
     (home / "store.sqlite3").touch()
-    with pytest.raises(StoreFailure, match="empty"):
+    with pytest.raises(StoreError, match="empty"):
         Store.open(home)
     Store.open(home, create=True).close()
     Store.open(home).close()
@@ -277,7 +277,7 @@ def test_the_identifier_is_made_once(home: Path) -> None:
 def test_what_is_no_database_is_refused_and_left_as_it_is(home: Path, create: bool) -> None:
     home.mkdir(mode=0o700)
     (home / "store.sqlite3").write_bytes(b"this is a letter to my aunt" * 100)
-    with pytest.raises(StoreFailure, match="damaged or no store"):
+    with pytest.raises(StoreError, match="damaged or no store"):
         Store.open(home, create=create)
     assert (home / "store.sqlite3").read_bytes().startswith(b"this is a letter")
 
@@ -286,14 +286,14 @@ def test_a_database_of_another_program_is_refused(home: Path) -> None:
     home.mkdir(mode=0o700)
     with closing(sqlite3.connect(home / "store.sqlite3")) as database:
         database.execute("CREATE TABLE recipes(name)")
-    with pytest.raises(StoreFailure, match="another program"):
+    with pytest.raises(StoreError, match="another program"):
         Store.open(home, create=True)
 
 
 def test_a_store_of_a_newer_version_is_refused(store: Store, home: Path) -> None:
     store._database.execute("PRAGMA user_version = 99")
     store.close()
-    with pytest.raises(StoreFailure, match="schema 99"):
+    with pytest.raises(StoreError, match="schema 99"):
         Store.open(home)
 
 
@@ -317,7 +317,7 @@ def test_a_damaged_file_never_raises_anything_foreign(store: Store, home: Path) 
                 list(again.audit.entries())
                 refused += not again.audit.check().intact or again.damage() is not None
                 again.put_node(NodeRecord(NODE))
-        except StoreFailure as failure:
+        except StoreError as failure:
             refused += bool(failure.hint)
     assert refused > 10
 
@@ -329,14 +329,14 @@ def test_a_truncated_file_never_raises_anything_foreign(store: Store, home: Path
     good = (home / "store.sqlite3").read_bytes()
     for length in (1, 50, 100, 512, 4095, 4096, 4097, len(good) // 2, len(good) - 1):
         (home / "store.sqlite3").write_bytes(good[:length])
-        with suppress(StoreFailure), Store.open(home) as again:
+        with suppress(StoreError), Store.open(home) as again:
             again.nodes()
             assert again.damage() is not None, f"{length} octets pass for the whole file"
 
 
 def test_a_home_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "home").write_text("x")
-    with pytest.raises(StoreFailure, match="not a directory"):
+    with pytest.raises(StoreError, match="not a directory"):
         Store.open(tmp_path / "home", create=True)
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         Store.open(tmp_path / "home" / "below", create=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.store import NodeRecord, Store
 from teds_provision.store.database import open_copy
 
@@ -24,13 +24,13 @@ FULL = (
 READER = """
 import sys
 from pathlib import Path
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.store import NodeRecord, Store
 store = Store.open(Path(sys.argv[1]))
 print(len(store.nodes()), store.audit.check().intact, store.frozen is not None)
 try:
     store.put_node(NodeRecord(bytes(10)))
-except StoreFailure as failure:
+except StoreError as failure:
     print(failure.exit_code, failure.message)
 """
 
@@ -94,7 +94,7 @@ def test_a_link_in_the_place_of_the_store_is_not_followed(home: Path, tmp_path: 
     planted.write_bytes(b"")
     (home / name).unlink(missing_ok=True)
     (home / name).symlink_to(planted)
-    with pytest.raises(StoreFailure, match="a link"):
+    with pytest.raises(StoreError, match="a link"):
         Store.open(home, create=True)
     assert planted.read_bytes() == b""
 
@@ -107,6 +107,6 @@ def test_a_home_of_another_user_is_refused_before_anything_is_written(tmp_path: 
         os.chown(home, 12345, 12345)
     except PermissionError:
         pytest.skip("this root may not give a folder to another user")
-    with pytest.raises(StoreFailure, match="another user"):
+    with pytest.raises(StoreError, match="another user"):
         Store.open(home, create=True)
     assert list(home.iterdir()) == []

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import PolicyRefused, StoreFailure, UsageFailure
+from teds_provision.errors import PolicyError, StoreError, UsageError
 from teds_provision.store import Handover, Holder, RevocationRecord, Store, Tombstone, TrustRecord
 
 NODE = bytes(range(10))
@@ -33,16 +33,16 @@ def test_few_digits_or_ambiguous_ones_remove_nothing(store: Store) -> None:
     store.put_trust(LAB)
     store.put_trust(other)
     assert not store.remove_trust("abab")
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         store.remove_trust("ab" * 8)
     assert store.trusted() == [LAB, other]
 
 
 def test_a_name_does_not_silently_change_its_key(store: Store) -> None:
     store.put_trust(LAB)
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         store.put_trust(replace(LAB, fingerprint="cd" * 32))
-    with pytest.raises(PolicyRefused):
+    with pytest.raises(PolicyError):
         store.put_trust(replace(LAB, role="ca"))
     assert store.trusted() == [LAB]
 
@@ -96,6 +96,6 @@ def test_a_revocation_is_kept_with_its_statement(store: Store) -> None:
 
 
 def test_a_point_of_the_wrong_length_is_not_trusted(store: Store) -> None:
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         store.put_trust(replace(LAB, point=b"\x04"))
     assert store.trusted() == []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotFound, StoreFailure
+from teds_provision.errors import NotFoundError, StoreError
 from teds_provision.store import KeyRecord, NodeRecord, StationRecord, Store
 
 NODE = bytes(range(10))
@@ -46,14 +46,14 @@ def test_promoting_again_changes_nothing(store: Store) -> None:
 
 def test_promoting_an_unknown_key_deletes_nothing(store: Store) -> None:
     store.add_key(a_key(1, "active"))
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         store.activate_key(NODE, "f" * 16)
     assert numbers(store) == [1]
 
 
 def test_there_is_never_a_second_active_key(store: Store) -> None:
     store.add_key(a_key(1, "active"))
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         store.add_key(a_key(2, "active"))
     assert numbers(store) == [1]
 
@@ -117,12 +117,12 @@ def test_a_part_of_a_change_that_failed_takes_the_whole_with_it(store: Store) ->
                 store.put_node(NodeRecord(OTHER))
                 raise RuntimeError
 
-    with pytest.raises(StoreFailure, match="Part of this change failed"):
+    with pytest.raises(StoreError, match="Part of this change failed"):
         caught()
     assert store.nodes() == []
     with store.transaction():
         store.put_node(NodeRecord(NODE))
-        with suppress(NotFound), store.together():
+        with suppress(NotFoundError), store.together():
             store.activate_key(NODE, "00" * 8)  # nothing was changed before it failed
         with suppress(RuntimeError), store.transaction(), store.together():  # a savepoint around it takes it back
             store.put_node(NodeRecord(OTHER))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import StoreFailure, StoreLocked
+from teds_provision.errors import StoreError, StoreLockedError
 from teds_provision.store import StoreLock
 
 HOLDER = """
@@ -44,7 +44,7 @@ def holder(place: Path) -> Iterator[subprocess.Popen[str]]:
 def test_the_second_process_is_told_who_holds_the_store(place: Path, holder: subprocess.Popen[str]) -> None:
     notices: list[str] = []
     begun = time.monotonic()
-    with pytest.raises(StoreLocked) as caught, StoreLock(place, command="write", wait=0.3, notice=notices.append):
+    with pytest.raises(StoreLockedError) as caught, StoreLock(place, command="write", wait=0.3, notice=notices.append):
         pytest.fail("two hold one lock")
     assert time.monotonic() - begun >= 0.3
     assert f"pid {holder.pid} (provision) since 20" in caught.value.message
@@ -68,7 +68,11 @@ def test_the_lock_is_free_after_use_and_after_an_error(place: Path) -> None:
 def test_what_the_last_holder_left_names_nobody(place: Path) -> None:
     with StoreLock(place, command="a command with a longer name than the next one"):
         pass
-    with StoreLock(place, command="x"), pytest.raises(StoreLocked) as caught, StoreLock(place, command="y", wait=0):
+    with (
+        StoreLock(place, command="x"),
+        pytest.raises(StoreLockedError) as caught,
+        StoreLock(place, command="y", wait=0),
+    ):
         pytest.fail("two hold one lock")
     assert "(x)" in str(caught.value)
     assert "longer" not in str(caught.value)
@@ -76,12 +80,12 @@ def test_what_the_last_holder_left_names_nobody(place: Path) -> None:
 
 def test_an_unreadable_note_of_the_holder_is_no_obstacle(place: Path, holder: subprocess.Popen[str]) -> None:
     (place / "store.lock").write_bytes(b'{"pid": "\xff')
-    with pytest.raises(StoreLocked, match="another process"), StoreLock(place, command="write", wait=0):
+    with pytest.raises(StoreLockedError, match="another process"), StoreLock(place, command="write", wait=0):
         pytest.fail("two hold one lock")
 
 
 def test_a_home_that_is_not_there_is_a_store_failure(tmp_path: Path) -> None:
-    with pytest.raises(StoreFailure), StoreLock(tmp_path / "nowhere", command="write"):
+    with pytest.raises(StoreError), StoreLock(tmp_path / "nowhere", command="write"):
         pytest.fail("locked nothing")
 
 
@@ -89,6 +93,6 @@ def test_a_link_in_place_of_the_lock_is_not_followed(place: Path, tmp_path: Path
     target = tmp_path / "precious"
     target.write_text("text")
     (place / "store.lock").symlink_to(target)
-    with pytest.raises(StoreFailure), StoreLock(place, command="write"):
+    with pytest.raises(StoreError), StoreLock(place, command="write"):
         pytest.fail("followed a link")
     assert target.read_text() == "text"

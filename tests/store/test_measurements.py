@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
+from teds_provision.errors import BadDataError, StoreError, TedsProvisionError
 from teds_provision.store import Group, KeptMeasurement, Store
 
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))
@@ -26,7 +26,7 @@ def test_an_empty_group_is_listed(store: Store) -> None:
 
 
 def test_a_node_is_added_to_no_group_that_is_not_there(store: Store) -> None:
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         store.add_to_group("nobody", [ONE])
 
 
@@ -44,7 +44,7 @@ def test_with_a_group_go_its_measurements(store: Store) -> None:
 
 @pytest.mark.parametrize("wrong", [KeptMeasurement("m"), KeptMeasurement("m", "hand", (ONE,))])
 def test_a_measurement_names_a_group_or_nodes(store: Store, wrong: KeptMeasurement) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         store.put_measurement(wrong)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import BadData, NotFound, OtherKey, StoreFailure, UsageFailure
+from teds_provision.errors import BadDataError, KeyMismatchError, NotFoundError, StoreError, UsageError
 from teds_provision.store import Draft, NodeRecord, Store, WhitelistEntry
 from teds_provision.teds.image import Image
 
@@ -46,7 +46,7 @@ def test_epoch_and_sequence_never_go_back(store: Store) -> None:
 
 def test_a_known_node_with_another_identity_key_is_refused(store: Store) -> None:
     store.put_node(NodeRecord(FINGER, POINT, epoch=2))
-    with pytest.raises(OtherKey):
+    with pytest.raises(KeyMismatchError):
         store.put_node(NodeRecord(FINGER, b"\x04" + bytes(63) + b"\1"))
     assert store.node(FINGER) == NodeRecord(FINGER, POINT, epoch=2)
 
@@ -67,9 +67,9 @@ def test_an_owner_may_unpin_a_node_and_its_counters_stay(store: Store) -> None:
 
 
 def test_a_uuid_of_the_wrong_length_does_not_come_in(store: Store) -> None:
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         store.put_node(NodeRecord(b"short"))
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         store.put_whitelist(WhitelistEntry(bytes(16)))
     assert (store.nodes(), store.whitelist()) == ([], [])
 
@@ -102,7 +102,7 @@ def test_a_full_uuid_is_returned_even_if_unknown(store: Store) -> None:
 def test_an_ambiguous_prefix_lists_the_candidates(store: Store) -> None:
     store.put_node(NodeRecord(FINGER))
     store.put_whitelist(WhitelistEntry(JOINT))
-    with pytest.raises(UsageFailure, match=f"{FINGER.hex()}, {JOINT.hex()}"):
+    with pytest.raises(UsageError, match=f"{FINGER.hex()}, {JOINT.hex()}"):
         store.resolve("0102")
 
 
@@ -113,7 +113,7 @@ def test_a_renamed_node_leaves_its_old_name_although_the_whitelist_keeps_it(stor
     store.put_node(NodeRecord(FINGER, name="grip"))
     store.put_node(NodeRecord(FINGER, name="wrist"))
     assert store.resolve("wrist") == FINGER
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         store.resolve("grip")
     assert store.bearers_of(["grip", "wrist"]) == {"wrist": FINGER}
     assert store.all_named("grip") == []
@@ -123,7 +123,7 @@ def test_a_renamed_node_leaves_its_old_name_although_the_whitelist_keeps_it(stor
 def test_a_name_that_two_nodes_have_is_ambiguous(store: Store) -> None:
     store.put_node(NodeRecord(FINGER, name="twin"))
     store.put_node(NodeRecord(JOINT, name="twin"))
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         store.resolve("twin")
 
 
@@ -132,12 +132,12 @@ def test_a_name_that_two_nodes_have_is_ambiguous(store: Store) -> None:
 )
 def test_what_fits_no_node_is_not_found(store: Store, text: str) -> None:
     store.put_node(NodeRecord(FINGER, name="finger"))
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         store.resolve(text)
 
 
 def test_a_name_in_a_broken_encoding_is_bad_data(store: Store) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         store.resolve("caf\udce9")
 
 

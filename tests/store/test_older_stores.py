@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.station.groups import Groups, is_valid_name, valid_name
 from teds_provision.station.measurements import Measurements
 from teds_provision.store import Store
@@ -30,7 +30,7 @@ def test_a_store_of_before_key_agreement_2_is_refused_and_left_as_it_is(tmp_path
     home = tmp_path / "home"
     make_station(home).close()
     before = stamped(home, version)
-    with pytest.raises(StoreFailure, match="from before KeyAgreement 2") as error:
+    with pytest.raises(StoreError, match="from before KeyAgreement 2") as error:
         Store.open(home)
     assert error.value.exit_code == 7
     assert "init" in error.value.hint
@@ -41,7 +41,7 @@ def test_a_store_of_a_later_schema_is_refused(tmp_path: Path) -> None:
     home = tmp_path / "home"
     make_station(home).close()
     stamped(home, SCHEMA_VERSION + 1)
-    with pytest.raises(StoreFailure, match="knows up to"):
+    with pytest.raises(StoreError, match="knows up to"):
         Store.open(home)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import PolicyRefused, StoreChanged, WrongPassphrase
+from teds_provision.errors import PolicyError, StoreChangedError, WrongPassphraseError
 from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise, rewrap
@@ -31,7 +31,7 @@ def ask(prompt: str, confirm: bool) -> str:
 
 
 def nobody(prompt: str, confirm: bool) -> str:
-    raise WrongPassphrase("Nobody can be asked.")
+    raise WrongPassphraseError("Nobody can be asked.")
 
 
 Open = Callable[..., Station]
@@ -102,7 +102,7 @@ def test_a_changed_ca_or_station_key_or_no_seal_key_stops_the_vault(home: Path, 
     behind_its_back(home, f"UPDATE station SET {change}", "UPDATE whitelist SET mac = NULL")
     station = opened()
     for _ in range(2):  # and it is not believed at the second try either
-        with pytest.raises(StoreChanged, match="own key or CA"):
+        with pytest.raises(StoreChangedError, match="own key or CA"):
             station.unlock()
 
 
@@ -159,7 +159,7 @@ def test_a_planted_end_of_trust_and_a_planted_lifting_do_not_count(home: Path, o
 def test_a_lifting_needs_the_vault(opened: Open) -> None:
     station = opened(ask=nobody)
     station.policy.deny(RevocationRecord(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
-    with pytest.raises(WrongPassphrase):
+    with pytest.raises(WrongPassphraseError):
         station.policy.lift(NODE)
     assert station.policy.revocation(NODE) is not None
 
@@ -194,7 +194,7 @@ def test_a_changed_pin_is_not_believed_and_can_be_made_anew(home: Path, opened: 
     station = opened()
     station.unlock()
     for use in (station.pins.pinned, station.pins.entry, station.policy.require_whitelisted):
-        with pytest.raises(StoreChanged, match=NODE.hex()):
+        with pytest.raises(StoreChangedError, match=NODE.hex()):
             use(NODE)
     station.pins.let_go(NODE)
     station.pins.remove(NODE)
@@ -206,7 +206,7 @@ def test_a_pin_moved_to_another_node_is_not_believed(home: Path, opened: Open) -
     behind_its_back(home, f"UPDATE whitelist SET uuid = x'{'ee' * 10}'")
     station = opened()
     station.unlock()
-    with pytest.raises(StoreChanged):
+    with pytest.raises(StoreChangedError):
         station.pins.entry(b"\xee" * 10)
 
 
@@ -214,7 +214,7 @@ def test_a_changed_identity_key_of_a_node_is_not_believed(home: Path, opened: Op
     behind_its_back(home, f"UPDATE nodes SET point = x'{OTHER.hex()}'", "DELETE FROM whitelist")
     station = opened()
     station.unlock()
-    with pytest.raises(StoreChanged):
+    with pytest.raises(StoreChangedError):
         station.pins.pinned(NODE)
 
 
@@ -222,7 +222,7 @@ def test_a_changed_ca_of_a_node_is_not_believed(home: Path, opened: Open) -> Non
     behind_its_back(home, f"UPDATE marks SET ca = x'{OTHER.hex()}'")
     station = opened()
     station.unlock()
-    with pytest.raises(StoreChanged):
+    with pytest.raises(StoreChangedError):
         station.policy.trusted_cas(NODE)
 
 
@@ -237,7 +237,7 @@ def test_lists_need_no_passphrase_and_changes_do(opened: Open) -> None:
         lambda: station.policy.trust(TrustRecord("x", "ca", OTHER, fingerprint(OTHER))),
         lambda: station.policy.distrust("peer"),
     ):
-        with pytest.raises(WrongPassphrase):
+        with pytest.raises(WrongPassphraseError):
             change()
     assert station.pins.entry(NODE) is not None
     assert len(station.policy.listed()) == 2
@@ -268,5 +268,5 @@ def test_a_changed_identity_key_is_not_handed_over(home: Path, opened: Open) -> 
     station.keys.promote(NODE, bytes(8).hex())
     peer = SoftwareKey.generate().point
     station.policy.trust(TrustRecord("east", "station", peer, fingerprint(peer)))
-    with pytest.raises(PolicyRefused, match="pinned"):
+    with pytest.raises(PolicyError, match="pinned"):
         plan_export(station, ExportOrder(("east",), (NODE,), "copy"))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from teds_provision.errors import BadData, Garbled, NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, GarbledError, NotAuthenticError, PolicyError, TedsProvisionError
 from teds_provision.links import LINKS, Capabilities, Contact
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station as Ours
@@ -59,30 +59,30 @@ def test_a_strangers_node_gets_a_key_of_ours(station: Ours) -> None:
 
 TAG, PROOF, POINT = "tagN", "does not hold the key that it shows", "one-time key"
 WHAT: dict[str, tuple[type[TedsProvisionError], str, int]] = {
-    "sigN without the 00 of its label": (NotAuthentic, PROOF, 1),
-    "sigN as a proof of Prove": (NotAuthentic, PROOF, 1),
-    "sigN by another key": (NotAuthentic, PROOF, 1),
-    "sigN with a high s": (NotAuthentic, PROOF, 1),
-    "sigN as DER": (Garbled, "octets, not 165", 1),
-    "halves of Z swapped": (NotAuthentic, TAG, 2),
-    "Z of the identity key": (NotAuthentic, TAG, 2),
-    "salt and ikm swapped": (NotAuthentic, TAG, 2),
-    "tagN of the station's label": (NotAuthentic, TAG, 2),
-    "tagN with 00 behind its label": (NotAuthentic, TAG, 2),
-    "En not in T": (NotAuthentic, TAG, 2),
-    "digest over the data block only": (NotAuthentic, TAG, 2),
-    "En is P(node)": (NotAuthentic, POINT, 1),
-    "En is P(station)": (NotAuthentic, POINT, 1),
-    "En is E": (NotAuthentic, POINT, 1),
-    "En off the curve": (NotAuthentic, POINT, 1),
-    "the same epoch again": (PolicyRefused, "offers key epoch 0", 1),
-    "the epoch little-endian": (NotAuthentic, "offered key epoch 16777216 but reports 1", 1),
-    "a reply without its last octet": (Garbled, "164 octets, not 165", 1),
-    "the reply to the Request before": (NotAuthentic, TAG, 2),
-    "the TEDS changes with every Read": (NotAuthentic, TAG, 2),
-    "field 102 is signed anew for every Read": (NotAuthentic, TAG, 2),
-    "KeyAgreement 1": (BadData, "KeyAgreement 1", 0),
-    "KeyAgreement 1 in the reply alone": (Garbled, "octets, not 165", 1),
+    "sigN without the 00 of its label": (NotAuthenticError, PROOF, 1),
+    "sigN as a proof of Prove": (NotAuthenticError, PROOF, 1),
+    "sigN by another key": (NotAuthenticError, PROOF, 1),
+    "sigN with a high s": (NotAuthenticError, PROOF, 1),
+    "sigN as DER": (GarbledError, "octets, not 165", 1),
+    "halves of Z swapped": (NotAuthenticError, TAG, 2),
+    "Z of the identity key": (NotAuthenticError, TAG, 2),
+    "salt and ikm swapped": (NotAuthenticError, TAG, 2),
+    "tagN of the station's label": (NotAuthenticError, TAG, 2),
+    "tagN with 00 behind its label": (NotAuthenticError, TAG, 2),
+    "En not in T": (NotAuthenticError, TAG, 2),
+    "digest over the data block only": (NotAuthenticError, TAG, 2),
+    "En is P(node)": (NotAuthenticError, POINT, 1),
+    "En is P(station)": (NotAuthenticError, POINT, 1),
+    "En is E": (NotAuthenticError, POINT, 1),
+    "En off the curve": (NotAuthenticError, POINT, 1),
+    "the same epoch again": (PolicyError, "offers key epoch 0", 1),
+    "the epoch little-endian": (NotAuthenticError, "offered key epoch 16777216 but reports 1", 1),
+    "a reply without its last octet": (GarbledError, "164 octets, not 165", 1),
+    "the reply to the Request before": (NotAuthenticError, TAG, 2),
+    "the TEDS changes with every Read": (NotAuthenticError, TAG, 2),
+    "field 102 is signed anew for every Read": (NotAuthenticError, TAG, 2),
+    "KeyAgreement 1": (BadDataError, "KeyAgreement 1", 0),
+    "KeyAgreement 1 in the reply alone": (GarbledError, "octets, not 165", 1),
 }
 
 

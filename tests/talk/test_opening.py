@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import NodeRefused
+from teds_provision.errors import NodeRefusedError
 from teds_provision.protocol.agreement import Credentials, StationAgreement
 from teds_provision.protocol.keys import SoftwareKey, station_key_message
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, read_teds, security_command
@@ -56,7 +56,7 @@ def test_after_the_second_refusal_the_operator_is_told(board: Board) -> None:
     key = keyed(board)
     link = FasterStation(board, key, times=2)
     with talk(board, link) as node:
-        with pytest.raises(NodeRefused) as caught:
+        with pytest.raises(NodeRefusedError) as caught:
             node.open(key)
         assert caught.value.reason == Reason.BAD_TAG
         assert not node.sealed
@@ -67,7 +67,7 @@ def test_an_unknown_key_is_not_tried_twice(board: Board) -> None:
     keyed(board)
     link = MemoryLink(board)
     with talk(board, link) as node:
-        with pytest.raises(NodeRefused) as caught:
+        with pytest.raises(NodeRefusedError) as caught:
             node.open(bytes(16))
         assert caught.value.reason == Reason.UNKNOWN_KEY
     assert link.count == 2
@@ -101,7 +101,7 @@ def test_a_refusal_of_a_plain_question_on_a_bus_counts_when_it_comes_twice(board
     with talk(board, Disturbed(board, {1}, 6)) as node:
         assert node.ask(question, "to read") == node.ask(question, "to read")
     link = Disturbed(board, {1, 2}, 6)
-    with talk(board, link) as node, pytest.raises(NodeRefused):
+    with talk(board, link) as node, pytest.raises(NodeRefusedError):
         node.ask(question, "to read")
     assert link.count == 2
 
@@ -132,7 +132,7 @@ def test_a_node_that_stays_busy_is_asked_for_one_patience_and_no_new_session_is_
     link = MemoryLink(board, via="can", tapped=False, tamper=busy)
     with Conversation(contact(board, link), notice=lambda _notice: None, busy_seconds=0.05) as node:
         node.open(key)
-        with pytest.raises(NodeRefused) as caught:
+        with pytest.raises(NodeRefusedError) as caught:
             node.ask(security_command(Function.LIST), "to list its TEDS")
         assert caught.value.reason == Reason.BUSY
         node.forget()

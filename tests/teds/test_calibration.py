@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.teds.calibration import (
     METHODS,
     Calibration,
@@ -114,9 +114,9 @@ def test_cells_are_ordered_with_the_last_input_fastest() -> None:
 def test_what_does_not_fit_together_is_refused(
     inputs: tuple[CalibrationInput, ...], coefficients: tuple[float, ...]
 ) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         Calibration(1, "linear", inputs, coefficients)
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         CalibrationInput(1, 1, (0.0, 1.0), (0.0, 1.0))
 
 
@@ -156,7 +156,7 @@ def test_a_table_goes_through_its_points_and_straight_in_between() -> None:
 def test_a_table_can_be_thinned_and_stays_as_close_as_asked() -> None:
     raw = np.linspace(0, 65535, 20_000)
     points = list(zip(raw.tolist(), (360 * raw / 65535 + np.sin(raw / 9000)).tolist(), strict=True))
-    with pytest.raises(BadData, match="too large"):
+    with pytest.raises(BadDataError, match="too large"):
         fit(points, "table", channel=1)
     thin = fit(points, "table", channel=1, tolerance=0.01)
     assert 20 < thin.inputs[0].segments < 200
@@ -179,12 +179,12 @@ def test_an_actuator_is_fitted_from_units_to_raw() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_too_few_points_are_refused(method: str) -> None:
-    with pytest.raises(BadData, match="two different inputs"):
+    with pytest.raises(BadDataError, match="two different inputs"):
         fit([(5, 1.0), (5, 2.0)], method, channel=1)  # type: ignore[arg-type]
 
 
 def test_points_that_a_float32_cannot_tell_apart_are_refused() -> None:
-    with pytest.raises(BadData, match="Float32"):
+    with pytest.raises(BadDataError, match="Float32"):
         fit([(16777216, 0.0), (16777217, 1.0), (16777219, 2.0)], "table", channel=1)
 
 
@@ -245,7 +245,7 @@ def test_the_calibrated_unit_is_recognized_again(magnetic: Profile) -> None:
 
 def test_a_foreign_calibration_is_bad_data_and_nothing_else() -> None:
     foreign = teds.decode(teds.compose(5, [("LinOnly", (1.0, 2.0))]))
-    with pytest.raises(BadData, match="understood"):
+    with pytest.raises(BadDataError, match="understood"):
         from_decoded(foreign, channel=1)
 
 
@@ -254,7 +254,7 @@ def test_any_octets_of_a_calibration_teds_give_a_calibration_or_bad_data(block: 
     from teds_provision.teds.codec.frame import frame
 
     decoded = teds.decode(frame(bytes.fromhex("030400050101") + block))
-    with suppress(BadData):
+    with suppress(BadDataError):
         assert isinstance(from_decoded(decoded, channel=1), Calibration)
 
 
@@ -442,30 +442,30 @@ offsets = [25]
     ],
 )
 def test_a_bad_file_names_file_line_and_field(text: str, name: str, place: int, field: str, magnetic: Profile) -> None:
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         read_calibrations(text, name, magnetic)
     assert caught.value.message.startswith(f"{name}:{place}: ")
     assert field in caught.value.message + caught.value.hint
 
 
 def test_a_file_for_one_of_many_channels_must_say_which(tactile: Profile) -> None:
-    with pytest.raises(BadData, match="12 channels"):
+    with pytest.raises(BadDataError, match="12 channels"):
         read_calibrations("0,0\n1,1\n", "x.csv", tactile)
-    with pytest.raises(BadData, match="two calibrations"):
+    with pytest.raises(BadDataError, match="two calibrations"):
         read_calibrations(
             '{"calibration": [{"channel": 1, "slope": 1}, {"channel": "1-2", "slope": 1}]}', "x.json", tactile
         )
 
 
 def test_a_missing_file_is_not_found(magnetic: Profile, tmp_path: Path) -> None:
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         load_calibrations(tmp_path / "no.csv", magnetic)
 
 
 @given(st.text(max_size=200), st.sampled_from(["c.csv", "c.toml", "c.json"]))
 def test_any_text_is_a_calibration_or_bad_data(text: str, name: str) -> None:
     profile = load_profile("magnetic-angular-position-sensor")
-    with suppress(BadData):
+    with suppress(BadDataError):
         assert read_calibrations(text, name, profile)
 
 
@@ -480,5 +480,5 @@ def test_a_calibration_kept_from_a_node_gives_the_same_octets(magnetic: Profile)
 
 def test_a_column_that_is_named_twice_is_refused(tactile: Profile) -> None:
     text = "channel;from;to;from;to;offset;c0;c1\n1;0;512;0;0,5;0,001\n"
-    with pytest.raises(BadData, match=r'c\.csv:1: the column "from" appears twice'):
+    with pytest.raises(BadDataError, match=r'c\.csv:1: the column "from" appears twice'):
         read_calibrations(text, "c.csv", tactile)

@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import unframe
 from tests.teds.vectors import octets_of
 
@@ -84,9 +84,9 @@ def test_width_grows_only_where_it_must() -> None:
     assert unframe(teds.compose(5, {"Coefs": [1.0] * 64}))[5] == 2
     long = teds.compose(5, {"Coefs": [0.5] * 1000})
     assert teds.decode(long).get("Coefs") == (0.5,) * 1000
-    with pytest.raises(BadData, match="Field 129"):
+    with pytest.raises(BadDataError, match="Field 129"):
         teds.compose(5, {"Coefs": [1.0] * 64}, width=1)
-    with pytest.raises(BadData, match="Field 129"):
+    with pytest.raises(BadDataError, match="Field 129"):
         teds.compose(5, {"Coefs": [1.0] * 20000})
     assert len(teds.compose(5, {"Coefs": [1.0] * 20000}, width=3)) > 80000
 
@@ -134,7 +134,7 @@ def test_numpy_arrays_are_arrays() -> None:
     ],
 )
 def test_refusals_name_the_field(fields: object, named: str) -> None:
-    with pytest.raises(BadData, match=named):
+    with pytest.raises(BadDataError, match=named):
         teds.compose(1, fields)  # type: ignore[arg-type]
 
 
@@ -143,20 +143,20 @@ def test_refusals_name_the_field(fields: object, named: str) -> None:
     [3, "K", {"kelvin": 1}, {"kelvins": "x"}, {"meters": 100}, {"meters": 0.3}, {"interpretation": 300}, b"\0" * 3],
 )
 def test_units_that_cannot_be_said(units: object) -> None:
-    with pytest.raises(BadData, match="PhyUnits"):
+    with pytest.raises(BadDataError, match="PhyUnits"):
         teds.compose(3, {**KELVIN, "PhyUnits": units})
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "today", 1 << 40, teds.TimeInstance(0, 1 << 31)])
 def test_times_that_cannot_be_said(value: object) -> None:
-    with pytest.raises(BadData, match="LstCalDt"):
+    with pytest.raises(BadDataError, match="LstCalDt"):
         teds.compose(5, {"LstCalDt": value})
 
 
 def test_negative_times() -> None:
     octets = teds.compose(5, {"LstCalDt": -1.5})
     assert teds.decode(octets).get("LstCalDt") == teds.TimeInstance(1, 500_000_000, True)
-    with pytest.raises(BadData, match="LstCalDt"):
+    with pytest.raises(BadDataError, match="LstCalDt"):
         teds.compose(5, {"LstCalDt": -1.5}, edition=2024)
 
 
@@ -164,7 +164,7 @@ def test_negative_times() -> None:
     ("access_code", "options"), [(0, {}), (256, {}), (1, {"edition": 2010}), (1, {"width": 5}), (1, {"width": 0})]
 )
 def test_impossible_requests(access_code: int, options: dict[str, int]) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         teds.compose(access_code, META, **options)  # type: ignore[arg-type]
 
 
@@ -177,5 +177,5 @@ def test_numpy_numbers_are_numbers() -> None:
     numpy = pytest.importorskip("numpy")
     fields = {**META, "MaxChan": numpy.uint16(2), "OholdOff": numpy.float32(0.5)}
     assert teds.compose(1, fields) == octets_of("x07_meta")
-    with pytest.raises(BadData, match="MaxChan"):
+    with pytest.raises(BadDataError, match="MaxChan"):
         teds.compose(1, {**META, "MaxChan": numpy.float64(2)})

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import frame, raw_tuple
 from tests.teds.strategies import some_fields
 from tests.teds.vectors import TEDS, octets_of
@@ -53,7 +53,7 @@ def test_a_uuid_cannot_be_said_in_the_other_edition() -> None:
     assert decoded.verdict == "clean"
     decoded, findings = to(octets_of("x07_meta"), 2024, uuid=NEW)
     assert (decoded.get("UUID"), findings) == (NEW, [])
-    with pytest.raises(BadData, match="16 octets"):
+    with pytest.raises(BadDataError, match="16 octets"):
         to(octets_of("x07_meta"), 2024, uuid=OLD)
 
 
@@ -116,7 +116,7 @@ def test_prototype_versions_are_kept_and_named() -> None:
 def test_every_vector_converts_or_says_why_not(name: str, edition: Any) -> None:
     decoded = teds.decode(octets_of(name))
     if decoded.edition is None or decoded.verdict == "malformed":
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             teds.convert(decoded, edition)
     else:
         converted, _ = teds.convert(decoded, edition)
@@ -160,5 +160,5 @@ def test_habits_of_other_people_are_read_with_a_remark(area: bytes, length: int,
 
 @pytest.mark.parametrize("fields", [{}, {"NumLang": 1}, {"Text": 3}, {"Text": {"Text": 5}}, {"Text": {"Lang": "en"}}])
 def test_texts_that_cannot_be_written(fields: dict[str, object]) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         teds.compose(10, fields)

@@ -8,7 +8,7 @@ import tracemalloc
 import pytest
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import frame, raw_tuple
 from tests.teds.vectors import octets_of
 
@@ -207,7 +207,7 @@ def test_too_many_octets_are_not_walked() -> None:
 
 
 def test_strict_names_the_octet() -> None:
-    with pytest.raises(BadData, match="octet 27"):
+    with pytest.raises(BadDataError, match="octet 27"):
         teds.decode(octets_of("n07_bad_checksum"), strict=True)
 
 

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import checksum, frame
 from tests.teds.strategies import some_fields
 from tests.teds.vectors import ALL, TEDS, octets_of
@@ -84,7 +84,7 @@ def test_recompose_mends_a_wrong_frame() -> None:
 
 @pytest.mark.parametrize("name", ["n07_overrun", "m07_reset_cmd"])
 def test_recompose_refuses_what_has_no_fields(name: str) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         teds.recompose(teds.decode(octets_of(name)))
 
 

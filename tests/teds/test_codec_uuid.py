@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 
 
 def parts_of(digits: str) -> teds.UuidParts:
@@ -78,5 +78,5 @@ def test_random_octets_are_not_plausible(digits: str) -> None:
     ("part", "value"), [("latitude", 1 << 20), ("longitude", -1), ("year", 4096), ("time", 1 << 22)]
 )
 def test_parts_that_do_not_fit_are_named(part: str, value: int) -> None:
-    with pytest.raises(BadData, match=part):
+    with pytest.raises(BadDataError, match=part):
         teds.pack_uuid(replace(parts_of("8D4D9DA65281F7000000"), **{part: value}))

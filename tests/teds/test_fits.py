@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds import Sheet
 from teds_provision.teds.calibration import fit
 from teds_provision.teds.fits import Fit, judge, met, parse_fits, parse_require
@@ -107,7 +107,7 @@ def test_an_overdue_calibration_promises_no_uncertainty_and_without_one_there_ar
     ],
 )
 def test_an_expression_that_means_nothing_is_refused_by_name(text: str, words: str) -> None:
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         parse_fits(text)
     assert words in caught.value.message
 
@@ -116,7 +116,7 @@ def test_an_expression_that_means_nothing_is_refused_by_name(text: str, words: s
 def test_no_expression_raises_anything_else(text: str) -> None:
     try:
         requirement = parse_fits(text)
-    except BadData:
+    except BadDataError:
         return
     assert judge(requirement, angle())
 
@@ -154,7 +154,7 @@ def test_a_sheet_of_requirements_names_quantities_and_channels() -> None:
     ],
 )
 def test_a_sheet_of_requirements_that_means_nothing_names_the_place(text: str, words: str) -> None:
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         parse_require(text, "task.toml")
     assert words in caught.value.message
     assert caught.value.message.startswith("task.toml")

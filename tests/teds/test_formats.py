@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.formats import FORMATS, TedsBlock, class_of, detect, lost, read_blocks, write_blocks
 from teds_provision.teds.formats.intelhex import stretches, write_intel_hex
@@ -100,7 +100,7 @@ def test_a_profile_that_extends_another_is_read_beside_it(tmp_path):
     blocks = read_blocks((tmp_path / "mine.toml").read_bytes(), path=tmp_path / "mine.toml")
     assert {block.access_code for block in blocks} >= {1, 3, 12}
     (tmp_path / "lost.toml").write_text('extends = "nothing-of-the-kind"\n')
-    with pytest.raises((BadData, NotFound), match="nothing-of-the-kind"):
+    with pytest.raises((BadDataError, NotFoundError), match="nothing-of-the-kind"):
         read_blocks((tmp_path / "lost.toml").read_bytes(), path=tmp_path / "lost.toml")
 
 
@@ -132,7 +132,7 @@ def test_files_are_told_apart_by_content(content, kind):
 
 
 def test_an_empty_file_is_named():
-    with pytest.raises(BadData, match="empty"):
+    with pytest.raises(BadDataError, match="empty"):
         detect(b"")
 
 
@@ -154,12 +154,12 @@ def test_an_empty_file_is_named():
     ],
 )
 def test_a_damaged_file_is_refused_with_its_place(content, message):
-    with pytest.raises(BadData, match=message):
+    with pytest.raises(BadDataError, match=message):
         read_blocks(content)
 
 
 def test_a_file_of_junk_is_not_read_for_ever():
-    with pytest.raises(BadData, match="at most"):
+    with pytest.raises(BadDataError, match="at most"):
         read_blocks(bytes(33 << 20))
 
 
@@ -171,7 +171,7 @@ def test_a_run_of_framed_teds_is_cut_apart_and_a_broken_one_is_not():
     broken = META + NAME[:-1] + bytes([NAME[-1] ^ 1])
     assert split_run(broken) == [broken]
     assert [block.access_code for block in read_blocks(META + NAME)] == [1, 12]
-    with pytest.raises(BadData, match="right Length and checksum"):
+    with pytest.raises(BadDataError, match="right Length and checksum"):
         write_blocks([TedsBlock(0, 1, META), TedsBlock(0, 12, broken)], "binary")
     assert lost([TedsBlock(1, 12, NAME)], "binary") == ("the channels of the TEDS.",)
 
@@ -205,11 +205,11 @@ def test_intel_hex_with_segment_base_and_start_records_of_other_tools():
 def test_an_image_needs_a_uuid_and_places():
     image = json.loads(write_blocks([TedsBlock(0, 1, META), TedsBlock(1, 12, NAME)], "image"))
     assert (image["uuid"], len(image["blocks"])) == ("00010203040506070809", 2)
-    with pytest.raises(BadData, match="UUID"):
+    with pytest.raises(BadDataError, match="UUID"):
         write_blocks([TedsBlock(0, 12, NAME)], "image")
-    with pytest.raises(BadData, match="channel and access code"):
+    with pytest.raises(BadDataError, match="channel and access code"):
         write_blocks([TedsBlock(None, 12, NAME)], "image")
-    with pytest.raises(BadData, match="Two TEDS"):
+    with pytest.raises(BadDataError, match="Two TEDS"):
         write_blocks([TedsBlock(0, 1, META), TedsBlock(0, 1, META)], "image")
 
 
@@ -249,15 +249,15 @@ def test_json_can_be_written_by_hand_without_octets():
     ],
 )
 def test_json_that_makes_no_teds_is_refused(entry):
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         read_blocks(json.dumps({"format": "teds/1", "teds": [entry]}).encode())
 
 
 def test_json_that_nests_without_end_is_refused():
     deep = '{"name":"x","fields":[' * 50 + "]}" * 50
-    with pytest.raises(BadData, match="deep"):
+    with pytest.raises(BadDataError, match="deep"):
         read_blocks(f'{{"format":"teds/1","teds":[{{"access_code":1,"fields":[{deep}]}}]}}'.encode())
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         read_blocks(b'{"format":' + b"[" * 200_000)
 
 
@@ -352,12 +352,12 @@ def test_a_composed_teds_needs_no_octets_in_its_tree(block):
 def test_any_octets_are_read_or_refused_with_bad_data(octets):
     try:
         blocks = read_blocks(octets)
-    except (BadData, NotFound):
+    except (BadDataError, NotFoundError):
         return
     for format in FORMATS:
         try:
             write_blocks(blocks, format)
-        except BadData:
+        except BadDataError:
             continue
 
 
@@ -367,7 +367,7 @@ def test_a_damaged_text_file_is_read_or_refused_with_bad_data(format, data):
     text = bytearray(as_octets(write_blocks([TedsBlock(0, 1, META), TedsBlock(1, 12, NAME)], format)))
     for _ in range(data.draw(st.integers(1, 4))):
         text[data.draw(st.integers(0, len(text) - 1))] = data.draw(SMALL)
-    with suppress(BadData, NotFound):
+    with suppress(BadDataError, NotFoundError):
         read_blocks(bytes(text), format)
 
 

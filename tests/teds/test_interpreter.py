@@ -14,7 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds import AccessCode, Sheet
 from teds_provision.teds.calibration import (
     Calibration,
@@ -96,9 +96,9 @@ def test_a_block_may_come_as_rows_of_a_larger_message() -> None:
     body = np.frombuffer(bytes.fromhex("aa 0001 bb 0203 aa 0004 bb 0506"), dtype=np.uint8).reshape(-1, 6)
     assert reader.raw(body[:, 1:3]).tolist() == [1, 4]
     assert reader.raw(body[:, 4:6]).tolist() == [0x0203, 0x0506]
-    with pytest.raises(BadData, match="3 octets"):
+    with pytest.raises(BadDataError, match="3 octets"):
         reader.raw(b"abc")
-    with pytest.raises(BadData, match="3 octets"):
+    with pytest.raises(BadDataError, match="3 octets"):
         reader.raw(body[:, :3])
 
 
@@ -127,11 +127,11 @@ def test_numbers_are_written_rounded_and_kept_within_what_the_form_can_hold(
 
 def test_what_is_no_quantity_is_not_written_and_what_cannot_be_read_is_refused() -> None:
     for form in (SampleForm(4, 1), SampleForm(7, 8)):
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             SampleReader(form).write(np.array([1.0]))
-    with pytest.raises(BadData, match="reserved"):
+    with pytest.raises(BadDataError, match="reserved"):
         SampleReader(SampleForm(77, 1))
-    with pytest.raises(BadData, match="not finite"):
+    with pytest.raises(BadDataError, match="not finite"):
         SampleReader(SampleForm(1, 4)).write(np.array([math.nan]))
 
 
@@ -302,7 +302,7 @@ def test_a_channel_without_calibration_gives_raw_values_alone_and_says_why() -> 
     assert values.raw.tolist() == [0x1234, 1]
     assert not values.valid.any()
     assert np.isnan(values.value).all()
-    with pytest.raises(BadData, match="no calibration"):
+    with pytest.raises(BadDataError, match="no calibration"):
         interpreter.encode(1.0)
 
 
@@ -327,7 +327,7 @@ def test_a_compensated_channel_asks_for_its_other_input() -> None:
     own, other = np.array([5000, 6000], dtype=">u2").tobytes(), np.array([10, 20], dtype=">u2").tobytes()
     values = interpreter.decode(own, {2: other})
     assert values.value.tolist() == [evaluate(both, 5000, 10).value, evaluate(both, 6000, 20).value]
-    with pytest.raises(BadData, match="compensated by channel 2"):
+    with pytest.raises(BadDataError, match="compensated by channel 2"):
         interpreter.decode(own)
     back = interpreter.encode(values.value, {2: np.array([10, 20], dtype=np.uint64)})
     assert back == own
@@ -358,7 +358,7 @@ def test_an_actuator_is_set_within_its_limits_and_read_back() -> None:
     assert interpreter.beyond(middle) == ""
     assert "exceeds the limits" in interpreter.beyond(high * 1.01)
     assert interpreter.beyond(math.nan)
-    with pytest.raises(BadData, match="not finite"):
+    with pytest.raises(BadDataError, match="not finite"):
         interpreter.encode(math.nan)
 
 
@@ -391,7 +391,7 @@ def test_the_way_back_gives_the_raw_value_that_it_came_from(
     curve = PreparedCurve(fit(points, "polynomial" if cubic else "table", channel=1))
     try:
         inverse = PreparedInverse(curve, 0.0, 65535.0, step=0.25)
-    except BadData:
+    except BadDataError:
         assume(not cubic)  # a polynomial through such points may turn
         raise
     raws = np.array(data.draw(st.lists(st.integers(0, 65535), min_size=1, max_size=5)), dtype=np.float64)
@@ -414,7 +414,7 @@ def test_a_calibration_in_a_unit_without_a_name_is_shown_in_the_usual_one() -> N
 
 
 def test_what_is_not_described_is_refused() -> None:
-    with pytest.raises(BadData, match="no channel 9"):
+    with pytest.raises(BadDataError, match="no channel 9"):
         ChannelInterpreter(ANGLE, 9)
-    with pytest.raises(BadData, match="how a sample"):
+    with pytest.raises(BadDataError, match="how a sample"):
         ChannelInterpreter(changed(ANGLE, sample=None), 1)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_toml, load_json, whole_number
 from teds_provision.teds import AccessCode, compose
 from teds_provision.teds.formats import read_blocks
@@ -163,22 +163,22 @@ def test_a_calibration_of_many_terms_is_looked_at_in_bounded_time(tmp_path: Path
     "text", ["9**9**9 m", "m**9**9", "m" * 65, "((m**99)**99)**99", "1e9 m", "m ** 10000", "__import__"]
 )
 def test_a_unit_is_read_and_never_computed(text: str) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         parse_unit(text)
 
 
 def test_an_image_refuses_a_name_that_is_there_twice() -> None:
     text = Image(bytes(10), {}).to_json()
     assert Image.from_json(text).uuid == bytes(10)
-    with pytest.raises(BadData, match='"uuid" twice'):
+    with pytest.raises(BadDataError, match='"uuid" twice'):
         Image.from_json(text.replace('"blocks"', '"uuid": "00", "blocks"'))
 
 
 def test_numbers_beyond_the_limit_are_refused_by_their_length() -> None:
-    with pytest.raises(BadData, match="5000 characters"):
+    with pytest.raises(BadDataError, match="5000 characters"):
         whole_number("9" * 5000, "the value")
     assert whole_number(" -12 ", "the value") == -12
-    with pytest.raises(BadData, match="1001 digits"):
+    with pytest.raises(BadDataError, match="1001 digits"):
         load_json("9" * (LIMITS.integer_digits + 1), "the file")
 
 
@@ -189,5 +189,5 @@ def test_usual_toml_is_not_taken_for_a_hostile_one() -> None:
 def test_what_was_read_before_is_still_read() -> None:
     octets = compose(12, (("Format", 0), ("TCName", "x")))
     assert len(read_blocks(octets * LIMITS.teds_of_a_file)) == LIMITS.teds_of_a_file
-    with pytest.raises(BadData, match="at most 2000"):
+    with pytest.raises(BadDataError, match="at most 2000"):
         read_blocks(octets * (LIMITS.teds_of_a_file + 1))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.formats.mapped import profile_from_xml
 from teds_provision.teds.profile.load import parse_profile
 
@@ -59,7 +59,7 @@ def test_the_examples_become_types_with_limits_in_their_units(
     ],
 )
 def test_what_is_wrong_is_named(xml: bytes, mapping: str, words: str) -> None:
-    with pytest.raises(BadData, match=words):
+    with pytest.raises(BadDataError, match=words):
         profile_from_xml(xml, mapping, name="lab")
 
 
@@ -76,6 +76,6 @@ def test_what_is_wrong_is_named(xml: bytes, mapping: str, words: str) -> None:
 )
 def test_a_bomb_costs_little(bomb: bytes) -> None:
     began = time.process_time()
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         profile_from_xml(bomb, MAP, name="lab")
     assert time.process_time() - began < 1

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, NotFound, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
 from teds_provision.teds.plot import plot_blocks
 from teds_provision.teds.profile import load_profile, shipped_profiles
@@ -79,16 +79,16 @@ def test_several_inputs_and_actuators_are_drawn(finger, tmp_path: Path) -> None:
 def test_what_cannot_be_drawn_is_said(finger, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     calibrations = read_calibrations(f"# channel: 1\n{ROWS}", "x.csv", finger)
     blocks = finger.build(UUID, calibration=calibrations).blocks
-    with pytest.raises(UsageFailure, match="picture"):
+    with pytest.raises(UsageError, match="picture"):
         plot_blocks(blocks, tmp_path / "x.pdf")
-    with pytest.raises(BadData, match="channel 2"):
+    with pytest.raises(BadDataError, match="channel 2"):
         plot_blocks(blocks, tmp_path / "x.png", channel=2)
-    with pytest.raises(BadData, match="any channel"):
+    with pytest.raises(BadDataError, match="any channel"):
         plot_blocks({(0, 1): b"", (1, 5): b"\xff" * 40}, tmp_path / "x.png")
-    with pytest.raises(NotFound, match="There is no folder"):
+    with pytest.raises(NotFoundError, match="There is no folder"):
         plot_blocks(blocks, tmp_path / "no" / "x.png")
     erased = replace(calibrations[1], zero_offset=float("nan"))
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         plot_blocks(finger.build(UUID, calibration={1: erased}).blocks, tmp_path / "x.png")
     assert list(tmp_path.iterdir()) == []
 

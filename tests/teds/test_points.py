@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.teds.calibration import evaluate, fit_points, left_out, read_calibrations, residuals
 from teds_provision.teds.calibration.points import Point, points_of, with_point
 from teds_provision.teds.profile import load_profile, shipped_profiles
@@ -51,14 +51,14 @@ def test_a_later_point_dates_the_file_and_stands_in_its_unit() -> None:
 
 
 def test_a_file_of_another_node_or_of_other_columns_or_units_is_left_alone() -> None:
-    with pytest.raises(PolicyRefused, match="holds points of node cd"):
+    with pytest.raises(PolicyError, match="holds points of node cd"):
         grown((1, 1), text=grown((0, 0)).replace(NODE, "cd" * 10))
     for text in ("raw, value\n1, 2\n", "# date: 2026-01-01\n", grown((0, 0)) * 2):
-        with pytest.raises(BadData):
+        with pytest.raises(BadDataError):
             grown((1, 1), text=text)
-    with pytest.raises(BadData, match="values in N"):
+    with pytest.raises(BadDataError, match="values in N"):
         grown((1, 1), text=grown((0, 0)).replace("[degree]", "[N]"))
-    with pytest.raises(BadData, match="not a number"):
+    with pytest.raises(BadDataError, match="not a number"):
         grown((1, 1), text=grown((0, 0)).replace("1, 0, 0", "1, zero, 0"))
 
 
@@ -107,14 +107,14 @@ def test_a_polynomial_of_its_own_degree_meets_every_point(a: float, b: float, c:
 
 
 def test_segments_have_no_points() -> None:
-    with pytest.raises(BadData, match="no points"):
+    with pytest.raises(BadDataError, match="no points"):
         fit_points("from,to,offset,c0,c1\n0,10,0,1,2\n", "x.csv")
 
 
 def test_remarks_are_no_values(tmp_path: Path) -> None:
     text = "raw, # who, value [N], #\n0, me, 1\n5, you, 2, x\n"
     assert fit_points(text, "x.csv")[1].points == ((0, 1), (5, 2))
-    with pytest.raises(BadData, match="columns"):
+    with pytest.raises(BadDataError, match="columns"):
         fit_points("raw, value, # a\n0, 1, 2, 3\n", "x.csv")
     file = tmp_path / "x.csv"
     file.write_text(text)

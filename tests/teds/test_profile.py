@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.teds.calibration import fit
 from teds_provision.teds.profile import (
     Profile,
@@ -83,7 +83,7 @@ def test_every_shipped_profile_builds_clean_teds_without_a_warning_of_its_own(na
     profile = load_profile(name, [shipped_profiles()])
     assert profile.warnings == ()
     if profile.abstract:
-        with pytest.raises(BadData, match="base"):
+        with pytest.raises(BadDataError, match="base"):
             profile.build(UUID)
         return
     built = profile.build(UUID if edition == 2007 else bytes(16), edition=edition)
@@ -158,12 +158,12 @@ def test_a_broken_profile_is_listed_with_its_error(tmp_path: Path) -> None:
 
 
 def test_an_unknown_profile_is_not_found_and_the_nearest_is_named() -> None:
-    with pytest.raises(NotFound) as caught:
+    with pytest.raises(NotFoundError) as caught:
         load_profile("tactile-finger-senser", [shipped_profiles()])
     assert '"tactile-finger-sensor"' in caught.value.hint
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         load_profile("../secret", [shipped_profiles()])
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         load_profile(Path("/no/such.toml"))
 
 
@@ -198,9 +198,9 @@ def test_what_a_person_should_know_is_a_warning(tmp_path: Path) -> None:
 
 def test_a_uuid_of_the_wrong_length_and_a_foreign_channel_are_refused(tmp_path: Path) -> None:
     profile = load_profile(write(tmp_path, "force", GOOD))
-    with pytest.raises(BadData, match="10 octets"):
+    with pytest.raises(BadDataError, match="10 octets"):
         profile.build(bytes(16))
-    with pytest.raises(BadData, match="channel 2"):
+    with pytest.raises(BadDataError, match="channel 2"):
         profile.build(UUID, calibration={2: fit([(0, 0.0), (1, 1.0)], "linear", channel=2)})
     built = profile.build(UUID, edition=2024)
     assert "six zero octets" in built.warnings[0]
@@ -260,7 +260,7 @@ def test_the_narrower_selection_of_channels_wins(tmp_path: Path) -> None:
 def test_a_circle_of_profiles_is_refused(circle: tuple[str, ...], tmp_path: Path) -> None:
     for name, base in zip(circle, circle[1:] + circle[:1], strict=True):
         write(tmp_path, name, f'extends = "{base}"\n')
-    with pytest.raises(BadData, match="circle: a -> "):
+    with pytest.raises(BadDataError, match="circle: a -> "):
         load_profile("a", [tmp_path])
 
 
@@ -272,7 +272,7 @@ def test_a_users_profile_may_extend_the_shipped_one_of_the_same_name(tmp_path: P
 def test_an_error_in_an_inherited_file_names_that_file(tmp_path: Path) -> None:
     write(tmp_path, "base", GOOD.replace('unit = "N"', 'unit = "Newtons of"'))
     write(tmp_path, "mine", 'extends = "base"\n')
-    with pytest.raises(BadData, match=r"base\.toml:8: channel\.1\.unit: "):
+    with pytest.raises(BadDataError, match=r"base\.toml:8: channel\.1\.unit: "):
         load_profile("mine", [tmp_path])
 
 
@@ -319,7 +319,7 @@ def test_a_mistake_is_named_with_file_line_and_field(
 ) -> None:
     assert old in GOOD
     path = write(tmp_path, "force", GOOD.replace(old, new, 1))
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         load_profile(path)
     _, problems = check(path)
     errors = [str(problem) for problem in problems if problem.severity == "error"]
@@ -357,7 +357,7 @@ def test_all_mistakes_are_found_at_once(tmp_path: Path) -> None:
     text = GOOD.replace('"N"', '"newtn"').replace('"sensor"', '"x"').replace("[meta]", "[meta]\nfoo = 1")
     path = write(tmp_path, "force", text)
     assert len([problem for problem in check(path)[1] if problem.severity == "error"]) == 3
-    with pytest.raises(BadData, match=r"\(2 more\)"):
+    with pytest.raises(BadDataError, match=r"\(2 more\)"):
         load_profile(path)
 
 
@@ -367,7 +367,7 @@ def test_all_mistakes_are_found_at_once(tmp_path: Path) -> None:
 def test_what_is_not_toml_is_bad_data(octets: bytes, words: str, tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     path.write_bytes(octets)
-    with pytest.raises(BadData, match=words):
+    with pytest.raises(BadDataError, match=words):
         load_profile(path)
 
 
@@ -423,7 +423,7 @@ def test_a_damaged_profile_is_a_profile_or_bad_data(data: st.DataObject, tmp_pat
     at = data.draw(st.integers(0, len(GOOD)))
     to = data.draw(st.integers(at, min(len(GOOD), at + 20)))
     text = GOOD[:at] + data.draw(st.text("[]{}=\"'.\n#,- 019aex", max_size=6)) + GOOD[to:]
-    with suppress(BadData, NotFound):
+    with suppress(BadDataError, NotFoundError):
         assert load_profile(write(tmp_path, "damaged", text), [tmp_path]).channels
 
 

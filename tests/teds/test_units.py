@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds import units as u
 from teds_provision.teds.codec.model import UNIT_PARTS, Units
 
@@ -135,21 +135,21 @@ def test_products_need_no_pint(monkeypatch: pytest.MonkeyPatch, text: str) -> No
 
 def test_a_rare_unit_without_pint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(u, "_registry", lambda: None)
-    with pytest.raises(BadData, match="without the package pint") as caught:
+    with pytest.raises(BadDataError, match="without the package pint") as caught:
         u.parse_unit("furlong/fortnight")
     assert "teds-provision[units]" in caught.value.hint
 
 
 @pytest.mark.parametrize("text", ["newtn", "degree celsius of", "", "3 +", "USD", "m**0.3", "m/", "]["])
 def test_what_is_no_unit_is_refused_with_its_text_and_a_cure(text: str) -> None:
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         u.parse_unit(text)
     assert f'"{text}"' in caught.value.message
     assert caught.value.hint
 
 
 def test_a_near_miss_is_suggested() -> None:
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         u.parse_unit("degre")
     assert '"degree"' in caught.value.hint
 
@@ -221,7 +221,7 @@ def test_times_are_read_as_written(written: object, seconds: float) -> None:
 
 @pytest.mark.parametrize("written", ["soon", "3 N", "0 Hz", [], True, None, ""])
 def test_what_is_no_time_is_refused(written: object) -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         u.parse_seconds(written)
 
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from tests.teds.vectors import ALL, CLEAN, TEDS, octets_of
 
 GOOD = {"clean", "block-clean", "message"}
@@ -60,7 +60,7 @@ def test_strict_raises_exactly_where_there_are_errors(name: str) -> None:
     if ALL[name]["verdict"] in GOOD:
         assert teds.decode(octets_of(name), strict=True).verdict in GOOD
     else:
-        with pytest.raises(BadData) as caught:
+        with pytest.raises(BadDataError) as caught:
             teds.decode(octets_of(name), strict=True)
         assert ALL[name]["verdict"] in caught.value.hint
 

@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.formats import TedsBlock, read_blocks, write_blocks
 from teds_provision.teds.formats.xmlform import NAMESPACE, SCHEMA
 from tests.pace import costs_at_most
@@ -62,7 +62,7 @@ BOMB = (
     ids=["bomb", "external DTD", "external entity", "bare DTD"],
 )
 def test_documents_with_a_dtd_or_entities_are_refused_at_once(document):
-    with costs_at_most(1.0), pytest.raises(BadData, match="refused"):
+    with costs_at_most(1.0), pytest.raises(BadDataError, match="refused"):
         read_blocks(document.encode())
 
 
@@ -93,7 +93,7 @@ INVALID = [
 def test_what_the_schema_refuses_the_reader_refuses_too(schema, inner):
     document = f"{OPEN}{inner}</teds-set>"
     assert inner == "<teds/>" or not schema.is_valid(document)
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         read_blocks(document.encode())
 
 
@@ -101,13 +101,13 @@ def test_what_the_schema_refuses_the_reader_refuses_too(schema, inner):
     "document", ["<whitelist/>", '<teds-set xmlns="urn:other"/>', f'{OPEN[:-1]} a="1"/>', "<teds-set>", "<"]
 )
 def test_other_xml_is_refused(document):
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         read_blocks(document.encode(), "xml")
 
 
 def test_deep_nesting_is_refused():
     deep = '<field name="x">' * 5000 + "</field>" * 5000
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         read_blocks(f'{OPEN}<teds access-code="1">{deep}</teds></teds-set>'.encode())
 
 

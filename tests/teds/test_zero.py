@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration import Calibration, CalibrationInput, evaluate, from_decoded
 from teds_provision.teds.calibration.zero import offset_for, reading_of, turn_of, with_zero_offset
 from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
@@ -99,5 +99,5 @@ def test_the_edition_of_2024_is_kept() -> None:
 
 
 def test_a_damaged_one_is_refused() -> None:
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         with_zero_offset(composed(LINE)[:-1] + b"\x00", 1.0, AT)

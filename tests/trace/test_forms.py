@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, NotFound, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, UsageError
 from teds_provision.links.ports import Direction
 from teds_provision.trace import pcapng
 from teds_provision.trace import record as lines
@@ -148,7 +148,7 @@ def test_a_capture_by_another_program_is_read() -> None:
 )
 def test_what_is_no_trace_is_bad_data(octets: bytes, tmp_path: Path) -> None:
     (tmp_path / "t").write_bytes(octets)
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         list(read_trace(tmp_path / "t"))
 
 
@@ -162,8 +162,8 @@ def test_a_trace_is_private_and_never_over_another_file(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o600
     (record,) = read_trace(path)
     assert record.command == "Sealed, not opened"
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         open_trace(path, told.append)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         open_trace(tmp_path / "none" / "t", told.append)
     assert not told

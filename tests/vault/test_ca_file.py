@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotFound, VaultFailure, WrongPassphrase
+from teds_provision.errors import NotFoundError, VaultError, WrongPassphraseError
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.vault.passphrase import GOOD, STORE, Person
@@ -23,9 +23,9 @@ def test_the_ca_key_can_be_kept_away_and_brought_back(tmp_path: Path, vault: Fil
     assert vault.drop_ca()
     assert not vault.drop_ca()
     assert FileVault.open(tmp_path, STORE, Person()).ca() is None
-    with pytest.raises(VaultFailure, match="does not contain a CA key"):
+    with pytest.raises(VaultError, match="does not contain a CA key"):
         vault.export_ca(tmp_path / "other.pem", "a passphrase for the safe")
-    with pytest.raises(WrongPassphrase):
+    with pytest.raises(WrongPassphraseError):
         vault.import_ca(away, "not that passphrase")
     assert vault.ca() is None
     assert vault.import_ca(away, "a passphrase for the safe").point == ca.point
@@ -52,24 +52,24 @@ def test_openssl_opens_the_exported_ca_key(tmp_path: Path, vault: FileVault) -> 
 def test_an_export_never_overwrites_and_never_takes_a_weak_passphrase(tmp_path: Path, vault: FileVault) -> None:
     taken = tmp_path / "ca.pem"
     taken.write_text("precious")
-    with pytest.raises(VaultFailure, match="already exists"):
+    with pytest.raises(VaultError, match="already exists"):
         vault.export_ca(taken, "a passphrase for the safe")
     assert taken.read_text() == "precious"
-    with pytest.raises(VaultFailure, match="too short"):
+    with pytest.raises(VaultError, match="too short"):
         vault.export_ca(tmp_path / "new.pem", "short")
     assert not (tmp_path / "new.pem").exists()
 
 
 def test_what_is_no_ca_file_is_refused(tmp_path: Path, vault: FileVault) -> None:
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         vault.import_ca(tmp_path / "nowhere.pem", GOOD)
     (tmp_path / "letter.pem").write_text("dear aunt")
-    with pytest.raises(VaultFailure, match="no encrypted private key"):
+    with pytest.raises(VaultError, match="no encrypted private key"):
         vault.import_ca(tmp_path / "letter.pem", GOOD)
     (tmp_path / "torn.pem").write_text(
         "-----BEGIN ENCRYPTED PRIVATE KEY-----\nMIIB\n-----END ENCRYPTED PRIVATE KEY-----\n"
     )
-    with pytest.raises(VaultFailure):
+    with pytest.raises(VaultError):
         vault.import_ca(tmp_path / "torn.pem", GOOD)
 
 
@@ -78,7 +78,7 @@ def test_another_ca_key_does_not_replace_the_one_that_is_there(tmp_path: Path, v
     other.mkdir()
     FileVault.create(other, STORE, Person(), costs=THROWAWAY).export_ca(tmp_path / "ca.pem", GOOD)
     before = vault.ca()
-    with pytest.raises(VaultFailure, match="a different CA key"):
+    with pytest.raises(VaultError, match="a different CA key"):
         vault.import_ca(tmp_path / "ca.pem", GOOD)
     after = vault.ca()
     assert before is not None

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import TedsProvisionError, VaultFailure, WrongPassphrase
+from teds_provision.errors import TedsProvisionError, VaultError, WrongPassphraseError
 from teds_provision.vault.ca_file import MAX_ROUNDS, ROUNDS, read_ca, write_ca
 from tests.pace import costs_at_most
 
@@ -36,7 +36,7 @@ def test_more_rounds_than_the_bound_are_refused_at_once(tmp_path: Path) -> None:
     assert der.count(own) == 1
     for many in (MAX_ROUNDS + 1, 0xFFFFFF, 0):
         path.write_text(pem_of(der.replace(own, b"\x02\x03" + many.to_bytes(3, "big"))))
-        with costs_at_most(0.1), pytest.raises(VaultFailure, match="encrypted in an unsupported way"):
+        with costs_at_most(0.1), pytest.raises(VaultError, match="encrypted in an unsupported way"):
             read_ca(path, WORDS)
 
 
@@ -64,7 +64,7 @@ def test_a_key_sealed_by_scrypt_is_refused_and_the_usual_openssl_ones_open(tmp_p
     (tmp_path / "scrypt.pem").write_bytes(
         subprocess.run(seal, input=WORDS.encode(), check=True, capture_output=True).stdout
     )
-    with pytest.raises(VaultFailure, match="encrypted in an unsupported way"):
+    with pytest.raises(VaultError, match="encrypted in an unsupported way"):
         read_ca(tmp_path / "scrypt.pem", WORDS)
 
 
@@ -72,5 +72,5 @@ def test_a_key_sealed_by_scrypt_is_refused_and_the_usual_openssl_ones_open(tmp_p
 def test_no_octets_raise_anything_foreign(tmp_path_factory: pytest.TempPathFactory, octets: bytes) -> None:
     path = tmp_path_factory.mktemp("ca") / "ca.pem"
     path.write_text(pem_of(octets))
-    with pytest.raises((TedsProvisionError, WrongPassphrase)):
+    with pytest.raises((TedsProvisionError, WrongPassphraseError)):
         read_ca(path, WORDS)

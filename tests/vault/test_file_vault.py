@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import StoreFailure, UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.errors import StoreError, UsageError, VaultError, WrongPassphraseError
 from teds_provision.protocol.keys import SoftwareKey, verify
 from teds_provision.vault import create_vault, open_vault
 from teds_provision.vault.file_vault import FileVault
@@ -60,9 +60,9 @@ def test_no_secret_stands_in_the_file_or_in_a_repr(tmp_path: Path, vault: FileVa
 
 @pytest.mark.parametrize("wrong", ["", "four random words her", GOOD + " ", GOOD.upper(), "x" * 5000])
 def test_a_wrong_passphrase_is_told_apart_from_damage(tmp_path: Path, vault: FileVault, wrong: str) -> None:
-    with pytest.raises(VaultFailure) as caught:
+    with pytest.raises(VaultError) as caught:
         FileVault.open(tmp_path, STORE, Person(wrong))
-    assert isinstance(caught.value, WrongPassphrase) or len(wrong) > 1024
+    assert isinstance(caught.value, WrongPassphraseError) or len(wrong) > 1024
     assert caught.value.exit_code == 7
     assert wrong == "" or wrong not in str(caught.value) + caught.value.hint
 
@@ -78,7 +78,7 @@ def test_a_passphrase_typed_in_another_unicode_form_is_the_same(tmp_path: Path) 
     ["", "short", "1234567", "aaaaaaaaaaaa", "line\nbreak here", "nul\0 in the middle", "\udce9" * 4 + "abcdefg"],
 )
 def test_a_weak_or_impossible_passphrase_makes_no_vault(tmp_path: Path, weak: str) -> None:
-    with pytest.raises(VaultFailure):
+    with pytest.raises(VaultError):
         FileVault.create(tmp_path, STORE, Person(weak), costs=THROWAWAY)
     assert list(tmp_path.iterdir()) == []
 
@@ -90,24 +90,24 @@ def test_a_second_init_opens_the_vault_and_changes_nothing(tmp_path: Path, vault
     assert again.identity().point == vault.identity().point
     assert [confirm for _, confirm in person.asked] == [False]
     assert (tmp_path / "vault.json").read_bytes() == before
-    with pytest.raises(WrongPassphrase):
+    with pytest.raises(WrongPassphraseError):
         FileVault.create(tmp_path, STORE, Person("quite another one"))
     assert (tmp_path / "vault.json").read_bytes() == before
 
 
 def test_the_vault_of_another_store_is_refused_before_anyone_is_asked(tmp_path: Path, vault: FileVault) -> None:
     person = Person()
-    with pytest.raises(VaultFailure, match="another store"):
+    with pytest.raises(VaultError, match="another store"):
         FileVault.open(tmp_path, "77" * 16, person)
     assert person.asked == []
     content = json.loads((tmp_path / "vault.json").read_text())
     (tmp_path / "vault.json").write_text(json.dumps({**content, "store": "77" * 16}))
-    with pytest.raises(WrongPassphrase):
+    with pytest.raises(WrongPassphraseError):
         FileVault.open(tmp_path, "77" * 16, person)
 
 
 def test_a_missing_vault_names_the_cure(tmp_path: Path) -> None:
-    with pytest.raises(VaultFailure, match="missing") as caught:
+    with pytest.raises(VaultError, match="missing") as caught:
         FileVault.open(tmp_path, STORE, Person())
     assert "restore" in caught.value.hint
 
@@ -134,7 +134,7 @@ def test_a_vault_that_another_process_replaced_is_read_again(tmp_path: Path) -> 
 
 def test_a_new_passphrase_replaces_the_old(tmp_path: Path, vault: FileVault) -> None:
     vault.new_passphrase(Person("another good passphrase"), costs=THROWAWAY)()
-    with pytest.raises(WrongPassphrase):
+    with pytest.raises(WrongPassphraseError):
         FileVault.open(tmp_path, STORE, Person())
     again = FileVault.open(tmp_path, STORE, Person("another good passphrase"))
     assert again.identity().point == vault.identity().point
@@ -149,7 +149,7 @@ def test_every_flipped_octet_of_the_file_is_noticed(tmp_path: Path, vault: FileV
         path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
         try:
             again = FileVault.open(tmp_path, STORE, Person())
-        except VaultFailure:
+        except VaultError:
             continue
         silent.append((place, again.identity().point == point))
     assert silent == []
@@ -165,7 +165,7 @@ def test_forged_costs_cannot_exhaust_the_machine(tmp_path: Path, vault: FileVaul
         {"memory_kib": -1},
     ):
         (tmp_path / "vault.json").write_text(json.dumps({**content, **forged}))
-        with costs_at_most(1.0), pytest.raises(VaultFailure):
+        with costs_at_most(1.0), pytest.raises(VaultError):
             FileVault.open(tmp_path, STORE, Person())
 
 
@@ -173,13 +173,13 @@ def test_forged_costs_cannot_exhaust_the_machine(tmp_path: Path, vault: FileVaul
 def test_no_file_raises_anything_foreign(tmp_path_factory: pytest.TempPathFactory, octets: bytes) -> None:
     home = tmp_path_factory.mktemp("vault")
     (home / "vault.json").write_bytes(octets)
-    with pytest.raises(VaultFailure):
+    with pytest.raises(VaultError):
         FileVault.open(home, STORE, Person())
 
 
 def test_a_deep_json_is_damage(tmp_path: Path) -> None:
     (tmp_path / "vault.json").write_text("[" * 60_000)
-    with pytest.raises(VaultFailure):
+    with pytest.raises(VaultError):
         FileVault.open(tmp_path, STORE, Person())
 
 
@@ -236,12 +236,12 @@ def test_a_full_disk_leaves_the_vault_as_it_was(tmp_path: Path, vault: FileVault
     before = (tmp_path / "vault.json").read_bytes()
     code = (
         "import resource, sys; sys.dont_write_bytecode = True\n"
-        "from pathlib import Path; from teds_provision.errors import VaultFailure\n"
+        "from pathlib import Path; from teds_provision.errors import VaultError\n"
         "from teds_provision.vault.file_vault import FileVault\n"
         f"vault = FileVault.open(Path(sys.argv[1]), {STORE!r}, lambda prompt, confirm: {GOOD!r})\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
         "try: vault.drop_ca()\n"
-        "except VaultFailure as failure: print(vault.ca() is not None, failure.message)"
+        "except VaultError as failure: print(vault.ca() is not None, failure.message)"
     )
     run = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=60, check=False
@@ -262,7 +262,7 @@ def test_a_backup_brings_the_station_to_another_home(tmp_path: Path, vault: File
 
 
 def test_a_backup_of_another_station_replaces_nothing(tmp_path: Path, vault: FileVault) -> None:
-    with pytest.raises(VaultFailure, match="another station"):
+    with pytest.raises(VaultError, match="another station"):
         create_vault(tmp_path, STORE, "file", Person(), restored=Material.generate().encode())
     assert FileVault.open(tmp_path, STORE, Person()).identity().point == vault.identity().point
 
@@ -277,7 +277,7 @@ def test_two_lives_of_one_station_are_not_called_two_stations(tmp_path: Path, va
     assert isinstance(restored, FileVault)
     restored.add_master()
     before = restored.secret_material()
-    with pytest.raises(VaultFailure, match="are of one station, but each has another master key") as error:
+    with pytest.raises(VaultError, match="are of one station, but each has another master key") as error:
         restored.join(newer)
     assert "another --home" in error.value.hint
     assert restored.secret_material() == before
@@ -294,17 +294,17 @@ def test_an_older_backup_brings_back_old_master_keys_without_losing_the_new(tmp_
 
 
 def test_an_unknown_keystore_is_a_usage_error(tmp_path: Path) -> None:
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         create_vault(tmp_path, STORE, "floppy", Person())
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         open_vault(tmp_path, STORE, "floppy", Person())
 
 
 def test_nobody_to_ask_makes_nothing(tmp_path: Path) -> None:
     def nobody(prompt: str, confirm: bool) -> str:
-        raise VaultFailure("No passphrase, and nobody may be asked.")
+        raise VaultError("No passphrase, and nobody may be asked.")
 
-    with pytest.raises(StoreFailure):
+    with pytest.raises(StoreError):
         create_vault(tmp_path, STORE, "file", nobody)
     assert list(tmp_path.iterdir()) == []
 

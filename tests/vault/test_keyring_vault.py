@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NoKeyring, VaultFailure
+from teds_provision.errors import KeyringUnavailableError, VaultError
 from teds_provision.vault import create_vault, forget_vaults, keyring_vault, open_vault
 from teds_provision.vault.keyring_vault import KeyringVault
 from teds_provision.vault.passphrase import THROWAWAY
@@ -56,11 +56,11 @@ def _no_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 @pytest.mark.parametrize("name", NOT_ALLOWED)
 def test_a_backend_that_may_not_hold_a_secret_is_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setenv("PYTHON_KEYRING_BACKEND", name)
-    with pytest.raises(NoKeyring, match=name.replace(".", r"\.")) as caught:
+    with pytest.raises(KeyringUnavailableError, match=name.replace(".", r"\.")) as caught:
         KeyringVault.create(STORE)
     assert "--keystore file" in caught.value.hint
     assert caught.value.exit_code == 7
-    with pytest.raises(NoKeyring):
+    with pytest.raises(KeyringUnavailableError):
         open_vault(Path("unused"), STORE, "keyring", never)
 
 
@@ -69,7 +69,7 @@ def test_the_same_backend_named_in_the_configuration_file_is_refused(tmp_path: P
     place = tmp_path / ".config" / "python_keyring"
     place.mkdir(parents=True)
     (place / "keyringrc.cfg").write_text(f"[backend]\ndefault-keyring={name}\n")
-    with pytest.raises(NoKeyring, match=name.replace(".", r"\.")):
+    with pytest.raises(KeyringUnavailableError, match=name.replace(".", r"\.")):
         KeyringVault.create(STORE)
 
 
@@ -77,7 +77,7 @@ def test_an_unreadable_configuration_file_is_not_ignored(tmp_path: Path) -> None
     place = tmp_path / ".config" / "python_keyring"
     place.mkdir(parents=True)
     (place / "keyringrc.cfg").write_bytes(b"default-keyring=\xff\xfe\n")
-    with pytest.raises(NoKeyring, match=r"keyringrc\.cfg"):
+    with pytest.raises(KeyringUnavailableError, match=r"keyringrc\.cfg"):
         KeyringVault.create(STORE)
 
 
@@ -85,9 +85,9 @@ def test_an_unreadable_configuration_file_is_not_ignored(tmp_path: Path) -> None
 def test_a_machine_without_a_keyring_says_so(monkeypatch: pytest.MonkeyPatch, name: str | None) -> None:
     if name:
         monkeypatch.setenv("PYTHON_KEYRING_BACKEND", name)
-    with pytest.raises(NoKeyring, match="no keyring"):
+    with pytest.raises(KeyringUnavailableError, match="no keyring"):
         KeyringVault.create(STORE)
-    with pytest.raises(NoKeyring, match="no keyring"):
+    with pytest.raises(KeyringUnavailableError, match="no keyring"):
         KeyringVault.open(STORE)
 
 
@@ -96,7 +96,7 @@ def test_a_backend_that_forgets_is_found_out_before_a_key_is_trusted_to_it(monke
     monkeypatch.setenv("PYTHON_KEYRING_BACKEND", forgetful)
     monkeypatch.setitem(keyring_vault.ALLOWED, forgetful, "forgetful")
     monkeypatch.setattr("keyring.backends.null.Keyring.priority", 1)
-    with pytest.raises(VaultFailure, match="did not store"):
+    with pytest.raises(VaultError, match="did not store"):
         KeyringVault.create(STORE)
 
 
@@ -150,7 +150,7 @@ def test_what_is_written_is_made_from_what_lies_in_the_keyring_now(monkeypatch: 
     assert not other.refresh()
     assert not other.drop_ca(), "it is gone already"
     backend.entries.clear()
-    with pytest.raises(VaultFailure, match="no longer has"):
+    with pytest.raises(VaultError, match="no longer has"):
         other.add_master()
     assert backend.entries == {}
 
@@ -304,7 +304,7 @@ def test_the_ca_key_leaves_and_comes_back_and_the_master_key_changes(session: Se
 @pytest.mark.system
 def test_the_keyring_of_another_user_has_no_entry(session: Session) -> None:
     said = session.run('attempt(lambda: open_vault(home, store, "keyring", never))')
-    assert said["error"] == "VaultFailure"
+    assert said["error"] == "VaultError"
     assert "no entry" in said["message"]
     assert "restore" in said["hint"]
 
@@ -313,7 +313,7 @@ def test_the_keyring_of_another_user_has_no_entry(session: Session) -> None:
 def test_a_keyring_that_stays_locked_is_not_taken_and_not_waited_for(session: Session) -> None:
     session.run(MAKE)
     said = session.run('attempt(lambda: open_vault(home, store, "keyring", never))', password="another password")
-    assert said["error"] == "VaultFailure"
+    assert said["error"] == "VaultError"
     assert "locked" in said["message"]
     assert "Unlock it" in said["hint"]
     fallen = session.run(
@@ -327,7 +327,7 @@ def test_a_keyring_that_stays_locked_is_not_taken_and_not_waited_for(session: Se
 @pytest.mark.system
 def test_a_secret_service_that_nobody_unlocked_is_locked(session: Session) -> None:
     said = session.run('attempt(lambda: create_vault(home, store, "keyring", never))', password=None)
-    assert said["error"] in ("VaultFailure", "NoKeyring")
+    assert said["error"] in ("VaultError", "KeyringUnavailableError")
     assert said["hint"]
 
 
@@ -345,7 +345,7 @@ def test_a_bus_without_a_secret_service_has_no_keyring(session: Session) -> None
         password=None,
         bus=("--config-file", str(config)),
     )
-    assert said["error"] == "NoKeyring"
+    assert said["error"] == "KeyringUnavailableError"
     assert "--keystore file" in said["hint"]
 
 
@@ -360,7 +360,7 @@ def test_an_entry_that_is_not_ours_is_damage_and_stays(session: Session) -> None
         kept = keyring.get_password("teds-provision", f"station/{store}")
         say(**json.loads(output.getvalue()), kept=kept)
     """)
-    assert said["error"] == "VaultFailure"
+    assert said["error"] == "VaultError"
     assert said["kept"] == "something else"
     assert "something else" not in said["message"] + said["hint"]
 
@@ -383,5 +383,5 @@ def test_a_service_that_dies_is_a_failure_with_a_cure(session: Session) -> None:
                     os.kill(int(name), signal.SIGKILL)
         attempt(vault.drop_ca)
     """)
-    assert said["error"] in ("VaultFailure", "NoKeyring")
+    assert said["error"] in ("VaultError", "KeyringUnavailableError")
     assert said["hint"]

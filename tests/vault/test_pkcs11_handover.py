@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import PolicyRefused, VaultFailure
+from teds_provision.errors import PolicyError, VaultError
 from teds_provision.protocol.handover.bundle import open_bundle, payload_of, seal_bundle
 from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
@@ -65,7 +65,7 @@ def test_from_token_to_token(stations, count):
     found = open_bundle(octets, south, trusts(north), NOW)
     assert found.bundle == made
     assert found.station_signature is not None
-    with pytest.raises(PolicyRefused, match="not sealed for this station"):
+    with pytest.raises(PolicyError, match="not sealed for this station"):
         open_bundle(octets, north, trusts(north), NOW)
 
 
@@ -97,5 +97,5 @@ def test_a_token_that_fails_is_no_fault_of_the_bundle(stations, reopened):
     south = stations[1].identity()
     octets = seal_bundle(between(SENDER, south, stations[0].ca(), 1), SENDER, [south.point])
     stations[1].close()
-    with pytest.raises(VaultFailure, match="The token failed"):
+    with pytest.raises(VaultError, match="The token failed"):
         open_bundle(octets, south, trusts(SENDER), NOW)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import VaultError
 from teds_provision.vault import pkcs11
 
 
@@ -36,5 +36,5 @@ def test_a_folder_that_was_planted_is_refused(cache: Path, tmp_path: Path, plant
     else:
         folder.mkdir()
         folder.chmod(0o777)
-    with pytest.raises(VaultFailure, match="cannot be used"), pkcs11.exclusive("/lib/module.so"):
+    with pytest.raises(VaultError, match="cannot be used"), pkcs11.exclusive("/lib/module.so"):
         pass

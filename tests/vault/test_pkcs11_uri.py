@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 
 M = "?module-path=/lib/m.so"
@@ -26,14 +26,14 @@ def test_every_attribute_is_read():
 @pytest.mark.parametrize("between", ["&", "?"])
 def test_no_uri_may_hold_a_pin_and_the_message_does_not_repeat_it(query, between):
     text = f"pkcs11:token=t{M}&{query}" if between == "&" else f"pkcs11:token=t?{query}&module-path=/lib/m.so"
-    with pytest.raises(UsageFailure, match="may not hold a PIN") as refused:
+    with pytest.raises(UsageError, match="may not hold a PIN") as refused:
         Pkcs11Uri.parse(text)
     assert "1234" not in str(refused.value)
     assert "--passphrase-fd" in refused.value.hint
 
 
 def test_a_pin_among_the_path_attributes_is_refused_as_well():
-    with pytest.raises(UsageFailure, match="may not hold a PIN"):
+    with pytest.raises(UsageError, match="may not hold a PIN"):
         Pkcs11Uri.parse("pkcs11:token=t;pin-value=1234" + M)
 
 
@@ -61,7 +61,7 @@ def test_a_pin_among_the_path_attributes_is_refused_as_well():
     ],
 )
 def test_what_might_name_something_else_is_refused(text):
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         Pkcs11Uri.parse(text)
 
 
@@ -69,7 +69,7 @@ def test_what_might_name_something_else_is_refused(text):
 @given(st.text(max_size=60))
 def test_any_text_is_read_or_refused(text):
     for whole in (text, "pkcs11:" + text, "pkcs11:" + text + M):
-        with suppress(UsageFailure):
+        with suppress(UsageError):
             assert isinstance(Pkcs11Uri.parse(whole), Pkcs11Uri)
 
 

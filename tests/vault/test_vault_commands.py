@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import VaultChanged, VaultLocked, WrongPassphrase
+from teds_provision.errors import VaultChangedError, VaultLockedError, WrongPassphraseError
 from teds_provision.station.station import Station, rewrap
 from teds_provision.store import StoreLock
 from teds_provision.store.database import Database
@@ -161,7 +161,7 @@ def test_a_new_passphrase_cut_at_every_durable_write_opens_with_the_old_or_the_n
         for passphrase in (PASSPHRASE, NEW):
             try:
                 assert FileVault.open(home, store_id, asking(passphrase)).identity().point == before
-            except WrongPassphrase:
+            except WrongPassphraseError:
                 continue
             fits.append(passphrase)
         assert len(fits) == 1, f"cut before durable step {step}"
@@ -272,7 +272,7 @@ def test_a_process_that_is_locked_out_says_so_until_the_vault_is_unlocked(home: 
     rewrap(other)
     forget_vaults()  # the other process ends
     for act in (lambda: keys(long_running), long_running.unlock, lambda: long_running.plant.keep_login(b"", b"")):
-        with pytest.raises(VaultLocked) as error:
+        with pytest.raises(VaultLockedError) as error:
             act()
     assert (error.value.exit_code, error.value.code) == (7, "vault-locked")
     agent.start(home, "file", other.vault.opener(), 60)
@@ -337,12 +337,12 @@ def test_what_another_process_did_to_a_tokens_file_is_taken_in(tmp_path: Path, m
         late = other.new_passphrase(asking(PIN, "111111"))
         set_pin()
         for change in (late, other.add_master, other.retire_masters, other.drop_ca):
-            with pytest.raises(VaultChanged):
+            with pytest.raises(VaultChangedError):
                 change()
         Pkcs11Vault.open(tmp_path, store, uri, asking("654321")).retire_masters()
         other.reread()
         assert other.masters() == (2,), "an open session outlasts the PIN that opened it"
-        with pytest.raises(VaultChanged):
+        with pytest.raises(VaultChangedError):
             other.add_master()
         assert one.refresh()
         assert one.masters() == (2,)
@@ -362,7 +362,7 @@ def test_a_tokens_pin_and_master_key(tmp_path: Path, monkeypatch: pytest.MonkeyP
         station.keys.add_pending(NODES[0], key=bytes(16), key_id=b"pending!", epoch=1)
         rewrap(station)
         assert [held.key for held in station.keys.unwrapped(NODES[0])] == [bytes(16)]
-        with pytest.raises(WrongPassphrase):
+        with pytest.raises(WrongPassphraseError):
             station.vault.new_passphrase(asking("0000", "654321"))()
         station.vault.new_passphrase(asking(PIN, "654321"))()
         station.vault.new_passphrase(asking("654321", PIN))()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import VaultError
 from teds_provision.store import KeyRecord, Store
 from teds_provision.vault import node_key_context
 from teds_provision.vault.file_vault import FileVault
@@ -31,7 +31,7 @@ def test_a_wrapped_key_opens_only_in_its_own_place(vault: FileVault) -> None:
         node_key_context(STORE, NODE, 3, 2),
         b"",
     ):
-        with pytest.raises(VaultFailure):
+        with pytest.raises(VaultError):
             vault.unwrap(wrapped, context=moved)
 
 
@@ -40,10 +40,10 @@ def test_every_flipped_bit_of_a_wrapped_key_is_noticed(vault: FileVault) -> None
     for bit in range(8 * len(wrapped)):
         torn = bytearray(wrapped)
         torn[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(VaultFailure):
+        with pytest.raises(VaultError):
             vault.unwrap(bytes(torn), context=b"c")
     for length in range(len(wrapped)):
-        with pytest.raises(VaultFailure):
+        with pytest.raises(VaultError):
             vault.unwrap(wrapped[:length], context=b"c")
 
 
@@ -110,5 +110,5 @@ def test_the_secret_line_fits_every_keyring_and_goes_both_ways() -> None:
     st.text(max_size=200) | st.binary(max_size=100).map(lambda b: "teds1:" + __import__("base64").b64encode(b).decode())
 )
 def test_no_secret_line_raises_anything_foreign(line: str) -> None:
-    with pytest.raises(VaultFailure):
+    with pytest.raises(VaultError):
         Material.decode(line)

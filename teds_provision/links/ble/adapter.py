@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import LinkFailure, NoNode
+from teds_provision.errors import LinkError, NoNodeError
 from teds_provision.links.ble import troubles
 from teds_provision.links.ble.spec import BleSpec
 from teds_provision.protocol.messages.ble import SERVICE
@@ -58,13 +58,13 @@ class Adapter:
         return now
 
     async def device(self, address: str) -> BLEDevice:
-        """The device at this address, as BlueZ knows it now; raises NoNode."""
+        """The device at this address, as BlueZ knows it now; raises NoNodeError."""
         known = self._seen.get(address)
         if known is None or time.monotonic() - known[1] > _FRESH_SECONDS:
             await self.scan(CONNECT_SECONDS, lambda now: address in now)
             known = self._seen.get(address)
         if known is None:
-            raise NoNode(
+            raise NoNodeError(
                 f"No node advertises as {address}.",
                 hint="Tap it: it then advertises for 60 s; a node with a key always does. Is it in range?",
             )
@@ -100,11 +100,14 @@ class Adapter:
                     raise trouble from error
 
     async def persist(self, work: Callable[[], Any]) -> Any:
-        """Do what another program's connect or scan may hold up; raises NoReader for Bluetooth that cannot be used."""
+        """Do what another program's connect or scan may hold up.
+
+        Raises NoReaderError for Bluetooth that cannot be used.
+        """
         for attempt in range(_BUSY_TRIES):
             try:
                 return await work()
-            except LinkFailure:
+            except LinkError:
                 raise
             except Exception as error:
                 trouble = troubles.adapter_trouble(error, self.spec.text)

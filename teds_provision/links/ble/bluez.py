@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass
 from typing import Any, Final
 
-from teds_provision.errors import NoReader
+from teds_provision.errors import NoReaderError
 from teds_provision.links.ble import troubles
 
 _SECONDS: Final = 5.0
@@ -27,7 +27,7 @@ class AdapterFacts:
 def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
     """Every adapter that bluetoothd has; ``bus_address`` None: the system's bus.
 
-    Raises NoReader where there is no system bus, bluetoothd does not run, or what asks for it is not installed.
+    Raises NoReaderError where there is no system bus, bluetoothd does not run, or what asks for it is not installed.
     """
     try:
         import dbus_fast  # noqa: F401
@@ -35,13 +35,13 @@ def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
         raise troubles.missing_bleak() from None
     try:
         return asyncio.run(asyncio.wait_for(_adapters(bus_address), _SECONDS))
-    except NoReader:
+    except NoReaderError:
         raise
     except TimeoutError:
-        raise NoReader("bluetoothd does not answer.", hint="sudo systemctl restart bluetooth") from None
+        raise NoReaderError("bluetoothd does not answer.", hint="sudo systemctl restart bluetooth") from None
     except Exception as error:
         trouble = troubles.adapter_trouble(error, "this machine")
-        raise trouble or NoReader(f"Cannot talk to bluetoothd: {error}.", hint=troubles.SERVICE_HINT) from error
+        raise trouble or NoReaderError(f"Cannot talk to bluetoothd: {error}.", hint=troubles.SERVICE_HINT) from error
 
 
 async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
@@ -52,7 +52,7 @@ async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
     try:
         (owned,) = await _call(bus, "org.freedesktop.DBus", "org.freedesktop.DBus", "NameHasOwner", "org.bluez")
         if not owned:
-            raise NoReader("The Bluetooth service (bluetoothd) is not running.", hint=troubles.SERVICE_HINT)
+            raise NoReaderError("The Bluetooth service (bluetoothd) is not running.", hint=troubles.SERVICE_HINT)
         (objects,) = await _call(bus, "org.bluez", "org.freedesktop.DBus.ObjectManager", "GetManagedObjects")
     finally:
         bus.disconnect()

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.ble import troubles
 from teds_provision.links.ble.adapter import CONNECT_SECONDS, Adapter
 from teds_provision.links.ports import Direction, Trace
@@ -25,11 +25,11 @@ _DOWN_SECONDS: Final = 5.0
 _FORGOTTEN_TRIES: Final = 2
 
 
-class ConnectionLost(Exception):
+class ConnectionLostError(Exception):
     """The connection ended, or did not come about, for a reason of the air: it is tried again."""
 
 
-class NotConnected(ConnectionLost):
+class NotConnectedError(ConnectionLostError):
     """No connection came about: nothing was sent."""
 
 
@@ -70,7 +70,7 @@ class BleConnection:
     async def exchange(self, transaction: int, message: bytes, seconds: float) -> bytes:
         """Write a command and return its reply; connects first where need be.
 
-        Raises ConnectionLost, TimeoutError (no reply), NoNode, and what makes Bluetooth unusable.
+        Raises ConnectionLostError, TimeoutError (no reply), NoNodeError, and what makes Bluetooth unusable.
         """
         async with self._turn:
             self.asking = True
@@ -81,7 +81,7 @@ class BleConnection:
                 self.asking = False
 
     async def write_data(self, message: bytes) -> None:
-        """Write a Drive message without response; raises ConnectionLost."""
+        """Write a Drive message without response; raises ConnectionLostError."""
         to = self._characteristic(ble.DATA)
         await self._doing(lambda client: client.write_gatt_char(to, b"\0" + message, response=False))
 
@@ -93,8 +93,8 @@ class BleConnection:
             if not self.is_up:
                 try:
                     await self._connect()
-                except ConnectionLost as lost:
-                    raise NotConnected(str(lost)) from lost
+                except ConnectionLostError as lost:
+                    raise NotConnectedError(str(lost)) from lost
 
     async def down(self) -> None:
         """Disconnect; never raises."""
@@ -119,7 +119,7 @@ class BleConnection:
             self._adapter.forget(self.address)
             if not await self._client_with_service():
                 await self.down()
-                raise LinkFailure(
+                raise LinkError(
                     f"The device at {self.address} advertises the service of a node but does not offer it.",
                     hint="Its firmware is wrong, or a cache: sudo rm -r /var/lib/bluetooth/*/cache, restart bluetooth.",
                 )
@@ -144,7 +144,7 @@ class BleConnection:
             try:
                 await self._adapter.persist(client.connect)
                 return client
-            except LinkFailure:
+            except LinkError:
                 raise
             except Exception as error:
                 self._client = None
@@ -152,7 +152,7 @@ class BleConnection:
                 if troubles.is_full(error, self._adapter.held):
                     raise troubles.too_many(len(self._adapter.held), self._adapter.spec.text) from error
                 if not troubles.is_gone(error) or attempt == _FORGOTTEN_TRIES - 1:
-                    raise ConnectionLost(_why(error)) from error
+                    raise ConnectionLostError(_why(error)) from error
         raise AssertionError("every attempt returns or raises")
 
     def _new_client(self, device: Any) -> BleakClient:
@@ -175,7 +175,7 @@ class BleConnection:
                 if client.services.get_characteristic(ble.DATA) is not None:
                     await client.start_notify(ble.DATA, lambda _c, octets: self._data(self.number, bytes(octets)))
         except Exception as error:
-            raise ConnectionLost(_why(error)) from error
+            raise ConnectionLostError(_why(error)) from error
 
     def _disconnected(self, client: BleakClient) -> None:
         self._adapter.held.discard(self)
@@ -195,7 +195,7 @@ class BleConnection:
             async with asyncio.timeout(seconds):
                 octets = await self._news.get()
             if octets is None:
-                raise ConnectionLost("the connection ended")
+                raise ConnectionLostError("the connection ended")
             self._note("in", octets)
             received = assembly.take(octets)
             if received is not None and received.transaction == transaction:
@@ -204,18 +204,18 @@ class BleConnection:
     async def _doing(self, work: Callable[[BleakClient], Awaitable[None]]) -> None:
         client = self._client
         if client is None or not client.is_connected:
-            raise ConnectionLost("the connection ended")
+            raise ConnectionLostError("the connection ended")
         try:
             await work(client)
         except TimeoutError:
             raise
         except Exception as error:
-            raise ConnectionLost(_why(error)) from error
+            raise ConnectionLostError(_why(error)) from error
 
     def _characteristic(self, uuid: str) -> BleakGATTCharacteristic:
         found = self._client.services.get_characteristic(uuid) if self.is_up and self._client is not None else None
         if found is None:
-            raise ConnectionLost("the connection ended")
+            raise ConnectionLostError("the connection ended")
         return found
 
     def _note(self, direction: Direction, octets: bytes) -> None:

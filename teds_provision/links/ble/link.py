@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Any, Final, TypeVar
 
 from teds_provision.links.ble import troubles
-from teds_provision.links.ble.connection import BleConnection, ConnectionLost, NotConnected
+from teds_provision.links.ble.connection import BleConnection, ConnectionLostError, NotConnectedError
 from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
 from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
 
@@ -99,18 +99,20 @@ class BleLink:
         self._last = self._number()
         try:
             return self._loop.run(self.connection.exchange(self._last, frame, seconds))
-        except (ConnectionLost, TimeoutError) as lost:
-            raise troubles.silent(self.connection.address, lost if isinstance(lost, ConnectionLost) else None) from lost
+        except (ConnectionLostError, TimeoutError) as lost:
+            raise troubles.silent(
+                self.connection.address, lost if isinstance(lost, ConnectionLostError) else None
+            ) from lost
 
     def again(self, frame: bytes) -> bytes:
         """Send the last frame once more under its transaction; see ``Repeats.again``."""
         return self._ask(frame, self._last)
 
     def drive(self, message: bytes) -> None:
-        """Write a Drive message; raises LinkFailure."""
+        """Write a Drive message; raises LinkError."""
         try:
             self._loop.run(self.connection.write_data(message))
-        except ConnectionLost as lost:
+        except ConnectionLostError as lost:
             raise troubles.silent(self.connection.address, lost) from lost
 
     def close(self) -> None:
@@ -123,16 +125,16 @@ class BleLink:
         while tries < TRIES and time.monotonic() - began < REPEAT_SECONDS:
             try:
                 return self._loop.run(self.connection.exchange(transaction, frame, REPLY_SECONDS))
-            except ConnectionLost as lost:
+            except ConnectionLostError as lost:
                 last = lost
                 # nothing was sent where no connection came about: an adapter that is still busy is no try
-                tries += not (isinstance(lost, NotConnected) and self.connection.was_up)
+                tries += not (isinstance(lost, NotConnectedError) and self.connection.was_up)
                 self._notice(Notice("retry", f"BLE: {str(lost).rstrip('.')}. Connecting again"))
                 time.sleep(pause)
                 pause = min(2 * pause, _LAST_PAUSE)
             except TimeoutError:
                 last, tries = None, tries + 1
-            except troubles.TooMany:
+            except troubles.TooManyConnectionsError:
                 if not self._make_room():
                     raise
         raise troubles.silent(self.connection.address, last)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import LinkFailure, NodeRefused, NoNode, NoReader, TedsProvisionError
+from teds_provision.errors import LinkError, NodeRefusedError, NoNodeError, NoReaderError, TedsProvisionError
 from teds_provision.files import read_limited, whole_file
 from teds_provision.links.ble.adapter import Adapter
 from teds_provision.links.ble.connection import BleConnection
@@ -89,7 +89,7 @@ _MOST_HELD: Final = 20_000
 
 
 def open_port(where: str, trace: Trace | None = None) -> BlePort:
-    """Open the adapter that ``where`` names, as ``--ble`` does; raises UsageFailure. Frames go to ``trace``."""
+    """Open the adapter that ``where`` names, as ``--ble`` does; raises UsageError. Frames go to ``trace``."""
     return BlePort(where, trace)
 
 
@@ -153,10 +153,10 @@ class BlePort:
             self._heard = False
 
     def link(self, number: int, notice: NoticeSink | None = None) -> BleLink:
-        """The line over the connection of this number; raises NoNode where there is none."""
+        """The line over the connection of this number; raises NoNodeError where there is none."""
         connection = next((each for each in self._connections.values() if each.number == number), None)
         if connection is None:
-            raise NoNode("That node is no longer known here.")
+            raise NoNodeError("That node is no longer known here.")
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice or _silently)
 
     def mtu(self, number: int) -> int:
@@ -176,7 +176,7 @@ class BlePort:
     ) -> Contact:
         """Return the node for which ``wanted`` holds: at ``address=``, else whichever advertises and is it.
 
-        Raises NoNode after ``seconds``, NoReader where Bluetooth cannot be used.
+        Raises NoNodeError after ``seconds``, NoReaderError where Bluetooth cannot be used.
         """
         where = f"at {self.spec.address} " if self.spec.address else ""
         notice(Notice("waiting", f"Looking for the node {where}over BLE ({self.spec.text}).", seconds))
@@ -186,13 +186,13 @@ class BlePort:
             if contact is not None:
                 return contact
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
-        raise NoNode(
+        raise NoNodeError(
             f"The node did not answer over BLE {where}within {seconds:g} s{others}.",
             hint="A node advertises for 60 s after a tap, and as long as it has a key. Bring it closer, or tap it.",
         )
 
     def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
-        """Every node that advertises, asked one after the other; raises NoNode after ``seconds``.
+        """Every node that advertises, asked one after the other; raises NoNodeError after ``seconds``.
 
         Listens until nobody new came for 1.5 s, and for ``listen`` seconds at least. Who is heard is asked soon: a new
         node advertises for a minute after its tap, and no longer.
@@ -216,7 +216,7 @@ class BlePort:
                 break
         if found:
             return [found[each] for each in sorted(found)]
-        raise NoNode(
+        raise NoNodeError(
             f"No node advertises within {seconds:g} s.",
             hint="A node advertises for 60 s after a tap, and as long as it has a key.",
         )
@@ -232,7 +232,7 @@ class BlePort:
                 if lost:
                     lost = False
                     notice(Notice("reader-ready", "Bluetooth is back."))
-            except NoReader as error:
+            except NoReaderError as error:
                 if not lost:
                     lost = True
                     notice(Notice("reader-lost", f"{error.message} Waiting for it."))
@@ -320,9 +320,9 @@ class BlePort:
         in_use = link.connection.is_up
         try:
             identity = Identity.decode(decode_reply(link.exchange(IDENTIFY.encode())).payload)
-        except NoReader:
+        except NoReaderError:
             raise
-        except (LinkFailure, NodeRefused) as error:
+        except (LinkError, NodeRefusedError) as error:
             notice(Notice("unfinished", f"The node at {address} did not say who it is: {error.message}"))
             self._leave(link, in_use=in_use)
             return None

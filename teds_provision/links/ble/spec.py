@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import parse_qsl
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 
 _ADDRESS: Final = re.compile(r"([0-9A-F]{2}:){5}[0-9A-F]{2}")
 _ADAPTER: Final = re.compile(r"[A-Za-z0-9_.-]{1,32}")
@@ -28,16 +28,16 @@ class BleSpec:
 
 
 def parse_spec(text: str) -> BleSpec:
-    """Read the value of ``--ble``; raises UsageFailure."""
+    """Read the value of ``--ble``; raises UsageError."""
     adapter, _, query = text.partition("?")
     options = dict(parse_qsl(query, keep_blank_values=True))
     address = options.pop("address", None)
     if options:
-        raise UsageFailure(f"--ble knows no option {next(iter(options))!r}.", hint=_HINT)
+        raise UsageError(f"--ble knows no option {next(iter(options))!r}.", hint=_HINT)
     if address is not None:
         address = address.upper().replace("-", ":")
         if not _ADDRESS.fullmatch(address):
-            raise UsageFailure(f"{address!r} is not a Bluetooth address.", hint=_HINT)
+            raise UsageError(f"{address!r} is not a Bluetooth address.", hint=_HINT)
     if adapter not in ("", "auto") and not _ADAPTER.fullmatch(adapter):
-        raise UsageFailure(f"{adapter!r} is not a Bluetooth adapter name.", hint=_HINT)
+        raise UsageError(f"{adapter!r} is not a Bluetooth adapter name.", hint=_HINT)
     return BleSpec(adapter if adapter not in ("", "auto") else None, address)

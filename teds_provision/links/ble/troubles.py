@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Final
 
-from teds_provision.errors import LinkFailure, NodeSilent, NoReader
+from teds_provision.errors import LinkError, NodeSilentError, NoReaderError
 from teds_provision.lazy import how_to_install
 
 SERVICE_HINT: Final = "sudo systemctl start bluetooth (package bluez); teds-provision doctor tells you more."
@@ -20,9 +20,9 @@ _UNKNOWN: Final = ("org.freedesktop.DBus.Error.UnknownObject", "org.freedesktop.
 _NO_SERVICE: Final = ("org.freedesktop.DBus.Error.ServiceUnknown", "org.freedesktop.DBus.Error.NameHasNoOwner")
 
 
-def missing_bleak() -> NoReader:
+def missing_bleak() -> NoReaderError:
     """The error where bleak is not installed."""
-    return NoReader("BLE needs bleak, which is not installed.", hint=how_to_install("ble"))
+    return NoReaderError("BLE needs bleak, which is not installed.", hint=how_to_install("ble"))
 
 
 def is_full(error: BaseException, held: Collection[object]) -> bool:
@@ -42,55 +42,57 @@ def is_gone(error: BaseException) -> bool:
     return unknown or type(error).__name__ == "BleakDeviceNotFoundError" or "not found" in str(error)
 
 
-def adapter_trouble(error: Exception, adapter: str) -> LinkFailure | None:
+def adapter_trouble(error: Exception, adapter: str) -> LinkError | None:
     """The error for Bluetooth that cannot be used at all; None where the trouble is the node's or the air's."""
     reason = getattr(getattr(error, "reason", None), "name", "")
     if isinstance(error, FileNotFoundError | ConnectionRefusedError | PermissionError):
-        return NoReader("There is no D-Bus system bus, so Bluetooth is unavailable.", hint=SERVICE_HINT)
+        return NoReaderError("There is no D-Bus system bus, so Bluetooth is unavailable.", hint=SERVICE_HINT)
     if getattr(error, "dbus_error", "") in _NO_SERVICE:
-        return NoReader("The Bluetooth service (bluetoothd) is not running.", hint=SERVICE_HINT)
+        return NoReaderError("The Bluetooth service (bluetoothd) is not running.", hint=SERVICE_HINT)
     if reason == "POWERED_OFF" or "adapter-not-powered" in str(error):
-        return NoReader(f"Bluetooth is switched off on {adapter}.", hint=POWER_HINT)
+        return NoReaderError(f"Bluetooth is switched off on {adapter}.", hint=POWER_HINT)
     if reason == "NO_BLE_CENTRAL_ROLE":
-        return NoReader(
+        return NoReaderError(
             f"The LE central role is not supported by {adapter}.",
             hint="Use an adapter with Bluetooth 4.0 or later.",
         )
     if reason:
-        return NoReader("There is no Bluetooth adapter.", hint="Plug one in; bluetoothctl list shows the adapters.")
+        return NoReaderError(
+            "There is no Bluetooth adapter.", hint="Plug one in; bluetoothctl list shows the adapters."
+        )
     if "adapter '" in str(error):
-        return NoReader(
+        return NoReaderError(
             f"There is no Bluetooth adapter {adapter}.", hint="bluetoothctl list, or: ls /sys/class/bluetooth"
         )
     if "AccessDenied" in str(error):
-        return NoReader(
+        return NoReaderError(
             "This user may not use Bluetooth.", hint="sudo adduser $USER bluetooth, or log in at the machine itself."
         )
     return None
 
 
-class TooMany(LinkFailure):
+class TooManyConnectionsError(LinkError):
     """An adapter's connections are used up."""
 
 
-def too_many(held: int, adapter: str) -> TooMany:
+def too_many(held: int, adapter: str) -> TooManyConnectionsError:
     """The error for an adapter whose connections are used up."""
-    return TooMany(
+    return TooManyConnectionsError(
         f"The Bluetooth of {adapter} holds {held} connection{'' if held == 1 else 's'} and takes no more.",
         hint="Measure fewer nodes over it, or add an adapter: many take 5 to 9, Nordic's own controllers 20.",
     )
 
 
-def silent(address: str, last: Exception | None) -> NodeSilent:
+def silent(address: str, last: Exception | None) -> NodeSilentError:
     """The error for a node that does not answer."""
     why = f" ({_text(last)})" if last is not None and _text(last) else ""
-    return NodeSilent(
+    return NodeSilentError(
         f"The node at {address} does not answer over BLE{why}.",
         hint="Bring it closer. It advertises for 60 s after a tap, and while it has a key.",
     )
 
 
 def _text(error: Exception) -> str:
-    if isinstance(error, LinkFailure):
+    if isinstance(error, LinkError):
         return error.message.rstrip(".")
     return str(error).strip().rstrip(".") or type(error).__name__

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
-from teds_provision.errors import AddressConflict
+from teds_provision.errors import AddressConflictError
 from teds_provision.links.can.finding import FunctionalAnswers, ask_all, conflict_text, settle
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
@@ -127,7 +127,7 @@ class Arrivals:
     def _one(self, address: int, clashing: set[int]) -> Iterator[tuple[int, Identity]]:
         try:
             identity = self._port.identify(address)
-        except AddressConflict:
+        except AddressConflictError:
             clashing.add(address)
             return
         if identity is not None and self._is_news(address, identity):

@@ -16,7 +16,7 @@ import time
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.errors import LinkError, NoReaderError, UsageError
 from teds_provision.lazy import install_command, late
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.multicast import Multicast, of_bus, written
@@ -148,7 +148,7 @@ class Bus:
         return self._pacer.busy_seconds if self._pacer else 0.0
 
     def send(self, frame: Frame) -> None:
-        """Put one frame on the bus; raises LinkFailure."""
+        """Put one frame on the bus; raises LinkError."""
         multicast = self._multicast
         datagram = written(frame) if multicast is not None else b""  # ready when the wire is free, as a controller's
         if self._pacer:
@@ -181,7 +181,7 @@ class Bus:
             self._failed("does not take a frame", error)
 
     def receive(self, seconds: float) -> Frame | None:
-        """Return the next data frame that another sent, None when there is none; raises LinkFailure (also bus-off).
+        """Return the next data frame that another sent, None when there is none; raises LinkError (also bus-off).
 
         Waits ``seconds`` at most, and returns None before for what is no such frame.
         """
@@ -277,12 +277,12 @@ class Bus:
         except (can.CanError, OSError, NotImplementedError):
             return
         if self.spec.interface == "socketcand" and _hung_up(self._bus):
-            raise LinkFailure(
+            raise LinkError(
                 f"The socketcand server closed the bus {self.spec.text}.", hint="Start it again, then repeat."
             )
 
     def _bus_off(self) -> NoReturn:
-        raise LinkFailure(
+        raise LinkError(
             f"The CAN controller of {self.spec.text} went bus-off: too many frame errors.",
             hint="Check wiring, termination (120 ohm at both ends) and the bit rate; then: "
             f"ip link set {self.spec.channel} type can restart.",
@@ -290,7 +290,7 @@ class Bus:
 
     def _failed(self, what: str, error: Exception) -> NoReturn:
         self._check_alive()
-        raise LinkFailure(
+        raise LinkError(
             f"The CAN bus {self.spec.text} {what}: {_reason(error)}.",
             hint="Check that the adapter is up and plugged in.",
         ) from error
@@ -307,7 +307,7 @@ def _open(spec: CanSpec) -> can.BusABC:
         bus = _opened(spec, options)
     except can.CanInterfaceNotImplementedError as error:
         known = f"python-can knows {', '.join(sorted(can.VALID_INTERFACES))}."
-        raise NoReader(
+        raise NoReaderError(
             f"Cannot use CAN interface {spec.interface!r} here: {_reason(error)}.",
             hint=_driver(spec.interface) or known,
         ) from error
@@ -328,14 +328,14 @@ def _open(spec: CanSpec) -> can.BusABC:
 
 
 def require_known(spec: CanSpec) -> None:
-    """Raise UsageFailure for a key that the interface does not have: python-can takes any, and says nothing."""
+    """Raise UsageError for a key that the interface does not have: python-can takes any, and says nothing."""
     if not spec.options:
         return
     known = known_keys(spec.interface)
     for key, _ in spec.options:
         if known and key not in known:
             own = ", ".join(sorted(known | {"node", "source", "pace", "fd"}))
-            raise UsageFailure(f"--can {spec.interface} has no key {key!r}.", hint=f"It has: {own}.")
+            raise UsageError(f"--can {spec.interface} has no key {key!r}.", hint=f"It has: {own}.")
 
 
 @functools.cache
@@ -378,25 +378,25 @@ def _options(spec: CanSpec) -> dict[str, Any]:
         options["fd"] = spec.fd
     if spec.interface == "socketcand":
         if spec.fd:
-            raise UsageFailure("socketcand carries classic CAN only.", hint="Remove fd=1.")
+            raise UsageError("socketcand carries classic CAN only.", hint="Remove fd=1.")
         options = {"host": "127.0.0.1", "port": _SOCKETCAND_PORT, "tcp_tune": True} | options
         _probe(spec, options)
     return options
 
 
-def _not_opened(spec: CanSpec, error: Exception) -> NoReader:
+def _not_opened(spec: CanSpec, error: Exception) -> NoReaderError:
     """Why a bus does not open, and the cure."""
     number = _number(error) if spec.interface == "socketcan" else None
     if number == errno.EAFNOSUPPORT:
-        return NoReader(
+        return NoReaderError(
             "This kernel has no CAN support.",
             hint="Load it (sudo modprobe can_raw), or go over the network: socketcand:can0?host=….",
         )
     if number == errno.ENODEV:
-        return NoReader(
+        return NoReaderError(
             f"There is no CAN interface {spec.channel}.", hint="To list the interfaces: ip -brief link show type can."
         )
-    return NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec))
+    return NoReaderError(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec))
 
 
 def _opened(spec: CanSpec, options: dict[str, Any]) -> can.BusABC:
@@ -444,7 +444,7 @@ def _probe(spec: CanSpec, options: dict[str, Any]) -> None:
     try:
         socket.create_connection((str(options["host"]), int(options["port"])), timeout=3).close()
     except (OSError, ValueError) as error:
-        raise NoReader(
+        raise NoReaderError(
             f"No socketcand server answers at {options['host']}:{options['port']} ({_reason(error)}).", hint=_cure(spec)
         ) from error
 
@@ -467,7 +467,7 @@ def _driver(interface: str) -> str:
     return f"Install it: {install_command(package)}" if package else f"It needs {library}." if library else ""
 
 
-def _unknown_key(spec: CanSpec, error: TypeError) -> UsageFailure:
+def _unknown_key(spec: CanSpec, error: TypeError) -> UsageError:
     """Why an interface does not take what stands behind the ``?``."""
     found = re.search(r"unexpected keyword argument '(\w+)'", str(error))
     missing = re.search(r"missing \d+ required [^:]*: (.+)", str(error))
@@ -475,7 +475,7 @@ def _unknown_key(spec: CanSpec, error: TypeError) -> UsageFailure:
         why = f"takes no {found[1]}="
     else:
         why = f"also needs {missing[1]}" if missing is not None else f"does not take these options: {_reason(error)}"
-    return UsageFailure(
+    return UsageError(
         f"The CAN interface {spec.interface} {why}.",
         hint="teds-provision's own options are bitrate, data_bitrate, fd, node, source and pace; any other goes"
         " to the interface.",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-from teds_provision.errors import AddressConflict, BadData, Garbled, NodeSilent, TedsProvisionError
+from teds_provision.errors import AddressConflictError, BadDataError, GarbledError, NodeSilentError, TedsProvisionError
 from teds_provision.links.can.isotp import FUNCTIONAL, Frame, single
 from teds_provision.links.can.link import conflict
 from teds_provision.links.can.shared import Asked, Gathering, SharedBus
@@ -19,7 +19,7 @@ LONGEST_SECONDS: Final = 3.0
 """A station listens until 300 ms of silence, 3 s at most (profile.md, "CAN")."""
 
 AskOne = Callable[[int], Identity | None]
-"""Ask one address who is there: None where nobody answers in a way that can be read; raises AddressConflict."""
+"""Ask one address who is there: None where nobody answers in a way that can be read; raises AddressConflictError."""
 
 
 @dataclass
@@ -58,7 +58,7 @@ def ask_all(
     """Send a functional Identify; yields each node as it answers, and at last all that was found.
 
     Ends after ``silence`` seconds without a frame of an answer, ``longest`` at most. What came torn stands under
-    ``conflicts`` or ``unfinished``: it may be two nodes, or a lost frame. Raises LinkFailure.
+    ``conflicts`` or ``unfinished``: it may be two nodes, or a lost frame. Raises LinkError.
     """
     fd = bus.spec.fd
     with bus.gather(transaction) as asked:
@@ -101,7 +101,7 @@ def settle(found: FunctionalAnswers, ask: AskOne, *, until: float) -> Functional
             continue
         try:
             identity = ask(address)
-        except AddressConflict:
+        except AddressConflictError:
             identities.pop(address, None)
             conflicts.add(address)
             continue
@@ -113,10 +113,10 @@ def settle(found: FunctionalAnswers, ask: AskOne, *, until: float) -> Functional
 
 
 def read_identity(reply: bytes) -> Identity:
-    """Read a reply frame to Identify; raises Garbled or BadData."""
+    """Read a reply frame to Identify; raises GarbledError or BadDataError."""
     answer = decode_reply(reply)
     if not answer.ok:
-        raise Garbled(
+        raise GarbledError(
             "The node refuses Identify, which no node is allowed to do.", hint="It does not follow the profile."
         )
     return Identity.decode(answer.payload)
@@ -128,9 +128,9 @@ def ask_one(ask: Callable[[bytes], bytes]) -> Identity | None:
     while torn < 2:
         try:
             return read_identity(ask(IDENTIFY.encode()))
-        except (NodeSilent, BadData):
+        except (NodeSilentError, BadDataError):
             return None
-        except Garbled:
+        except GarbledError:
             torn += 1
     return None
 

@@ -8,7 +8,14 @@ from contextlib import suppress
 from queue import Empty
 from typing import Final
 
-from teds_provision.errors import AddressConflict, BadData, Garbled, LinkFailure, NodeSilent, TooLongForNode
+from teds_provision.errors import (
+    AddressConflictError,
+    BadDataError,
+    GarbledError,
+    LinkError,
+    MessageTooLongError,
+    NodeSilentError,
+)
 from teds_provision.links.can.isotp import (
     FUNCTIONAL,
     OVERFLOW,
@@ -47,15 +54,15 @@ _LONGEST_TRY: Final = 120.0
 """Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
 
 
-def conflict(node: int) -> AddressConflict:
+def conflict(node: int) -> AddressConflictError:
     """The error for two nodes under one address."""
-    return AddressConflict(
+    return AddressConflictError(
         f"Two nodes answer at CAN address 0x{node:02X}.",
         hint="Tap one of them, or connect it alone, then run: teds-provision address UUID NEW.",
     )
 
 
-class _Answered(Exception):
+class _EarlyReplyError(Exception):
     """The reply came as a single frame in place of a flow control: most of the request was not sent."""
 
     def __init__(self, reply: tuple[bytes, float]) -> None:
@@ -63,7 +70,7 @@ class _Answered(Exception):
         self.reply = reply
 
 
-class _NoFlow(Exception):
+class _NoFlowControlError(Exception):
     """The node did not take up our first frame, or a block; ``begun`` says whether it took up anything."""
 
     def __init__(self, *, begun: bool) -> None:
@@ -137,7 +144,7 @@ class CanLink:
         try:
             reply = decode_reply(link.ask(IDENTIFY.encode(), tries=1, seconds=_HELLO_SECONDS))
             return Identity.decode(reply.payload)
-        except (NodeSilent, Garbled, BadData):
+        except (NodeSilentError, GarbledError, BadDataError):
             return None
 
     def begin(self, octets: int) -> bytes:
@@ -170,7 +177,7 @@ class CanLink:
                 exchange = _Exchange(bus, line, body, tries, seconds, prompt=prompt, hopeless=self.hopeless)
                 self.left = self.left or time.monotonic()
                 reply, self.came = exchange.run()
-        except LinkFailure as failure:
+        except LinkError as failure:
             if bus.rivals.seen() and not bus.failed:
                 raise type(failure)(f"{failure.message} {bus.rivals.text}", hint=bus.rivals.hint) from failure
             raise
@@ -203,7 +210,7 @@ class _Exchange:
     def run(self) -> tuple[bytes, float]:
         """Return the whole reply, transaction first, and when it was whole (time.monotonic).
 
-        Raises NodeSilent, Garbled, AddressConflict, LinkFailure.
+        Raises NodeSilentError, GarbledError, AddressConflictError, LinkError.
         """
         began = time.monotonic()
         whole = refused = 0
@@ -211,13 +218,13 @@ class _Exchange:
             try:
                 seconds = _FLOW_SECONDS[min(refused, len(_FLOW_SECONDS) - 1)]
                 self._send(min(seconds, self._seconds * _PROMPT_SHARES[0]) if self._prompt else seconds)
-            except _Answered as answered:
+            except _EarlyReplyError as answered:
                 busy = answered.reply[0][1:] == _BUSY and not self._prompt
                 if not busy or time.monotonic() - began >= BUSY_SECONDS:
                     return answered.reply
                 time.sleep(BUSY_PAUSE)  # it cannot take a long request now; the same octets again, no repetition
                 continue
-            except _NoFlow as lost:
+            except _NoFlowControlError as lost:
                 refused += 1
                 if lost.begun:
                     self._bus.note_loss()
@@ -249,7 +256,10 @@ class _Exchange:
         return self._tries > 1 and (refused < self._tries or passed < self._seconds)
 
     def _send(self, patience: float) -> None:
-        """Send the request; raises _NoFlow where the node does not take it up, Garbled where it is too long for it."""
+        """Send the request.
+
+        Raises _NoFlowControlError if the node does not take it up, GarbledError if it is too long for it.
+        """
         if len(self._body) <= (62 if self._fd else 7):
             self._put(single(self._body, fd=self._fd))
             return
@@ -286,10 +296,10 @@ class _Exchange:
                 with suppress(Empty):
                     event = self._line.events.get_nowait()
                     if event.kind == "whole":
-                        raise _Answered((event.body, event.at))
+                        raise _EarlyReplyError((event.body, event.at))
                 continue
             if data[0] == OVERFLOW:
-                raise TooLongForNode(
+                raise MessageTooLongError(
                     f"The node at 0x{self._line.node:02X} refuses {len(self._body)} octets (flow control: overflow).",
                     hint="It announces a longer maxMessage than it can handle.",
                 )
@@ -297,7 +307,7 @@ class _Exchange:
                 until = time.monotonic() + 1.0
             elif data[0] & 0xF == 0:
                 return data[1], gap_seconds(data[2])
-        raise _NoFlow(begun=begun)
+        raise _NoFlowControlError(begun=begun)
 
     def _put(self, data: bytes) -> None:
         self._bus.send(Frame(physical_id(self._line.node, self._line.own), data, self._fd))
@@ -335,12 +345,12 @@ class _Exchange:
                         return None
         return None
 
-    def _failed(self) -> LinkFailure:
+    def _failed(self) -> LinkError:
         where = f"The node at 0x{self._line.node:02X} on {self._bus.spec.text}"
         if self._clash or self._bus.clash(self._line.node):
             return conflict(self._line.node)
         if self._torn:
-            return Garbled(
+            return GarbledError(
                 f"{where} answers, but frames of its replies are missing.", hint="Check wiring, bit rate, bus load."
             )
-        return NodeSilent(f"{where} no longer answers.", hint="Check its power, its wiring and its address.")
+        return NodeSilentError(f"{where} no longer answers.", hint="Check its power, its wiring and its address.")

@@ -11,7 +11,7 @@ from functools import partial
 from shlex import quote
 from typing import Final
 
-from teds_provision.errors import LinkFailure, NoNode
+from teds_provision.errors import LinkError, NoNodeError
 from teds_provision.links.can.arrivals import Arrivals
 from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.finding import (
@@ -46,7 +46,7 @@ _REOPEN_SECONDS: Final = 1.0
 
 
 def open_port(where: str, trace: Trace | None = None) -> CanPort:
-    """Open the bus that ``where`` names, as ``--can`` does; raises NoReader, UsageFailure."""
+    """Open the bus that ``where`` names, as ``--can`` does; raises NoReaderError, UsageError."""
     return CanPort(where, trace)
 
 
@@ -89,7 +89,7 @@ class CanPort:
         return self.bus().listen(wanted)
 
     def send(self, frame: Frame) -> None:
-        """Put one frame on the bus (trigger, Drive); raises LinkFailure."""
+        """Put one frame on the bus (trigger, Drive); raises LinkError."""
         self.bus().send(frame)
 
     def link(self, address: int) -> CanLink:
@@ -112,7 +112,7 @@ class CanPort:
     def identify(
         self, address: int, *, seconds: float = _HELLO_SECONDS, until_announced: bool = False
     ) -> Identity | None:
-        """Ask one address who is there; None for nobody. Raises AddressConflict, LinkFailure.
+        """Ask one address who is there; None for nobody. Raises AddressConflictError, LinkError.
 
         ``until_announced``: given up when something announces itself there, as it has not heard the question; whoever
         asks it because of its Announce need not wait for this one.
@@ -129,8 +129,8 @@ class CanPort:
     ) -> Contact:
         """Return the node for which ``wanted`` holds: at ``address`` or ``node=``, else whichever answers first.
 
-        Raises NoNode after ``seconds``, AddressConflict when two nodes answer under one address and the wanted one is
-        not found elsewhere, LinkFailure when the bus fails.
+        Raises NoNodeError after ``seconds``, AddressConflictError when two nodes answer under one address and the
+        wanted one is not found elsewhere, LinkError when the bus fails.
         """
         until = time.monotonic() + seconds
         told: set[bytes] = set()
@@ -152,10 +152,10 @@ class CanPort:
             time.sleep(max(0.0, round_ends - time.monotonic()))
         raise self._nobody(seconds, told)
 
-    def _nobody(self, seconds: float, told: set[bytes]) -> NoNode:
+    def _nobody(self, seconds: float, told: set[bytes]) -> NoNodeError:
         where = f"at 0x{self.spec.node:02X} on {self.spec.text}" if self.spec.node else f"on {self.spec.text}"
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
-        return NoNode(
+        return NoNodeError(
             f"The node did not answer {where} within {seconds:g} s{others}.",
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
             " nodes that answer.",
@@ -166,8 +166,8 @@ class CanPort:
 
         Listens until 300 ms of silence, 3 s at most, and asks by itself each address whose answer was torn; what
         remains unclear is told through ``notice``. With ``listen`` everyone is asked again and again so long, and has
-        1.5 s for each answer: a node may be busy with another station, or about to start. Raises NoNode after
-        ``seconds``, AddressConflict, LinkFailure.
+        1.5 s for each answer: a node may be busy with another station, or about to start. Raises NoNodeError after
+        ``seconds``, AddressConflictError, LinkError.
         """
         began = time.monotonic()
         until, enough = began + seconds, began + min(listen, seconds)
@@ -189,7 +189,7 @@ class CanPort:
         if found.identities:
             return [self._contact(node, identity) for node, identity in sorted(found.identities.items())]
         if self.spec.node is None:
-            raise NoNode(
+            raise NoNodeError(
                 f"No node answered on {self.spec.text} within {seconds:g} s.",
                 hint="Check the nodes' power, the wiring, both terminators and the bit rate; to test the adapter:"
                 f" teds-provision doctor --can {quote(self.spec.text)}",
@@ -254,7 +254,7 @@ class CanPort:
                     lost = False
                     notice(Notice("reader-ready", f"The bus {self.spec.text} is back."))
                 arrivals.pause(stop)
-            except LinkFailure as error:
+            except LinkError as error:
                 arrivals.lost()
                 if not lost:
                     lost = True

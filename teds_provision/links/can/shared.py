@@ -20,7 +20,7 @@ from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Final, TypeVar
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.isotp import (
     CONTINUE,
@@ -57,7 +57,7 @@ class BusReader:
     """
 
     def __init__(
-        self, bus: Bus, take: Callable[[Frame], None], failed: Callable[[LinkFailure], None], woken: socket.socket
+        self, bus: Bus, take: Callable[[Frame], None], failed: Callable[[LinkError], None], woken: socket.socket
     ) -> None:
         self._bus, self._take, self._failed, self._woken = bus, take, failed, woken
         self._turn = threading.Lock()
@@ -138,7 +138,7 @@ class BusReader:
         """Whether there was a frame."""
         try:
             frame = self._bus.receive(seconds)
-        except LinkFailure as failure:
+        except LinkError as failure:
             self._over = True
             self._failed(failure)
             return False
@@ -311,7 +311,7 @@ class Listener:
         self.lost = 0
 
     def get(self, seconds: float | None = None) -> Frame | None:
-        """The next frame, None after ``seconds``; raises LinkFailure once the bus has failed and all is read."""
+        """The next frame, None after ``seconds``; raises LinkError once the bus has failed and all is read."""
         try:
             frame = self._frames.get(timeout=None if seconds is None else max(0.0, seconds))
         except Empty:
@@ -435,7 +435,7 @@ class SharedBus:
         self.spec = bus.spec
         self.own = bus.spec.source
         self.rivals = Rivals(self.own)
-        self._failure: LinkFailure | None = None
+        self._failure: LinkError | None = None
         self._listeners: tuple[Listener, ...] = ()
         self._asked: tuple[Asked, ...] = ()
         self._lines: dict[tuple[int, int], AddressPair] = {}
@@ -461,7 +461,7 @@ class SharedBus:
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2)
         self._bus.close()
-        self._fail(LinkFailure(f"The bus {self.spec.text} was closed."))
+        self._fail(LinkError(f"The bus {self.spec.text} was closed."))
         self._wake.close()
         self._woken.close()
 
@@ -485,7 +485,7 @@ class SharedBus:
         self._lost_at = time.monotonic()
 
     def check(self) -> None:
-        """Raise the LinkFailure that the bus met, if any."""
+        """Raise the LinkError that the bus met, if any."""
         if self._failure is not None:
             raise self._failure
 
@@ -494,7 +494,7 @@ class SharedBus:
         return self._reading.wait_for(queue, seconds)
 
     def send(self, frame: Frame) -> None:
-        """Put one frame on the bus; raises LinkFailure."""
+        """Put one frame on the bus; raises LinkError."""
         self.check()
         with self._sending:
             self._bus.send(frame)
@@ -545,7 +545,7 @@ class SharedBus:
 
     # -- the loop, and what runs in it -----------------------------------------------------------------------------
 
-    def _fail(self, failure: LinkFailure) -> None:
+    def _fail(self, failure: LinkError) -> None:
         self._failure = self._failure or failure
         with self._lock:
             listeners, asked, lines = self._listeners, self._asked, list(self._lines.values())

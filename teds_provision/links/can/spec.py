@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Final
 from urllib.parse import unquote
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 
 FIRST_STATION: Final = 0xF1
 LAST_STATION: Final = 0xF7
@@ -65,7 +65,7 @@ class CanSpec:
 
 
 def parse_spec(text: str) -> CanSpec:
-    """Read the ``--can`` option; raises UsageFailure that names the part which is wrong.
+    """Read the ``--can`` option; raises UsageError that names the part which is wrong.
 
     The interface ends at the first colon, so that an IPv6 multicast group may be a channel. ``bitrate`` and
     ``data_bitrate`` are used here and passed on as well.
@@ -73,7 +73,7 @@ def parse_spec(text: str) -> CanSpec:
     place, _, query = text.partition("?")
     interface, colon, channel = place.partition(":")
     if not interface.isidentifier() or not colon or not channel:
-        raise UsageFailure(f"--can {text!r} does not name an interface and a channel.", hint=_HINT)
+        raise UsageError(f"--can {text!r} does not name an interface and a channel.", hint=_HINT)
     values = _pairs(query)
     fd = _flag(values, "fd")
     pace = _flag(values, "pace")
@@ -103,9 +103,9 @@ def _pairs(query: str) -> dict[str, str]:
     for part in query.split("&") if query else []:
         key, equals, value = part.partition("=")
         if not equals or not key.isidentifier() or key in _RESERVED:
-            raise UsageFailure(f"--can has an option {part!r} that is not of the form key=value.", hint=_HINT)
+            raise UsageError(f"--can has an option {part!r} that is not of the form key=value.", hint=_HINT)
         if key in values:
-            raise UsageFailure(f"--can names {key} twice.", hint="Give each option once.")
+            raise UsageError(f"--can names {key} twice.", hint="Give each option once.")
         values[key] = unquote(value)
     return values
 
@@ -113,7 +113,7 @@ def _pairs(query: str) -> dict[str, str]:
 def _flag(values: dict[str, str], key: str) -> bool:
     value = values.pop(key, "0").lower()
     if value not in _TRUE | _FALSE:
-        raise UsageFailure(f"--can {key}={value!r} is neither 1 nor 0.", hint=f"Write {key}=1 or omit it.")
+        raise UsageError(f"--can {key}={value!r} is neither 1 nor 0.", hint=f"Write {key}=1 or omit it.")
     return value in _TRUE
 
 
@@ -125,7 +125,7 @@ def _number(values: dict[str, str], key: str, least: int, most: int) -> int | No
     number = _guess(value)
     if not isinstance(number, int) or not least <= number <= most:
         bounds = f"0x{least:02X} to 0x{most:02X}" if most <= 0xFF else f"{least} to {most}"
-        raise UsageFailure(
+        raise UsageError(
             f"--can {key}={value!r} is not a whole number from {bounds}.", hint=f"Write, for example, {key}={least:#x}."
         )
     return number

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 
 WELL_KNOWN, EXTERNAL = 1, 4
 _NAMES = ("empty", "urn:nfc:wkt:", "", "", "urn:nfc:ext:", "unknown", "unchanged", "reserved")
@@ -53,7 +53,7 @@ def encode(records: Sequence[NdefRecord]) -> bytes:
 def decode(octets: bytes) -> tuple[NdefRecord, ...]:
     """Split an NDEF message into its records, chunks put together; an empty message gives none.
 
-    Raises Garbled when the framing is broken: begin or end mark missing, a record longer than the message, octets
+    Raises GarbledError when the framing is broken: begin or end mark missing, a record longer than the message, octets
     left over, chunks out of order.
     """
     records: list[NdefRecord] = []
@@ -62,18 +62,18 @@ def decode(octets: bytes) -> tuple[NdefRecord, ...]:
     while not ended:
         flags, record, at = _record(octets, at)
         if bool(flags & 0x80) != (not records and chunk is None):
-            raise Garbled("The NDEF message has no valid beginning.")
+            raise GarbledError("The NDEF message has no valid beginning.")
         ended = bool(flags & 0x40)
         # a record goes on with a chunk where one is open, and only there
         if (chunk is not None) != (record.tnf == 6) or (chunk is not None and record.type):
-            raise Garbled("The NDEF message has a chunk out of order.")
+            raise GarbledError("The NDEF message has a chunk out of order.")
         if chunk is not None:
             record = NdefRecord(chunk.tnf, chunk.type, chunk.payload + record.payload, chunk.id)
         chunk = record if flags & 0x20 else None
         if chunk is None:
             records.append(record)
     if chunk is not None or at != len(octets):
-        raise Garbled("The NDEF message has no valid end.")
+        raise GarbledError("The NDEF message has no valid end.")
     return tuple(records)
 
 
@@ -85,11 +85,11 @@ def _record(octets: bytes, at: int) -> tuple[int, NdefRecord, int]:
         size = int.from_bytes(octets[at + 2 : at + 2 + wide], "big")
         id_octets = octets[at + 2 + wide] if flags & 0x08 else 0
     except IndexError:
-        raise Garbled("The NDEF message is cut off.") from None
+        raise GarbledError("The NDEF message is cut off.") from None
     start = at + 2 + wide + (1 if flags & 0x08 else 0)
     end = start + type_octets + id_octets + size
     if end > len(octets):
-        raise Garbled("The NDEF message is cut off.")
+        raise GarbledError("The NDEF message is cut off.")
     kind = octets[start : start + type_octets]
     ident = octets[start + type_octets : start + type_octets + id_octets]
     return flags, NdefRecord(flags & 7, bytes(kind), bytes(octets[end - size : end]), bytes(ident)), end

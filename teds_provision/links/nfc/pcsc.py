@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.lazy import how_to_install
 from teds_provision.links.nfc.nfcpy import Quiet, Type2TagCommandError, Type4ATag, nfc
-from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, Type2, Type4Ndef
+from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, ReaderTag, Type2, Type4Ndef
 from teds_provision.links.ports import Trace
 
 PREFIX: Final = "pcsc"
@@ -28,7 +28,7 @@ def _scard() -> Any:
     try:
         import smartcard.scard
     except ImportError as error:
-        raise NoReader(
+        raise NoReaderError(
             "PC/SC readers need the package pyscard, which is not installed.",
             hint=f"{how_to_install('pcsc')} (it is built: sudo apt install swig libpcsclite-dev first).",
         ) from error
@@ -38,7 +38,7 @@ def _scard() -> Any:
 def _context(scard: Any) -> Any:
     result, context = scard.SCardEstablishContext(scard.SCARD_SCOPE_USER)
     if result != scard.SCARD_S_SUCCESS:
-        raise NoReader(
+        raise NoReaderError(
             f"The PC/SC service does not answer: {_error_text(scard, result)}.",
             hint="sudo apt install pcscd; sudo systemctl start pcscd.socket. Over ssh polkit may refuse; run as root.",
         )
@@ -46,7 +46,7 @@ def _context(scard: Any) -> Any:
 
 
 def names() -> list[str]:
-    """Names of all PC/SC readers; raises NoReader where the service or the library is missing."""
+    """Names of all PC/SC readers; raises NoReaderError where the service or the library is missing."""
     scard = _scard()
     context = _context(scard)
     try:
@@ -60,7 +60,7 @@ def names_if_any() -> list[str]:
     """As :func:`names`, empty where there is no PC/SC here."""
     try:
         return contactless(names())
-    except NoReader:
+    except NoReaderError:
         return []
 
 
@@ -81,7 +81,7 @@ class PcscReader:
         self._card: _Card | None = None
 
     def sense(self) -> ReaderTag | None:
-        """Connect to what lies on the reader, field off and on before; None for nothing. Raises ReaderLost."""
+        """Connect to what lies on the reader, field off and on before; None for nothing. Raises ReaderLostError."""
         self._disconnect()
         scard = self._scard
         result, handle, protocol = scard.SCardConnect(
@@ -91,15 +91,15 @@ class PcscReader:
             scard.SCARD_PROTOCOL_T0 | scard.SCARD_PROTOCOL_T1,
         )
         if result in _gone(scard):
-            raise ReaderLost(_error_text(scard, result))
+            raise ReaderLostError(_error_text(scard, result))
         if result == scard.SCARD_E_SHARING_VIOLATION:
-            raise ReaderLost("another program holds it")
+            raise ReaderLostError("another program holds it")
         if result != scard.SCARD_S_SUCCESS:
             return None
         self._card = card = _Card(scard, handle, protocol, self._trace)
         try:
             return _tag(card)
-        except FieldLost:
+        except FieldLostError:
             return None
 
     def close(self) -> None:
@@ -123,10 +123,10 @@ def _chosen(wanted: str) -> str:
         return fitting[0]
     listed = ", ".join(fitting or found)
     if fitting:
-        raise UsageFailure(
+        raise UsageError(
             f"{len(fitting)} PC/SC readers fit: {listed}.", hint="Name one: --nfc 'pcsc:PART OF ITS NAME'."
         )
-    raise NoReader(
+    raise NoReaderError(
         f"No PC/SC reader {wanted!r} is there; there are: {listed}." if found else "No PC/SC reader is plugged in.",
         hint="Plug it in; pcsc_scan (package pcsc-tools) lists the readers of pcscd.",
     )
@@ -172,18 +172,18 @@ class _Card:
         """Answer to reset, which the reader makes up for a card without contacts."""
         result, _, _, _, atr = self._scard.SCardStatus(self.handle)
         if result != self._scard.SCARD_S_SUCCESS:
-            raise FieldLost
+            raise FieldLostError
         return bytes(atr)
 
     def transmit(self, apdu: bytes) -> bytes:
-        """Exchange one APDU, status word last; raises FieldLost, ReaderLost."""
+        """Exchange one APDU, status word last; raises FieldLostError, ReaderLostError."""
         if self._trace is not None:
             self._trace.frame("pcsc", "out", apdu)
         result, answer = self._scard.SCardTransmit(self.handle, self._protocol, list(apdu))
         if result in _gone(self._scard):
-            raise ReaderLost(_error_text(self._scard, result))
+            raise ReaderLostError(_error_text(self._scard, result))
         if result != self._scard.SCARD_S_SUCCESS or len(answer) < 2:
-            raise FieldLost
+            raise FieldLostError
         if self._trace is not None:
             self._trace.frame("pcsc", "in", bytes(answer))
         return bytes(answer)
@@ -222,7 +222,7 @@ class _PcscType4(Quiet, Type4ATag):  # type: ignore[misc]
         self._extended_length_support = False
 
     def _is_present(self) -> bool:
-        self._dep.exchange(None)  # raises FieldLost where it is not
+        self._dep.exchange(None)  # raises FieldLostError where it is not
         return True
 
 

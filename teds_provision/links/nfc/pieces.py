@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 from teds_provision.links.nfc.tnep import TIM_TYPE
 
 _HEAD = struct.Struct(">BBHHH")
@@ -43,17 +43,17 @@ class Piece:
 
     @classmethod
     def decode(cls, payload: bytes) -> Piece:
-        """Read the payload of the record; raises Garbled when it is torn, corrupt or does not add up."""
+        """Read the payload of the record; raises GarbledError when it is torn, corrupt or does not add up."""
         if len(payload) < _PIECE_HEAD:
-            raise Garbled(f"A payload record needs at least {_PIECE_HEAD} octets; this one has {len(payload)}.")
+            raise GarbledError(f"A payload record needs at least {_PIECE_HEAD} octets; this one has {len(payload)}.")
         version, flags, transaction, total, offset = _HEAD.unpack_from(payload)
         if version != 1:
-            raise Garbled(f"Received a payload record of version {version}; this program supports version 1.")
+            raise GarbledError(f"Received a payload record of version {version}; this program supports version 1.")
         body = bytes(payload[_PIECE_HEAD:])
         if zlib.crc32(payload[: _HEAD.size] + body) != int.from_bytes(payload[_HEAD.size : _PIECE_HEAD], "big"):
-            raise Garbled("A payload record is damaged: its CRC-32 does not match.")
+            raise GarbledError("A payload record is damaged: its CRC-32 does not match.")
         if body and offset + len(body) > total:
-            raise Garbled(f"A payload record ends at {offset + len(body)} of {total} octets.")
+            raise GarbledError(f"A payload record ends at {offset + len(body)} of {total} octets.")
         return cls(transaction, total, offset, body, bool(flags & _ANSWER), bool(flags & _MORE))
 
 
@@ -104,7 +104,7 @@ class Requester:
     def take(self, piece: Piece) -> bool:
         """Take in what the node wrote; False when it is not an answer of this transaction and must be dropped.
 
-        Raises Garbled when the pieces do not fit together.
+        Raises GarbledError when the pieces do not fit together.
         """
         if not piece.answer or piece.transaction != self._transaction:
             return False
@@ -112,19 +112,21 @@ class Requester:
             self._take_reply(piece)
         elif self._total is None:
             if piece.offset > len(self._frame):
-                raise Garbled(f"The node holds {piece.offset} octets of a command of {len(self._frame)}.")
+                raise GarbledError(f"The node holds {piece.offset} octets of a command of {len(self._frame)}.")
             self._held = piece.offset
         return True
 
     def _take_reply(self, piece: Piece) -> None:
         if piece.total > LONGEST_FRAME:
-            raise Garbled(f"The node announces a reply of {piece.total} octets; at most {LONGEST_FRAME} are allowed.")
+            raise GarbledError(
+                f"The node announces a reply of {piece.total} octets; at most {LONGEST_FRAME} are allowed."
+            )
         if self._total is None:
             self._total = piece.total
         if piece.total != self._total:
-            raise Garbled(f"The reply had {self._total} octets and now has {piece.total}.")
+            raise GarbledError(f"The reply had {self._total} octets and now has {piece.total}.")
         if piece.offset > len(self._reply):
-            raise Garbled(f"The reply goes on at octet {piece.offset}, after {len(self._reply)}.")
+            raise GarbledError(f"The reply goes on at octet {piece.offset}, after {len(self._reply)}.")
         if piece.offset == len(self._reply):
             self._reply += piece.body
 
@@ -148,9 +150,12 @@ class Responder:
         self._reply = b""
 
     def answer(self, piece: Piece, room_octets: int) -> Piece:
-        """Return the record that answers ``piece``, its body at most ``room_octets``; raises Garbled for an answer."""
+        """Return the record that answers ``piece``, its body at most ``room_octets``.
+
+        Raises GarbledError for an answer.
+        """
         if piece.answer:
-            raise Garbled("A station sent a record that is marked as an answer.")
+            raise GarbledError("A station sent a record that is marked as an answer.")
         if not piece.body:
             if piece.transaction == self._answered:
                 return self._part(piece.offset, room_octets)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from teds_provision.errors import Garbled, NodeSilent
+from teds_provision.errors import GarbledError, NodeSilentError
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.links.nfc.pieces import Piece, Requester, room
@@ -22,7 +22,10 @@ STATUS_OCTETS = len(message.encode([tnep.status(0)]))
 
 
 class Mailbox(Protocol):
-    """An NDEF message on a tag. Both methods raise NodeSilent when the tag is gone, Garbled when it is unreadable."""
+    """An NDEF message on a tag.
+
+    Both methods raise NodeSilentError when the tag is gone, GarbledError when it is unreadable.
+    """
 
     def read(self) -> bytes:
         """Return the message as it is now, empty when the tag has none."""
@@ -51,11 +54,12 @@ class Poller:
     def transact(self, transaction: int, frame: bytes) -> bytes:
         """Send one command frame and return its reply frame.
 
-        Raises NodeSilent when no answer came in time, Garbled when the node's messages stay unreadable or do not fit.
+        Raises NodeSilentError when no answer came in time, GarbledError when the node's messages stay unreadable or do
+        not fit.
         """
         octets = room(self._service.max_ndef)
         if room(self._service.max_ndef, STATUS_OCTETS) < 1:
-            raise Garbled(
+            raise GarbledError(
                 f"The node takes NDEF messages of at most {self._service.max_ndef} octets, too short for the profile."
             )
         if not self._selected:
@@ -65,9 +69,9 @@ class Poller:
         steps, end = 0, self._clock() + LONGEST
         while (reply := requester.reply) is None:
             if steps > requester.steps_allowed:
-                raise Garbled("The node keeps asking for the same pieces.")
+                raise GarbledError("The node keeps asking for the same pieces.")
             if self._clock() > end:
-                raise NodeSilent(f"The node did not finish its reply within {LONGEST:.0f} s.")
+                raise NodeSilentError(f"The node did not finish its reply within {LONGEST:.0f} s.")
             steps += 1
             request = message.encode([tnep.payload_record(requester.next().encode())])
             self._exchange(request, lambda records: _take(records, requester))
@@ -86,7 +90,7 @@ class Poller:
     def _exchange(self, octets: bytes, take: Callable[[Sequence[NdefRecord]], bool]) -> None:
         """Write ``octets`` and read until ``take`` accepts an answer; our own message still there is "not yet"."""
         if len(octets) > self._service.max_ndef:
-            raise Garbled(f"The node takes NDEF messages of at most {self._service.max_ndef} octets.")
+            raise GarbledError(f"The node takes NDEF messages of at most {self._service.max_ndef} octets.")
         self._mailbox.write(octets)
         interval = t_wait = self._service.t_wait
         patience = max(PATIENCE, min((self._service.n_wait + 1) * t_wait, 3 * PATIENCE))
@@ -98,13 +102,13 @@ class Poller:
                 answer = self._mailbox.read()
                 if answer and answer != octets and take(_successful(message.decode(answer))):
                     return
-            except Garbled:
+            except GarbledError:
                 torn += 1
                 if torn > _REREADS:
                     raise
             left = until - self._clock()
             if left <= 0:
-                raise NodeSilent(
+                raise NodeSilentError(
                     f"The node did not answer within {patience:.0f} s.", hint="Leave it on the reader and try again."
                 )
             if reads > self._service.n_wait:
@@ -115,14 +119,14 @@ class Poller:
 def _take(records: Sequence[NdefRecord], requester: Requester) -> bool:
     payload = tnep.external(records, tnep.TIM_TYPE)
     if payload is None:
-        raise Garbled("The node answered without a payload record.")
+        raise GarbledError("The node answered without a payload record.")
     return requester.take(Piece.decode(payload))
 
 
 def _successful(records: Sequence[NdefRecord]) -> Sequence[NdefRecord]:
     code = tnep.status_of(records)
     if code is None:
-        raise Garbled("The node answered without a TNEP status.")
+        raise GarbledError("The node answered without a TNEP status.")
     if code != tnep.SUCCESS:
-        raise Garbled(f"The node answered with TNEP status 0x{code:02X}.")
+        raise GarbledError(f"The node answered with TNEP status 0x{code:02X}.")
     return records

@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeGuard
 
-from teds_provision.errors import BadData, Garbled, LinkFailure, NodeSilent, NoNode, NoReader
+from teds_provision.errors import BadDataError, GarbledError, LinkError, NodeSilentError, NoNodeError, NoReaderError
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.links.nfc import hints, message, tnep
 from teds_provision.links.nfc.message import NdefRecord
 from teds_provision.links.nfc.pcsc import PcscReader
 from teds_provision.links.nfc.poller import Poller
 from teds_provision.links.nfc.reader import AUTO, Reader, open_reader
-from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag
+from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, ReaderTag
 from teds_provision.links.ports import NFC, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
 
@@ -46,10 +46,10 @@ class Foreign:
 
 
 def look(tag: ReaderTag) -> NodeInField | Foreign:
-    """Read the initial message and say what the tag is; raises FieldLost and ReaderLost."""
+    """Read the initial message and say what the tag is; raises FieldLostError and ReaderLostError."""
     try:
         records = message.decode(tag.read())
-    except Garbled as error:
+    except GarbledError as error:
         return Foreign(tag, _described(tag, error.message))
     service = tnep.our_service(records)
     if service is None:
@@ -59,7 +59,7 @@ def look(tag: ReaderTag) -> NodeInField | Foreign:
         return Foreign(tag, _described(tag, "It offers the service but gives no UUID (no id record)."))
     try:
         identity = Identity.decode(payload)
-    except BadData as error:
+    except BadDataError as error:
         return Foreign(tag, _described(tag, error.message))
     return NodeInField(tag, service, identity, hints.charging(records), hints.ble_address(records))
 
@@ -86,7 +86,7 @@ _LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
 def open_port(where: str, trace: Trace | None = None) -> NfcPort:
     """Open the reader that ``where`` names, as ``--nfc`` does; empty or ``auto``: the one that is there.
 
-    Raises NoReader, UsageFailure.
+    Raises NoReaderError, UsageError.
     """
     return NfcPort(where or AUTO, trace)
 
@@ -94,8 +94,8 @@ def open_port(where: str, trace: Trace | None = None) -> NfcPort:
 class NfcPort:
     """A reader, on which nodes are found by tapping them. One tap at a time: calls from several threads take turns.
 
-    ``path`` is ``udp:localhost:PORT``, a path of nfcpy, or ``auto``. Raises NoReader when the reader cannot be opened,
-    UsageFailure where ``auto`` finds several.
+    ``path`` is ``udp:localhost:PORT``, a path of nfcpy, or ``auto``. Raises NoReaderError when the reader cannot be
+    opened, UsageError where ``auto`` finds several.
     """
 
     def __init__(self, path: str, trace: Trace | None = None) -> None:
@@ -125,7 +125,8 @@ class NfcPort:
         """Wait for the tap of a node for which ``wanted`` is true.
 
         Tags that are no nodes and nodes that are not wanted are named once through ``notice`` and waited past.
-        Raises NoNode after ``seconds``, NoReader when the reader is gone by then. ``address`` is of no use here.
+        Raises NoNodeError after ``seconds``, NoReaderError when the reader is gone by then. ``address`` is of no use
+        here.
         """
         until, told, never = time.monotonic() + seconds, "", threading.Event()
         waiting = False
@@ -143,13 +144,13 @@ class NfcPort:
                 notice(Notice("waiting", f"Place the node on the reader{self._named}.", left))
             time.sleep(_PAUSE)
         if self._reader is None:
-            raise NoReader("The reader was unplugged.", hint="Plug it in again.")
+            raise NoReaderError("The reader was unplugged.", hint="Plug it in again.")
         if isinstance(seen, NodeInField):
-            raise NoNode(
+            raise NoNodeError(
                 f"Node {seen.identity.uuid.hex()} is on the reader, but another node was requested.",
                 hint="Place the requested node on the reader, or name the one that is on it.",
             )
-        raise NoNode(
+        raise NoNodeError(
             f"No node was placed on the reader within {seconds:.0f} s.",
             hint="Place the node's NFC antenna flat on the reader, or allow more time with --timeout.",
         )
@@ -211,26 +212,29 @@ class NfcPort:
         return self._transaction
 
     def back(self, uuid: bytes, seconds: float) -> NodeInField:
-        """Activate the node ``uuid`` anew; raises NodeSilent when it, or any node, is not there within ``seconds``."""
+        """Activate the node ``uuid`` anew.
+
+        Raises NodeSilentError when it, or any node, is not there within ``seconds``.
+        """
         until = time.monotonic() + seconds
         while True:
             try:
                 seen = self._sense_and_look()
-            except FieldLost:
+            except FieldLostError:
                 seen = None
             if isinstance(seen, NodeInField) and seen.identity.uuid == uuid:
                 return seen
             if isinstance(seen, NodeInField):
-                raise NodeSilent(
+                raise NodeSilentError(
                     f"The node was removed; another one ({seen.identity.uuid.hex()}) is on the reader now.",
                     hint=f"Put node {uuid.hex()} back and run the command again.",
                 )
             if time.monotonic() > until:
-                raise FieldLost
+                raise FieldLostError
             time.sleep(_PAUSE)
 
     def reopen(self) -> None:
-        """Open the reader again after it failed; raises NoReader when it is gone."""
+        """Open the reader again after it failed; raises NoReaderError when it is gone."""
         with self.turn:
             if self._reader is None:
                 self._reader = open_reader(self._again, self.trace)
@@ -252,9 +256,9 @@ class NfcPort:
                     self._lost = False
                     notice(Notice("reader-ready", f"The reader is back: {self._reader.name}."))
                 return self._sense_and_look()
-        except FieldLost:
+        except FieldLostError:
             return None
-        except NoReader as error:
+        except NoReaderError as error:
             self.lose_reader()
             self._failures += 1
             if self._failures == 1 and not self._lost:
@@ -268,7 +272,7 @@ class NfcPort:
     def _sense_and_look(self) -> NodeInField | Foreign | None:
         with self.turn:
             if self._reader is None:
-                raise ReaderLost("it was closed")
+                raise ReaderLostError("it was closed")
             tag = self._reader.sense()
             self._failures = 0
             return None if tag is None else look(tag)
@@ -281,7 +285,7 @@ class NfcPort:
                 with self.turn:
                     if self._reader is None or not seen.tag.is_present:
                         return
-            except ReaderLost:
+            except ReaderLostError:
                 return  # the next look finds out and says so
             stop.wait(_SHORT_PAUSE)
 
@@ -319,7 +323,7 @@ class NfcLink:
 
         A transaction that failed is repeated as it is, at most twice within 15 s; a node that left the field for a
         moment is activated anew (its session is gone then, which the layer above notices by the reply), and a reader
-        that failed is opened again once. Raises NodeSilent, Garbled or NoReader.
+        that failed is opened again once. Raises NodeSilentError, GarbledError or NoReaderError.
         """
         with self._port.turn:
             self._last = self._port.next_transaction()
@@ -339,23 +343,23 @@ class NfcLink:
                 poller = self._ready_poller()  # a node that is gone for good ends it here
                 try:
                     return poller.transact(transaction, frame)
-                except (NodeSilent, Garbled) as error:
+                except (NodeSilentError, GarbledError) as error:
                     # choose how to go on: in the same activation while the tag still answers, else from a new one
-                    if self._poller is not None and not isinstance(error, FieldLost) and self.visit.tag.is_present:
+                    if self._poller is not None and not isinstance(error, FieldLostError) and self.visit.tag.is_present:
                         self._poller.restart()
                     else:
                         self._poller = None
                     if attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
                         raise
                     self._notice(Notice("retry", f"{error.message} Trying again."))
-            except ReaderLost:
+            except ReaderLostError:
                 self._poller = None
                 self._port.lose_reader()
                 if reopened or attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
                     raise
                 reopened = True  # one error alone is not worth a word
                 self._port.reopen()
-            except NoReader:
+            except NoReaderError:
                 self._poller = None
                 self._port.lose_reader()
                 raise
@@ -367,7 +371,7 @@ class NfcLink:
             with self._port.turn:
                 if self._poller is not None:
                     self._poller.deselect()
-        except LinkFailure:
+        except LinkError:
             self._poller = None
 
     def _ready_poller(self) -> Poller:

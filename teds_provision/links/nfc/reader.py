@@ -8,10 +8,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.links.nfc.nfcpy import Frontend, nfc
 from teds_provision.links.nfc.pcsc import PREFIX, PcscReader, names_if_any
-from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, activate, translated
+from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, ReaderTag, activate, translated
 from teds_provision.links.nfc.udp import ReaderDevice, address_of, frontend
 from teds_provision.links.ports import Trace
 
@@ -34,14 +34,14 @@ class Reader:
         self._targets = [nfc.clf.RemoteTarget(technology) for technology in technologies]
 
     def sense(self) -> ReaderTag | None:
-        """Poll the field once and activate what lies there; takes up to about 0.2 s. Raises ReaderLost."""
+        """Poll the field once and activate what lies there; takes up to about 0.2 s. Raises ReaderLostError."""
         try:
             with translated():
                 target = self._clf.sense(*self._targets, iterations=1)
-        except FieldLost as error:
+        except FieldLostError as error:
             self._failures += 1
             if self._failures >= _HOPELESS:
-                raise ReaderLost(error.__cause__) from error
+                raise ReaderLostError(error.__cause__) from error
             return None
         self._failures = 0
         return None if target is None else activate(self._clf, target)
@@ -58,7 +58,7 @@ def open_reader(path: str, trace: Trace | None = None) -> Reader | PcscReader:
     """Open the reader that ``path`` names: ``udp[:host][:port]``, ``pcsc[:READER]`` or any path of nfcpy.
 
     Those are ``usb``, ``usb:072f:2200``, ``tty:USB0:pn532``. ``auto`` is the one USB reader that is there, else the one
-    PC/SC reader. Raises NoReader with the cause and its cure, UsageFailure for a path
+    PC/SC reader. Raises NoReaderError with the cause and its cure, UsageError for a path
     that is none, and where ``auto`` finds several. Every frame goes to ``trace``.
     """
     if path == AUTO:
@@ -69,7 +69,7 @@ def open_reader(path: str, trace: Trace | None = None) -> Reader | PcscReader:
         device = ReaderDevice(*address_of(path))
         return Reader(frontend(device, path), again=path, simulated=True, trace=trace)
     if not _PATH.fullmatch(path):
-        raise UsageFailure(
+        raise UsageError(
             f"{path!r} is not a reader.",
             hint="Use auto, usb, usb:072f:2200, tty:USB0:pn532, pcsc or udp:localhost:54321.",
         )
@@ -83,7 +83,7 @@ def open_reader(path: str, trace: Trace | None = None) -> Reader | PcscReader:
 
 def _open_usb(path: str, trace: Trace | None) -> Reader:
     """Open the first reader that can be opened, by its full path: a partial one hides why it fails."""
-    failure: NoReader | None = None
+    failure: NoReaderError | None = None
     for vendor, product, bus, number in _usb_readers(path):
         try:
             clf = Frontend(f"usb:{int(bus):03}:{int(number):03}")
@@ -91,7 +91,7 @@ def _open_usb(path: str, trace: Trace | None) -> Reader:
             failure = failure or _explained(f"usb:{vendor:04x}:{product:04x}", error, vendor, product)
             continue
         return Reader(clf, again=f"usb:{vendor:04x}:{product:04x}", simulated=False, trace=trace)
-    raise failure or NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
+    raise failure or NoReaderError(f"No NFC reader was found on {path}.", hint=_candidates())
 
 
 def _usb_readers(path: str) -> list[tuple[int, int, int, int]]:
@@ -99,7 +99,7 @@ def _usb_readers(path: str) -> list[tuple[int, int, int, int]]:
     try:
         seen = nfc.clf.transport.USB.find(path) or []
     except FileNotFoundError as error:
-        raise NoReader(_NO_LIBUSB, hint="On Debian: sudo apt install libusb-1.0-0.") from error
+        raise NoReaderError(_NO_LIBUSB, hint="On Debian: sudo apt install libusb-1.0-0.") from error
     except Exception as error:  # libusb1 raises its own tree
         raise _explained(path, error) from error
     return [found for found in seen if found[:2] in nfc.clf.device.usb_device_map]
@@ -109,7 +109,7 @@ def plugged_in() -> list[str]:
     """The paths of the readers that ``auto`` chooses from: USB readers, else those of PC/SC. None is opened."""
     try:
         found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
-    except NoReader:  # no libusb: a PC/SC reader needs none
+    except NoReaderError:  # no libusb: a PC/SC reader needs none
         found = []
     return found or [f"{PREFIX}:{name}" for name in names_if_any()]
 
@@ -118,13 +118,13 @@ def _the_only_one() -> str:
     """The path of the only reader that is there; ``usb`` where there is none, so that it says what is missing."""
     found = plugged_in()
     if len(found) > 1:
-        raise UsageFailure(
+        raise UsageError(
             f"{len(found)} readers are plugged in: {', '.join(found)}.", hint=f"Choose one, e.g. --nfc '{found[0]}'."
         )
     return found[0] if found else "usb"
 
 
-def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -> NoReader:
+def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -> NoReaderError:
     code = error.errno if isinstance(error, OSError) else None
     if code == errno.EACCES:
         return _forbidden(path, vendor, product)
@@ -132,27 +132,27 @@ def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -
         return _in_use(path, vendor, product)
     if code in (errno.ENODEV, errno.ENOENT):
         return _absent(path)
-    return NoReader(f"The reader {path} cannot be opened: {error}.", hint="Unplug it, plug it in again.")
+    return NoReaderError(f"The reader {path} cannot be opened: {error}.", hint="Unplug it, plug it in again.")
 
 
-def _forbidden(path: str, vendor: int, product: int) -> NoReader:
+def _forbidden(path: str, vendor: int, product: int) -> NoReaderError:
     if vendor:
         rule = (
             f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{vendor:04x}", ATTRS{{idProduct}}=="{product:04x}", '
             'TAG+="uaccess", GROUP="plugdev", MODE="0660"'
         )
-        return NoReader(
+        return NoReaderError(
             f"You do not have permission to open reader {path}.",
             hint=f"Put this line into /etc/udev/rules.d/70-nfc.rules and plug the reader in again: {rule}",
         )
-    return NoReader(
+    return NoReaderError(
         f"You do not have permission to open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again."
     )
 
 
-def _in_use(path: str, vendor: int, product: int) -> NoReader:
+def _in_use(path: str, vendor: int, product: int) -> NoReaderError:
     driver = _kernel_driver(vendor, product)
-    return NoReader(
+    return NoReaderError(
         f"Reader {path} is in use by {driver or 'another program'}.",
         hint=f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
         if driver
@@ -160,13 +160,13 @@ def _in_use(path: str, vendor: int, product: int) -> NoReader:
     )
 
 
-def _absent(path: str) -> NoReader:
+def _absent(path: str) -> NoReaderError:
     if path.startswith("tty"):
-        return NoReader(
+        return NoReaderError(
             f"No NFC reader answers on the serial line {path}.",
             hint="List the serial lines (ls /dev/ttyUSB* /dev/ttyACM*), and write one like tty:USB0:pn532.",
         )
-    return NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
+    return NoReaderError(f"No NFC reader was found on {path}.", hint=_candidates())
 
 
 def _kernel_driver(vendor: int, product: int) -> str:

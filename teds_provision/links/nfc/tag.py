@@ -1,6 +1,7 @@
 """A tag in the field: activation and its NDEF message, on nfcpy, with nothing foreign getting out.
 
-Whatever nfcpy raises becomes :class:`FieldLost` (the tag does not answer) or :class:`ReaderLost` (the reader does not).
+Whatever nfcpy raises becomes :class:`FieldLostError` (the tag does not answer) or :class:`ReaderLostError` (the reader
+does not).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from teds_provision.errors import Garbled, NodeSilent, NoReader
+from teds_provision.errors import GarbledError, NodeSilentError, NoReaderError
 from teds_provision.links.nfc.nfcpy import (
     NfcpyType2Ndef,
     NfcpyType4Ndef,
@@ -29,7 +30,7 @@ _APDU_SECONDS = 5.0  # for one command of the tag and its answer: as long as a r
 _FSC = (16, 24, 32, 40, 48, 64, 96, 128, 256)  # octets by FSCI (ISO/IEC 14443-4, table 1)
 
 
-class FieldLost(NodeSilent):
+class FieldLostError(NodeSilentError):
     """The tag left the field or does not answer its reader any more."""
 
     def __init__(self) -> None:
@@ -38,7 +39,7 @@ class FieldLost(NodeSilent):
         )
 
 
-class ReaderLost(NoReader):
+class ReaderLostError(NoReaderError):
     """The reader itself went away while it was used."""
 
     def __init__(self, cause: object) -> None:
@@ -50,12 +51,12 @@ def translated() -> Iterator[None]:
     """Turn what nfcpy raises into LinkFailures."""
     try:
         yield
-    except (NodeSilent, NoReader, Garbled):
+    except (NodeSilentError, NoReaderError, GarbledError):
         raise
     except OSError as error:
-        raise ReaderLost(error.strerror or error) from error
+        raise ReaderLostError(error.strerror or error) from error
     except Exception as error:  # nfcpy: nfc.clf.Error, TagCommandError, Chipset.Error, ValueError, RuntimeError, …
-        raise FieldLost from error
+        raise FieldLostError from error
 
 
 class Type4Ndef(NfcpyType4Ndef):  # type: ignore[misc]
@@ -259,15 +260,18 @@ class ReaderTag:
 
     @property
     def is_present(self) -> bool:
-        """Whether the tag still answers, in this activation; raises ReaderLost."""
+        """Whether the tag still answers, in this activation; raises ReaderLostError."""
         try:
             with self._talking():
                 return bool(self._tag.is_present)
-        except FieldLost:
+        except FieldLostError:
             return False
 
     def read(self) -> bytes:
-        """Return the NDEF message as it is on the tag now; raises FieldLost, ReaderLost, Garbled (no NDEF message)."""
+        """Return the NDEF message as it is on the tag now.
+
+        Raises FieldLostError, ReaderLostError, GarbledError (no NDEF message).
+        """
         for attempt in range(_TRIES):
             if attempt:
                 time.sleep(0.02)
@@ -275,11 +279,11 @@ class ReaderTag:
             if octets is not None:
                 return octets
             if not self.is_present:
-                raise FieldLost
-        raise Garbled("The tag has no readable NDEF message.")
+                raise FieldLostError
+        raise GarbledError("The tag has no readable NDEF message.")
 
     def write(self, octets: bytes) -> None:
-        """Replace the NDEF message; raises FieldLost, ReaderLost, Garbled (read-only, or too small).
+        """Replace the NDEF message; raises FieldLostError, ReaderLostError, GarbledError (read-only, or too small).
 
         A Type 2 tag whose pages nfcpy writes is read afresh first: it sends only those that differ from what it saw
         last, and the node has put another message since.
@@ -287,16 +291,16 @@ class ReaderTag:
         if self._ndef is None or not getattr(self._ndef, "_simple", self.kind == "Type 4"):
             self.read()
         if not self._ndef.is_writeable or len(octets) > self._ndef.capacity:
-            raise Garbled(f"The tag does not take an NDEF message of {len(octets)} octets.")
+            raise GarbledError(f"The tag does not take an NDEF message of {len(octets)} octets.")
         with self._talking():
             self._ndef.octets = octets
 
     @contextmanager
     def _talking(self) -> Iterator[None]:
-        """Talk to the tag: FieldLost where the reader has looked for another since."""
+        """Talk to the tag: FieldLostError where the reader has looked for another since."""
         with translated():
             if self._tag.target is None or self._tag.clf.target is not self._tag.target:
-                raise FieldLost
+                raise FieldLostError
             yield
 
     def _read_once(self) -> bytes | None:
@@ -324,5 +328,5 @@ def activate(clf: Any, target: Any) -> ReaderTag | None:
                 return ReaderTag(Type2(clf, target), "Type 2" if plain else f"SAK {target.sel_res[0]:02X}h")
             tag = nfc.tag.activate(clf, target)
             return None if tag is None else ReaderTag(tag, str(tag.type).replace("Tag", "").replace("Type", "Type "))
-    except FieldLost:
+    except FieldLostError:
         return None

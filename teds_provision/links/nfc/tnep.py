@@ -10,7 +10,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 
 SERVICE = b"urn:nfc:xsn:teds-provision:tim"
@@ -47,9 +47,9 @@ class ServiceParameters:
 
     @classmethod
     def decode(cls, payload: bytes) -> ServiceParameters:
-        """Read the payload of a ``Tp`` record; raises Garbled when its length does not add up."""
+        """Read the payload of a ``Tp`` record; raises GarbledError when its length does not add up."""
         if len(payload) < 7 or len(payload) != 7 + payload[1]:
-            raise Garbled("A TNEP service record has a wrong length.")
+            raise GarbledError("A TNEP service record has a wrong length.")
         uri = bytes(payload[2 : 2 + payload[1]])
         mode, wt_int, n_wait, max_ndef = struct.unpack(">BBBH", payload[-5:])
         return cls(uri, wt_int & 63, min(n_wait, 15), max_ndef, mode, payload[0])
@@ -61,7 +61,7 @@ def our_service(records: Sequence[NdefRecord]) -> ServiceParameters | None:
         if record.is_well_known(b"Tp"):
             try:
                 service = ServiceParameters.decode(record.payload)
-            except Garbled:
+            except GarbledError:
                 continue
             if service.uri == SERVICE and service.version >> 4 == 1 and service.mode == _SINGLE_RESPONSE:
                 return service
@@ -76,12 +76,12 @@ def select(uri: bytes) -> NdefRecord:
 def selection(records: Sequence[NdefRecord]) -> bytes | None:
     """Return the URI that a message selects (empty: deselects), None when it holds no ``Ts`` record.
 
-    Raises Garbled when the record's length does not add up.
+    Raises GarbledError when the record's length does not add up.
     """
     for record in records:
         if record.is_well_known(b"Ts"):
             if not record.payload or len(record.payload) != 1 + record.payload[0]:
-                raise Garbled("A TNEP select record has a wrong length.")
+                raise GarbledError("A TNEP select record has a wrong length.")
             return record.payload[1:]
     return None
 

@@ -30,7 +30,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.links.nfc.nfcpy import Frontend, UdpDevice, nfc
 
 DEFAULT_PORT: Final = 54321
@@ -42,13 +42,13 @@ _Frame = tuple[str, bytearray, Any]
 
 
 def address_of(path: str) -> tuple[str, int]:
-    """Return host and port of ``udp[:host][:port]``; raises UsageFailure unless it is this machine's loopback."""
+    """Return host and port of ``udp[:host][:port]``; raises UsageError unless it is this machine's loopback."""
     parts = path.split(":")
     host, port = (*parts[1:], "", "")[:2]
     if parts[0] != "udp" or len(parts) > 3 or not (port == "" or (port.isdecimal() and 0 < int(port) < 65536)):
-        raise UsageFailure(f"{path!r} is not a simulated reader.", hint="Write udp:localhost:PORT.")
+        raise UsageError(f"{path!r} is not a simulated reader.", hint="Write udp:localhost:PORT.")
     if host not in _LOOPBACK:
-        raise UsageFailure(
+        raise UsageError(
             f"A simulated reader must be on this machine's loopback, not on {host}.",
             hint="Use udp:localhost:PORT; anyone who can reach the port could write to the node.",
         )

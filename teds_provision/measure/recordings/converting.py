@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.files import require_new, sync_folder
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
 from teds_provision.measure.grid import Grid
@@ -50,18 +50,18 @@ class Converted:
 def convert(source: Path, target: Path, *, wide: bool = False) -> Converted:
     """Write a recording in the format of ``target``'s suffix. ``wide``: as rows of one grid (text and Parquet).
 
-    Of a recording that is still being written, or was cut off, what is whole by now is taken. Raises UsageFailure
-    (``target`` exists, no such format), NotFound, BadData, StoreFailure (disk).
+    Of a recording that is still being written, or was cut off, what is whole by now is taken. Raises UsageError
+    (``target`` exists, no such format), NotFoundError, BadDataError, StoreError (disk).
     """
     suffix = target.suffix.lower()
     if suffix not in FILES and suffix != PARQUET:
-        raise UsageFailure(f"Unsupported format: {target.name!r}.", hint=f"Use {', '.join([*FILES, PARQUET])}.")
+        raise UsageError(f"Unsupported format: {target.name!r}.", hint=f"Use {', '.join([*FILES, PARQUET])}.")
     if wide and suffix not in TEXT and suffix != PARQUET:
-        raise UsageFailure("--wide only works with text files and Parquet.", hint="Name a FILE.csv or FILE.parquet.")
+        raise UsageError("--wide only works with text files and Parquet.", hint="Name a FILE.csv or FILE.parquet.")
     require_new(target)
     recording = open_recording(source)
     if recording.wide and not (suffix in TEXT or suffix == PARQUET):
-        raise UsageFailure(
+        raise UsageError(
             f"{source} was written with --wide: it has no raw values and sample numbers, which {suffix} needs.",
             hint="Convert the original recording, or choose .csv or .parquet.",
         )
@@ -205,7 +205,7 @@ def _published(path: Path, folder: Path) -> Path:
     try:
         os.link(path, target)
     except FileExistsError:
-        raise UsageFailure(f"{target} already exists and is not overwritten.", hint="Choose another name.") from None
+        raise UsageError(f"{target} already exists and is not overwritten.", hint="Choose another name.") from None
     except OSError:  # a file system without hard links
         require_new(target)
         os.rename(path, target)

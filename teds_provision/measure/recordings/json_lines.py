@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.measure.blocks import Block, Invalid, NodeReport, Note, State
 from teds_provision.measure.recordings.columns import Joined, integers, stacked
@@ -54,8 +54,10 @@ class JsonLines(Recording):
             elif line.startswith(b'{"event":"recording"'):
                 self.station = station_of(self._event(line))
 
-    def _bad(self, why: str) -> BadData:
-        return BadData(f"{self.path}:{self._line}: {why}.", hint="It was changed after it was recorded, or is damaged.")
+    def _bad(self, why: str) -> BadDataError:
+        return BadDataError(
+            f"{self.path}:{self._line}: {why}.", hint="It was changed after it was recorded, or is damaged."
+        )
 
     def _lines(self) -> Iterator[bytes]:
         self._line, rest = 0, b""

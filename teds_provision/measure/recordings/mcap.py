@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.measure.blocks import Block, ChannelFacts, Note
 from teds_provision.measure.recordings.columns import Joined, raw_kind
@@ -75,8 +75,8 @@ class McapRecording(Recording):
                 elif name == "channel":
                     self.know(facts_of(_values(words), f"{self.path}: the metadata"))
 
-    def _bad(self, why: str) -> BadData:
-        return BadData(
+    def _bad(self, why: str) -> BadDataError:
+        return BadDataError(
             f"{self.path}: {why}.",
             hint=f"To recover what is intact: teds-provision measure recover {quote(str(self.path))}",
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.measure.recordings import json_lines, mcap, parquet, text
 from teds_provision.measure.recordings.source import Recording
@@ -12,7 +12,10 @@ from teds_provision.measure.sinks.mcap.writer import MAGIC
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a recording; raises NotFound, BadData (none of ours, damaged), UsageFailure (Parquet without pyarrow)."""
+    """Open a recording.
+
+    Raises NotFoundError, BadDataError (none of ours, damaged), UsageError (Parquet without pyarrow).
+    """
     with open_to_read(path) as file:
         begin = file.read(64)
     if begin.startswith(MAGIC):
@@ -24,8 +27,8 @@ def open_recording(path: Path) -> Recording:
     if begin.startswith(text.FIRST.encode()):
         return text.TextRecording(path)
     if not begin:
-        raise BadData(f"{path} is empty.")
-    raise BadData(
+        raise BadDataError(f"{path} is empty.")
+    raise BadDataError(
         f"{path} is not a recording.",
         hint="Recordings are written by `measure --to`: CSV, text, MCAP, JSON lines; or Parquet.",
     )

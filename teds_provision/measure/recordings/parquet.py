@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadDataError, UsageError
 from teds_provision.lazy import how_to_install
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, Note, StationFacts
 from teds_provision.measure.recordings.columns import Rows, Streams, raw_kind
@@ -36,12 +36,12 @@ _FORMAT: Final = "teds-provision/measurement-1"
 
 
 def library() -> Any:
-    """Module pyarrow, with its Parquet; raises UsageFailure where it is not installed."""
+    """Module pyarrow, with its Parquet; raises UsageError where it is not installed."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise UsageFailure("Parquet needs pyarrow.", hint=how_to_install("parquet")) from None
+        raise UsageError("Parquet needs pyarrow.", hint=how_to_install("parquet")) from None
     return pyarrow
 
 
@@ -82,7 +82,7 @@ class ParquetWriter:
         return {"float": pa.float64(), "uint64": pa.uint64(), "int64": pa.int64()}.get(raw_kind(form), pa.string())
 
     def take(self, entry: Entry) -> None:
-        """One entry; raises BadData for a raw value that is not what its channel's datasheet says."""
+        """One entry; raises BadDataError for a raw value that is not what its channel's datasheet says."""
         if isinstance(entry, Block | GroupRows):
             self._waiting.append(entry)
             self._rows += len(entry.time)
@@ -169,7 +169,7 @@ class ParquetWriter:
             return self._pa.array(found[order], kind, mask=missing[order])
         except (TypeError, ValueError, OverflowError) as error:
             known = self._known[place]
-            raise BadData(
+            raise BadDataError(
                 f"A raw value of {known.label} of {known.uuid} is no {known.sample_form or 'number'}: {error}."
             ) from None
 
@@ -202,8 +202,8 @@ class ParquetRecording(Recording):
         if self.wide:
             self.form = "Parquet, wide"
 
-    def _bad(self, why: str) -> BadData:
-        return BadData(f"{self.path}: {why}.", hint="It was changed since it was written, or is damaged.")
+    def _bad(self, why: str) -> BadDataError:
+        return BadDataError(f"{self.path}: {why}.", hint="It was changed since it was written, or is damaged.")
 
     def _open(self) -> Any:
         try:

@@ -1,7 +1,7 @@
 """What every format of a recording is read as: facts of channels, blocks of samples, rows of a grid, reports, notes.
 
 A recording may come from anybody: sizes and counts are limited (:data:`MOST`), so that memory stays small whatever the
-file says, and what is malformed raises BadData with the place.
+file says, and what is malformed raises BadDataError with the place.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, get_args
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, Kind, NodeReport, Note, StationFacts
 from teds_provision.teds import Units
 from teds_provision.teds.calibration.plain import calibration_from_json
@@ -69,12 +69,12 @@ class Recording(ABC):
 
     @abstractmethod
     def entries(self) -> Iterator[Entry]:
-        """All that is in it; each call begins anew. Raises BadData, NotFound."""
+        """All that is in it; each call begins anew. Raises BadDataError, NotFoundError."""
 
     def know(self, facts: ChannelFacts) -> None:
-        """Keep the first facts of a channel; raises BadData for more channels than are read."""
+        """Keep the first facts of a channel; raises BadDataError for more channels than are read."""
         if facts.key not in self.facts and len(self.facts) >= MOST.channels:
-            raise BadData(f"{self.path} names more than {MOST.channels} channels.")
+            raise BadDataError(f"{self.path} names more than {MOST.channels} channels.")
         self.facts.setdefault(facts.key, facts)
 
 
@@ -145,31 +145,31 @@ _FIELDS = frozenset(field.name for field in fields(ChannelFacts))
 
 
 def facts_of(words: object, where: str) -> ChannelFacts:
-    """Facts of a channel as a recording has them (``lines.facts_as_json``); raises BadData, ``where`` before it.
+    """Facts of a channel as a recording has them (``lines.facts_as_json``); raises BadDataError, ``where`` before it.
 
     The exponents of the unit are read from its text: a unit that is none (another program's) stays text alone.
     """
     if not isinstance(words, dict):
-        raise BadData(f"{where}: the facts of a channel are not a JSON object.")
+        raise BadDataError(f"{where}: the facts of a channel are not a JSON object.")
     curve = words.get("calibration")
     told = ((name, value) for name, value in words.items() if name in _FIELDS and name != "calibration")
     kept: dict[str, Any] = {name: _fact(name, value, where) for name, value in told}
     if "uuid" not in kept or "number" not in kept:
-        raise BadData(f"{where}: a channel has no UUID or no number.")
+        raise BadDataError(f"{where}: a channel has no UUID or no number.")
     try:
         kept["units"] = parse_units(kept["unit"]) if kept.get("unit") else None
-    except BadData:
+    except BadDataError:
         kept["units"] = None
     if curve is not None:
         try:
             kept["calibration"] = calibration_from_json(curve, kept["number"], kept["units"] or Units())
-        except BadData as error:
-            raise BadData(f"{where}: the calibration of channel {kept['number']} cannot be read.") from error
+        except BadDataError as error:
+            raise BadDataError(f"{where}: the calibration of channel {kept['number']} cannot be read.") from error
     return ChannelFacts(**{"node": "", "name": "", **kept})
 
 
 def _fact(name: str, value: Any, where: str) -> Any:
-    """One fact as :class:`ChannelFacts` has it; raises BadData where the value is not of its kind."""
+    """One fact as :class:`ChannelFacts` has it; raises BadDataError where the value is not of its kind."""
     if name in _TEXTS and isinstance(value, str) and len(value) <= MOST.text:
         return value
     if name in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
@@ -180,19 +180,19 @@ def _fact(name: str, value: Any, where: str) -> Any:
         return tuple(channel_number(one, where) for one in value)
     if name == "number":
         return channel_number(value, where)
-    raise BadData(f"{where}: {name} of a channel is {_short(value)}.")
+    raise BadDataError(f"{where}: {name} of a channel is {_short(value)}.")
 
 
 def channel_number(value: object, where: str) -> int:
-    """Number of a TransducerChannel; raises BadData."""
+    """Number of a TransducerChannel; raises BadDataError."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFF:
-        raise BadData(f"{where}: {_short(value)} is no number of a channel.")
+        raise BadDataError(f"{where}: {_short(value)} is no number of a channel.")
     return value
 
 
 def _finite(value: float, name: str, where: str) -> float:
     if not math.isfinite(value):
-        raise BadData(f"{where}: {name} of a channel is not finite.")
+        raise BadDataError(f"{where}: {name} of a channel is not finite.")
     return value
 
 

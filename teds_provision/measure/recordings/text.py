@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.limits import load_json
 from teds_provision.measure.blocks import ChannelFacts, GroupRows, NodeReport, Note, State
@@ -48,8 +48,10 @@ class TextRecording(Recording):
             raise self._bad(f"the columns are not those of the {len(self._known)} channels above")
         self._width = expected
 
-    def _bad(self, why: str) -> BadData:
-        return BadData(f"{self.path}:{self._line}: {why}.", hint="It was changed after it was recorded, or is damaged.")
+    def _bad(self, why: str) -> BadDataError:
+        return BadDataError(
+            f"{self.path}:{self._line}: {why}.", hint="It was changed after it was recorded, or is damaged."
+        )
 
     def _lines(self) -> Iterator[str]:
         """Whole lines, without their ends; what is no whole line at the end is torn."""

@@ -7,7 +7,7 @@ The way of `measure` and of `ncap run` alike:
 * ``Buses(ports)`` hears the buses of the process, once for all measurements.
 * ``MeasurementJob(station, kept)`` makes its sinks; ``run(buses, stop)`` measures on this thread until ``stop`` is set,
   or ``start(buses)`` and ``stop()`` on a thread of its own, again and again after an error. While it runs, its nodes
-  and its group are held: ``station.measurements.is_running(uuid)``, PolicyRefused (6) for whoever wants them too.
+  and its group are held: ``station.measurements.is_running(uuid)``, PolicyError (6) for whoever wants them too.
 * ``job.measurement.session(uuid)`` is the session of a node that is measured, for one more command in between.
 
 A measurement of a command is kept while it runs. The row of one that was killed belongs to no process, and the next
@@ -55,7 +55,7 @@ class MeasurementJob:
 
     ``more`` makes the sinks beside those that are kept, anew for each run; it gets what takes set points of topics.
     ``admits`` says of each set point whether it may pass; None: none may, whatever is kept. ``opened`` makes a sink of
-    a kept word. Raises UsageFailure where a sink cannot be named so.
+    a kept word. Raises UsageError where a sink cannot be named so.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class MeasurementJob:
     ) -> Ended:
         """Measure until ``stop``, for ``duration`` seconds of data, or to the kept end; nodes and group are held.
 
-        Raises PolicyRefused where another measurement holds one of them, and what a sink's ``open`` raises.
+        Raises PolicyError where another measurement holds one of them, and what a sink's ``open`` raises.
         """
         uuids = self.station.measurements.nodes_of(self.kept)
         name = self.kept.group or ", ".join(uuid.hex()[:8] for uuid in uuids[:3])

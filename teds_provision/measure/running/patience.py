@@ -7,19 +7,19 @@ import time
 from collections.abc import Callable
 
 from teds_provision.errors import (
-    BadData,
-    BadDatasheet,
-    Bug,
-    NodeRefused,
-    NotAuthentic,
-    PolicyRefused,
-    StoreFailure,
+    BadDataError,
+    BadDatasheetError,
+    InternalError,
+    NodeRefusedError,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
     TedsProvisionError,
 )
 from teds_provision.protocol.messages.frames import Reason
 
 CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
-_FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure, Bug)
+_FINAL = (NotAuthenticError, PolicyError, BadDataError, StoreError, InternalError)
 
 
 class Patience:
@@ -53,10 +53,10 @@ class Patience:
         and refuse to open one: then it is looked for ``elsewhere``.
         """
         if self.left == math.inf:  # a datasheet that was changed under its values ends what has an end
-            return self._ends and (decided or (proven and isinstance(error, BadDatasheet)))
+            return self._ends and (decided or (proven and isinstance(error, BadDatasheetError)))
         if decided:
             return True
-        passing = isinstance(error, NodeRefused) and error.reason in CURED_BY_TIME
+        passing = isinstance(error, NodeRefusedError) and error.reason in CURED_BY_TIME
         if not isinstance(error, _FINAL) or passing:
             return not self.left
         return proven or not elsewhere()

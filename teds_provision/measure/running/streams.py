@@ -19,7 +19,7 @@ from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.trusting import Trusted, ask_clock
 from teds_provision.protocol.operation.stream_commands import Clock, StreamKind, decode_stopped, stop
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
-from teds_provision.talk.conversation import SessionLost
+from teds_provision.talk.conversation import SessionLostError
 
 UNSIGNED = "the datasheet is unsigned: raw values only"
 SILENT = 2.0  # seconds without a good message, beside three messages' time: then the node is lost
@@ -164,7 +164,7 @@ class NodeStreams:
             self.running[number].hear_out(due)
         for number, heard in list(self.running.items()):
             if trusted is not None:
-                with suppress(TedsProvisionError, SessionLost):
+                with suppress(TedsProvisionError, SessionLostError):
                     counter = decode_stopped(trusted.node.send(stop(number), "to stop a stream"))
                     due = min(counter, wanted[number]) if wanted[number] else counter
                     heard.hear_out(due)

@@ -18,7 +18,7 @@ from teds_provision.protocol.operation.can_frames import trigger_identifier
 from teds_provision.protocol.operation.stream_commands import Action
 from teds_provision.protocol.operation.subscription import TickBounds
 from teds_provision.protocol.operation.timing import START_AFTER_MARK, TriggerToken, mark_is_honest
-from teds_provision.talk.conversation import SessionLost
+from teds_provision.talk.conversation import SessionLostError
 
 TRIGGER_LIFE = 30  # seconds
 HELD_BACK = 10_000_000  # ns: a controller may hold a frame back while others win arbitration; a node in a busy process
@@ -63,7 +63,7 @@ def _arm(
             with keeper.turn:
                 trusted.node.send(token.arm(Action.START, TRIGGER_LIFE).command(), "to wait for the trigger")
             armed.append((keeper, trusted))
-        except (TedsProvisionError, SessionLost) as error:
+        except (TedsProvisionError, SessionLostError) as error:
             note(f"Node {keeper.uuid.hex()} did not accept the trigger: {error}")
     return armed
 
@@ -76,7 +76,7 @@ def _mark(keeper: NodeKeeper, trusted: Trusted, before: int, after: int, note: C
     try:
         with keeper.turn:
             mark = keeper.streams.tell_time(trusted).mark
-    except (TedsProvisionError, SessionLost) as error:
+    except (TedsProvisionError, SessionLostError) as error:
         note(f"Node {keeper.uuid.hex()} did not report when it saw the trigger: {error}")
         return None
     with keeper.streams.mapping:

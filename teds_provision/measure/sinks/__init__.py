@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.lazy import lazy
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.mcap.recording import McapSink
@@ -45,7 +45,7 @@ SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
 def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
     """The sink of a spec, not yet opened: a file, ``wide:FILE``, ``ros1[:URL]``, ``ros2[:DOMAIN]``, ``mqtt://HOST``.
 
-    ``commands`` takes set points that come by the sink; None where no actuator may be moved. Raises UsageFailure.
+    ``commands`` takes set points that come by the sink; None where no actuator may be moved. Raises UsageError.
     """
     service = spec.partition(":")[0]
     if service in SERVICES:
@@ -54,7 +54,7 @@ def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
         return WideSink(Path(spec.removeprefix(WIDE)))
     path = Path(spec)
     if path.suffix.lower() not in FILES:
-        raise UsageFailure(
+        raise UsageError(
             f"Unsupported format: {spec!r}.",
             hint=f"Name a file that ends in {', '.join(FILES)}, or {', '.join(SERVICES)}.",
         )

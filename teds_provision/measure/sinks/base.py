@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final, Literal, Protocol
 
-from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
+from teds_provision.errors import NotFoundError, StoreError, TedsProvisionError
 from teds_provision.measure.blocks import (
     Block,
     ChannelFacts,
@@ -301,6 +301,6 @@ def as_sink_failure(error: OSError, name: str) -> TedsProvisionError:
         errno.EROFS: ("the disk is read-only", "Record to another disk."),
     }
     if error.errno == errno.ENOENT:
-        return NotFound(f"{name} cannot be written: its folder is not there.", hint="Create the folder first.")
+        return NotFoundError(f"{name} cannot be written: its folder is not there.", hint="Create the folder first.")
     cause, cure = cures.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path."))
-    return StoreFailure(f"{name} cannot be written: {cause}.", hint=cure)
+    return StoreError(f"{name} cannot be written: {cause}.", hint=cure)

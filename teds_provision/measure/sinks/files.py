@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from teds_provision.errors import StoreFailure, TedsProvisionError
+from teds_provision.errors import StoreError, TedsProvisionError
 from teds_provision.files import sync_folder
 from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, NodeReport, Note, StationFacts
 from teds_provision.measure.sinks.base import Item, ThreadedSink, as_sink_failure
@@ -338,7 +338,7 @@ class FileSink(ThreadedSink):
                     self._mend(self._parts[-1])
         if self._gaps:
             told = " ".join(self._gaps[-3:])
-            raise StoreFailure(
+            raise StoreError(
                 f"{self.name} has {len(self._gaps)} {'gap' if len(self._gaps) == 1 else 'gaps'}. {told}",
                 hint="Free some space before the next run; what was written is intact.",
             )

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
 from teds_provision import __version__
-from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError, UsageError
 from teds_provision.files import read_limited
 from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
@@ -71,9 +71,9 @@ class MqttSink(ThreadedSink):
         except (ValueError, KeyError):
             parts, port = urlsplit(""), 0
         if not parts.hostname or parts.path.strip("/") or parts.fragment:
-            raise UsageFailure(f"{spec!r} is not an MQTT URL.", hint="Use mqtt://HOST or mqtts://USER@HOST:8883.")
+            raise UsageError(f"{spec!r} is not an MQTT URL.", hint="Use mqtt://HOST or mqtts://USER@HOST:8883.")
         if parts.password is not None:
-            raise UsageFailure(
+            raise UsageError(
                 "Passwords are not allowed on the command line.",
                 hint="Store it in a file: mqtt://USER@HOST?password-file=PATH",
             )
@@ -83,7 +83,7 @@ class MqttSink(ThreadedSink):
         self._host, self._port = parts.hostname, port
         self._files = _files_of(parts.query, tls=parts.scheme == "mqtts")
         if "password-file" in self._files and not parts.username:
-            raise UsageFailure("A password needs a user.", hint=f"Write {parts.scheme}://USER@HOST?…")
+            raise UsageError("A password needs a user.", hint=f"Write {parts.scheme}://USER@HOST?…")
         self._why, self._greeted = "", False
         """Why it is not connected, as far as that is known; whether the broker has ever taken this client."""
         self._client: Any = None
@@ -132,22 +132,22 @@ class MqttSink(ThreadedSink):
         try:
             return _octets("password-file", self._files["password-file"]).decode().rstrip("\r\n")
         except UnicodeDecodeError as error:
-            raise BadData(f"The password file {self._files['password-file']} is not UTF-8 text.") from error
+            raise BadDataError(f"The password file {self._files['password-file']} is not UTF-8 text.") from error
 
     def _tls(self) -> ssl.SSLContext:
-        """How the broker is checked, and what this client shows; raises NotFound, BadData."""
+        """How the broker is checked, and what this client shows; raises NotFoundError, BadDataError."""
         for named, path in self._files.items():
             _octets(named, path)  # the library reads by name and knows no limit
         try:
             context = ssl.create_default_context(cafile=self._files.get("ca"))
         except (ssl.SSLError, OSError) as error:
-            raise BadData(f"{self._files.get('ca')} contains no CA certificate in PEM format.") from error
+            raise BadDataError(f"{self._files.get('ca')} contains no CA certificate in PEM format.") from error
         if "cert" in self._files:
             own, key = self._files["cert"], self._files.get("key")
             try:
                 context.load_cert_chain(own, key, password=_no_password)
             except (ssl.SSLError, OSError, ValueError) as error:
-                raise BadData(
+                raise BadDataError(
                     f"{own} and {key or own} are not a certificate and its key (PEM, unencrypted).",
                     hint="Give them as cert=PATH and key=PATH; openssl pkey removes the passphrase from a key.",
                 ) from error
@@ -343,28 +343,28 @@ def _host(name: str) -> str:
 
 
 def _files_of(query: str, *, tls: bool) -> dict[str, str]:
-    """The files that a URL names; raises UsageFailure for another key, one that comes twice, a CA without TLS."""
+    """The files that a URL names; raises UsageError for another key, one that comes twice, a CA without TLS."""
     known = FILES if tls else FILES[:1]
     named: dict[str, str] = {}
     for key, path in parse_qsl(query, keep_blank_values=True):
         if key not in known or key in named or not path:
             what = "comes twice or is empty" if key in known else "is unknown"
             more = "" if tls else f"; with mqtts:// also {', '.join(FILES[1:])}"
-            raise UsageFailure(f"{key!r} in the URL of a broker {what}.", hint=f"Known: {', '.join(known)}{more}.")
+            raise UsageError(f"{key!r} in the URL of a broker {what}.", hint=f"Known: {', '.join(known)}{more}.")
         named[key] = path
     if "key" in named and "cert" not in named:
-        raise UsageFailure("'key' in the URL of a broker needs 'cert'.", hint="cert=PATH&key=PATH, both in PEM.")
+        raise UsageError("'key' in the URL of a broker needs 'cert'.", hint="cert=PATH&key=PATH, both in PEM.")
     return named
 
 
 def _octets(key: str, path: str) -> bytes:
-    """A small regular file that the URL names by this key; raises NotFound, BadData."""
+    """A small regular file that the URL names by this key; raises NotFoundError, BadDataError."""
     try:
         if not stat.S_ISREG(Path(path).stat().st_mode):  # a pipe would hold the sink up until somebody writes
-            raise BadData(f"{key}={path} is no regular file.", hint="Check the URL of the broker.")
+            raise BadDataError(f"{key}={path} is no regular file.", hint="Check the URL of the broker.")
     except (OSError, ValueError) as error:
-        raise NotFound(f"{key}={path} cannot be read.", hint="Check its path and mode.") from error
-    return read_limited(Path(path), _MOST_OCTETS, "password or certificate", failure=NotFound)
+        raise NotFoundError(f"{key}={path} cannot be read.", hint="Check its path and mode.") from error
+    return read_limited(Path(path), _MOST_OCTETS, "password or certificate", failure=NotFoundError)
 
 
 def _no_password() -> str:

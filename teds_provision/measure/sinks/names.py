@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Set
 from itertools import chain
 from typing import Final, TypeVar
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
 
 LONGEST = 60
@@ -54,7 +54,7 @@ class Topics:
         self._chosen = {key: name.strip("/") for key, name in station.names.items()}
         for key, name in self._chosen.items():
             if not is_topic(name):
-                raise UsageFailure(
+                raise UsageError(
                     f"{name!r} for {key[0]} cannot be the name of a topic.",
                     hint="Use letters, digits and single _, beginning with a letter; / between parts.",
                 )
@@ -163,7 +163,7 @@ class Topics:
         return f"/{self.station}/{what}"
 
     def require_free(self, uuid: str, channel: int, name: str) -> None:
-        """Raise UsageFailure where a name that is to be chosen is, or would be taken for, another one's."""
+        """Raise UsageError where a name that is to be chosen is, or would be taken for, another one's."""
         name = name.strip("/")
         if not channel:
             other = next(
@@ -203,8 +203,8 @@ _NOT_TOPICS: Final = frozenset(
 _Key = TypeVar("_Key", str, int)
 
 
-def _taken(name: str, by: str) -> UsageFailure:
-    return UsageFailure(f"{name!r} is the topic of {by} already.", hint="Choose another name.")
+def _taken(name: str, by: str) -> UsageError:
+    return UsageError(f"{name!r} is the topic of {by} already.", hint="Choose another name.")
 
 
 def _apart(

@@ -13,11 +13,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar, cast
 
-from teds_provision.errors import Bug, Frozen, NodeBusy, NoNode, StoreFailure, TedsProvisionError
+from teds_provision.errors import FrozenError, InternalError, NodeBusyError, NoNodeError, StoreError, TedsProvisionError
 from teds_provision.links import Port
 from teds_provision.links.ports import Contact, Notice
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 
 # One thing at a time with each node: sessions of this process share one address, and a second Open ends the first.
 # A measurement keeps its nodes for as long as it runs; what else is asked of them meanwhile goes through its session,
@@ -41,18 +41,20 @@ class Turns:
             return self._holders.get(uuid)
 
     def take(self, uuid: str, what: str, *, wait: float = WAIT, frozen: bool = False) -> None:
-        """Begin; raises Frozen (a measurement has it) at once, NodeBusy after ``wait`` seconds."""
+        """Begin; raises FrozenError (a measurement has it) at once, NodeBusyError after ``wait`` seconds."""
         until = time.monotonic() + wait
         with self._news:
             while uuid in self._holders:
                 if uuid in self._frozen:
-                    raise Frozen(
+                    raise FrozenError(
                         f"Node {uuid} is being measured ({self._holders[uuid]}) and cannot be changed now.",
                         hint="End the measurement first.",
                     )
                 left = until - time.monotonic()
                 if left <= 0:
-                    raise NodeBusy(f"Node {uuid} is busy: {self._holders[uuid]}.", hint="Try again when that is done.")
+                    raise NodeBusyError(
+                        f"Node {uuid} is busy: {self._holders[uuid]}.", hint="Try again when that is done."
+                    )
                 self._news.wait(left)
             self._holders[uuid] = what
             if frozen:
@@ -86,8 +88,8 @@ ON_A_BUS: Final = 10.0
 def untold(error: Exception) -> TedsProvisionError:
     """What a thread tells of an exception that is none of ours: the disk's, or a bug."""
     if isinstance(error, OSError):
-        return StoreFailure(f"The system refused: {error.strerror or type(error).__name__}.", hint="See the log.")
-    return Bug(f"Unexpected {type(error).__name__}.", hint="This is a bug: see the daemon's log.")
+        return StoreError(f"The system refused: {error.strerror or type(error).__name__}.", hint="See the log.")
+    return InternalError(f"Unexpected {type(error).__name__}.", hint="This is a bug: see the daemon's log.")
 
 
 PortOf = Callable[[str], Port | None]
@@ -110,7 +112,7 @@ class Errand(Generic[Result]):
         """Do it; what is raised is kept for who waits."""
         try:
             self.result = self.work(node)
-        except SessionLost as lost:
+        except SessionLostError as lost:
             self.error = lost.cause
         except TedsProvisionError as error:
             self.error = error
@@ -134,20 +136,20 @@ class Desk:
     ) -> Result:
         """Do ``work`` with a node: at once on a bus, else at its next tap within ``wait`` seconds.
 
-        Raises Frozen (it is measured), NodeBusy, NoNode, and what the work raises.
+        Raises FrozenError (it is measured), NodeBusyError, NoNodeError, and what the work raises.
         """
         port = self._bus_of(uuid)
         if port is not None:
             with self._turns.of(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
                 try:
                     return work(node)
-                except SessionLost as lost:
+                except SessionLostError as lost:
                     raise lost.cause from lost
         errand = self.wait_for(uuid, what, work, wait)
         if not errand.done.wait(wait):
             self.cancel(errand)
             if not errand.done.is_set():
-                raise NoNode(
+                raise NoNodeError(
                     f"Node {uuid} is on no bus of this station and was not placed on a reader within {wait:.0f} s.",
                     hint="Place it on the reader, or connect it to the bus.",
                 )

@@ -16,7 +16,14 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from teds_provision.api.bodies import LONGEST_HOLD
-from teds_provision.errors import LinkFailure, NodeBusy, NodeRefused, NoNode, StoreFailure, TedsProvisionError
+from teds_provision.errors import (
+    LinkError,
+    NodeBusyError,
+    NodeRefusedError,
+    NoNodeError,
+    StoreError,
+    TedsProvisionError,
+)
 from teds_provision.links.ports import Notice
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.held_actuator import HeldActuator
@@ -26,7 +33,7 @@ from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk, Turns
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.station import Station
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 
 HOLD: Final = 1.0  # seconds, where a request does not say
 _STARTING: Final = 15.0
@@ -117,12 +124,13 @@ class Holding:
     def put(self, uuid: str, channel: int, value: float, unit: str | None, hold: float | None) -> dict[str, Any]:
         """Set and hold for ``hold`` seconds; again before they are over, it is held on. Returns when it was applied.
 
-        Raises PolicyRefused (whitelist, limits of the datasheet), NodeRefused (claimed by another), NoNode, BadData.
+        Raises PolicyError (whitelist, limits of the datasheet), NodeRefusedError (claimed by another), NoNodeError,
+        BadDataError.
         """
         try:
             require_whitelisted(self._station, bytes.fromhex(uuid))
         except TedsProvisionError as error:
-            with suppress(StoreFailure):
+            with suppress(StoreError):
                 facts = {"channel": channel, "value": value, "unit": unit or "", "why": error.message}
                 self._station.audit("set", bytes.fromhex(uuid), error.code, **facts)
             raise
@@ -163,9 +171,9 @@ class Holding:
         if held.error is not None and held.answered <= mine:
             raise held.error
         if held.let_go and held.answered < mine:
-            raise NodeBusy("The actuator was released before it took this value.", hint="Set it again.")
+            raise NodeBusyError("The actuator was released before it took this value.", hint="Set it again.")
         if held.answered < mine or held.applied is None:
-            raise LinkFailure("The actuator did not answer in time.", hint="Its dead-man takes it to its safe state.")
+            raise LinkError("The actuator did not answer in time.", hint="Its dead-man takes it to its safe state.")
         held.until = time.monotonic() + seconds
         return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
 
@@ -198,13 +206,13 @@ class Holding:
             with self._session(held.uuid) as session:
                 self._wait_for_the_one_before(held)
                 self._hold(held, session)
-        except SessionLost as lost:
-            held.error = LinkFailure(f"The session was lost: {lost.cause.message}", hint="It goes to its safe state.")
+        except SessionLostError as lost:
+            held.error = LinkError(f"The session was lost: {lost.cause.message}", hint="It goes to its safe state.")
         except TedsProvisionError as error:
             held.error = error
         finally:
             outcome = "done" if held.error is None else held.error.code
-            with suppress(StoreFailure):  # a full disk must not keep who waits for this waiting
+            with suppress(StoreError):  # a full disk must not keep who waits for this waiting
                 asked = {"value": held.order.value, "unit": held.order.unit or ""}
                 why = {} if held.error is None else {"why": held.error.message}
                 self._station.audit("set", node, outcome, safe=held.safe, **asked, **why, **facts)
@@ -241,7 +249,7 @@ class Holding:
     def _own_session(self, uuid: str) -> Iterator[Trusted]:
         contact = self._desk.contact(uuid)
         if contact is None:
-            raise NoNode(f"Node {uuid} is not on any bus of this station.", hint="Connect it to a bus.")
+            raise NoNodeError(f"Node {uuid} is not on any bus of this station.", hint="Connect it to a bus.")
         with self._turns.of(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
             yield open_trusted(self._station, node, by="ncap")
 
@@ -264,7 +272,7 @@ class Holding:
                 standing.require()
                 with session(held.uuid) as trusted:
                     if trusted is None:
-                        raise LinkFailure("The node is not connected now.", hint="Connect it to a bus.")
+                        raise LinkError("The node is not connected now.", hint="Connect it to a bus.")
                     if actuator is None or order.unit != unit:
                         actuator, unit = self._claimed(trusted, held, order, again=actuator is not None), order.unit
                     applied = actuator.apply(order.value)
@@ -306,11 +314,11 @@ class Holding:
         if not again:
             try:
                 actuator.__enter__()
-            except NodeRefused as refusal:
+            except NodeRefusedError as refusal:
                 if refusal.reason != Reason.WRONG_STATE:
                     raise
                 # It is claimed in this very session: by the set points of a topic, which only a measurement takes.
-                raise NodeBusy(
+                raise NodeBusyError(
                     f"Channel {held.channel} is controlled by set points from a topic.",
                     hint="Stop the publisher, then try again.",
                 ) from refusal

@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, Final
 
-from teds_provision.errors import BadData, NodeRefused, TedsProvisionError
+from teds_provision.errors import BadDataError, NodeRefusedError, TedsProvisionError
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import POWER, Power
 from teds_provision.station.station import Station
@@ -81,7 +81,7 @@ def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
             continue
         octets = read_block(node, block, until=until)
         if len(octets) > STRANGERS_OCTETS:
-            raise BadData(
+            raise BadDataError(
                 f"TEDS {block[1]} of channel {block[0]} has {len(octets)} octets: too long for an untrusted node."
             )
         blocks[block] = octets
@@ -95,7 +95,7 @@ def power_of(node: Conversation) -> dict[str, Any] | None:
     """128.18 in an open session, None where the node does not tell."""
     try:
         return Power.decode(node.send(POWER, "to tell its power")).as_json()
-    except (NodeRefused, BadData):
+    except (NodeRefusedError, BadDataError):
         return None
 
 

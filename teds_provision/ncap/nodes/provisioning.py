@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from teds_provision.errors import (
-    BadData,
-    NodeRefused,
-    NotFound,
-    PolicyRefused,
-    StoreFailure,
+    BadDataError,
+    NodeRefusedError,
+    NotFoundError,
+    PolicyError,
+    StoreError,
     TedsProvisionError,
-    UsageFailure,
+    UsageError,
 )
 from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
@@ -42,7 +42,7 @@ from teds_provision.steps.provision import Provisioned, newcomer, provision
 from teds_provision.steps.read import list_blocks
 from teds_provision.steps.verify import Verified, require_authentic
 from teds_provision.store.audit import ACTOR
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.progress import Silent, StepResult
 from teds_provision.teds.formats import placed
 
@@ -88,11 +88,11 @@ class Provisioning:
         self._guard = threading.Lock()
 
     def of(self, uuid: str) -> dict[str, Any]:
-        """How the last request for a node stands; raises NotFound."""
+        """How the last request for a node stands; raises NotFoundError."""
         with self._guard:
             run = self._runs.get(uuid)
         if run is None:
-            raise NotFound(f"No provisioning was requested for node {uuid}.", hint="Start one with POST.")
+            raise NotFoundError(f"No provisioning was requested for node {uuid}.", hint="Start one with POST.")
         return run.as_json()
 
     def begin(
@@ -110,13 +110,13 @@ class Provisioning:
 
         ``adopt``: the datasheet that the board brought is signed; ``accept`` says why it is right in spite of findings.
 
-        Raises UsageFailure, NotFound, BadData, PolicyRefused for what cannot be built, StoreFailure where no temporary
-        file can be written, before anybody is waited for.
+        Raises UsageError, NotFoundError, BadDataError, PolicyError for what cannot be built, StoreError where no
+        temporary file can be written, before anybody is waited for.
         """
         with self._guard:
             before = self._runs.get(uuid)
             if before is not None and before.state in ("waiting", "running"):
-                raise UsageFailure(f"Node {uuid} is already being provisioned.", hint="Cancel that first.")
+                raise UsageError(f"Node {uuid} is already being provisioned.", hint="Cancel that first.")
             run = self._runs[uuid] = Run(uuid)  # at once: a second request meanwhile is refused
         # The text of a calibration, as the file that the steps read; it is there until the run has ended.
         folder: tempfile.TemporaryDirectory[str] | None = None
@@ -138,7 +138,7 @@ class Provisioning:
                 if before is not None:
                     self._runs[uuid] = before
             if isinstance(error, OSError):
-                raise StoreFailure(
+                raise StoreError(
                     f"No temporary file can be written: {error.strerror or type(error).__name__}.",
                     hint=f"Make room in {tempfile.gettempdir()}, then try again.",
                 ) from error
@@ -163,11 +163,11 @@ class Provisioning:
         return run.as_json()
 
     def cancel(self, uuid: str) -> dict[str, Any]:
-        """Wait no more; a run that has begun goes on to its end. Raises NotFound."""
+        """Wait no more; a run that has begun goes on to its end. Raises NotFoundError."""
         with self._guard:
             run = self._runs.get(uuid)
         if run is None:
-            raise NotFound(f"No provisioning was requested for node {uuid}.")
+            raise NotFoundError(f"No provisioning was requested for node {uuid}.")
         if run.errand is not None and self._desk.cancel(run.errand):
             run.state, run.waits_for, run.until = "cancelled", None, None
             run.errand.done.set()
@@ -202,7 +202,7 @@ class Provisioning:
             with self._apart(run.uuid, "let go for provision"):
                 self._desk.with_node(run.uuid, "it is provisioned", work)
             clean()
-        except NodeRefused as refusal:
+        except NodeRefusedError as refusal:
             if refusal.reason != Reason.NOT_PERMITTED:
                 self._fail(run, as_problem(refusal))
                 clean()
@@ -232,7 +232,7 @@ class Provisioning:
             done: Provisioned = provision(
                 self._station, node, order, accept=lambda _who: None, reporter=reporter, adopt=lambda _brought: None
             )
-        except SessionLost as lost:
+        except SessionLostError as lost:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
         require_authentic(done.verified)
@@ -289,7 +289,7 @@ def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
         return None
     suffix = Path(name or "calibration.csv").suffix.lower()
     if suffix not in _SUFFIXES:
-        raise UsageFailure(
+        raise UsageError(
             f"Unsupported calibration file: {name!r}.", hint=f"Its name must end in {', '.join(_SUFFIXES)}."
         )
     path = folder / f"calibration{suffix}"
@@ -345,7 +345,9 @@ class Adopting:
             who = identify(self._station, node)
             listed = len(list_blocks(node))
             if listed > STRANGERS_TEDS:  # once it has a key, all of them would be read, again and again
-                raise BadData(f"Node {uuid} lists {listed} TEDS; one with more than {STRANGERS_TEDS} is not adopted.")
+                raise BadDataError(
+                    f"Node {uuid} lists {listed} TEDS; one with more than {STRANGERS_TEDS} is not adopted."
+                )
             entry = None if who.whitelisted is not None else newcomer(self._station, node, who)
             with self._station.turn(node.uuid):
                 agreed = agree(self._station, node, who, newcomer=entry)
@@ -373,7 +375,7 @@ class Adopting:
                 reporter=Silent(),
                 adopt=lambda _brought: None,
             )
-        except (BadData, PolicyRefused) as error:
+        except (BadDataError, PolicyError) as error:
             self._refused[uuid] = error
             self._live.event("node", uuid=uuid, state="not adopted", problem=as_problem(error))
             return False

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError, UsageError
 from teds_provision.lazy import late
 from teds_provision.ncap.nodes.desk import Desk
 from teds_provision.ncap.nodes.directory import NodeDirectory
@@ -57,7 +57,7 @@ class Sheets:
         self._station, self._roster, self._desk, self._measured = station, roster, desk, measured
 
     def read(self, uuid: str) -> ReadSheet:
-        """From the node where it is on a bus, else as it was last read; raises NotFound, and what reading raises."""
+        """From the node if it is on a bus, else as it was last read; raises NotFoundError, and what reading raises."""
         held = self._measured(uuid)
         if held is None and self._desk.on_a_bus(uuid):
             found = self._desk.with_node(uuid, "its datasheet is read", self._read)
@@ -66,7 +66,7 @@ class Sheets:
         kept = held or self._station.nodes.datasheet(bytes.fromhex(uuid))
         judged = verdict_of(self._station, bytes.fromhex(uuid))
         if kept is None or judged is None:
-            raise NotFound(
+            raise NotFoundError(
                 f"The datasheet of node {uuid} has never been read.",
                 hint="Connect it to the bus, or place it on the reader.",
             )
@@ -84,9 +84,9 @@ class Sheets:
         return ReadSheet(image, NodeVerdict(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
 
     def document(self, uuid: str, form: str) -> tuple[str, str]:
-        """The datasheet as a document, and its media type; raises UsageFailure for a format that is none of ours."""
+        """The datasheet as a document, and its media type; raises UsageError for a format that is none of ours."""
         if form not in FORMATS:
-            raise UsageFailure(f"Unsupported datasheet format: {form!r}.", hint=f"Use {', '.join(FORMATS)}.")
+            raise UsageError(f"Unsupported datasheet format: {form!r}.", hint=f"Use {', '.join(FORMATS)}.")
         image = self.read(uuid).image
         blocks = [TedsBlock(channel, code, image.blocks[channel, code]) for channel, code in image]
         text = write_blocks(blocks, form)  # type: ignore[arg-type]
@@ -148,9 +148,9 @@ class Sheets:
 
 
 def parsed(content: str) -> dict[BlockId, bytes]:
-    """The TEDS of a document in XML, JSON or hex; raises BadData."""
+    """The TEDS of a document in XML, JSON or hex; raises BadDataError."""
     if not content.strip():
-        raise BadData("The datasheet is empty.")
+        raise BadDataError("The datasheet is empty.")
     return placed(content.encode())
 
 

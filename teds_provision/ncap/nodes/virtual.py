@@ -23,7 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.files import write_whole
 from teds_provision.handover.life import DECOMMISSIONED
 from teds_provision.links.ports import free_port
@@ -123,13 +123,13 @@ class Virtuals:
     def make(self, *, name: str | None, source: str, content: str | None, profile: str | None) -> Virtual:
         """Make one from a datasheet (XML, JSON, hex) or a profile, whitelist it under the key in its file.
 
-        Raises UsageFailure, BadData, NotFound.
+        Raises UsageError, BadDataError, NotFoundError.
         """
         _check_source(source)
         if (content is None) == (profile is None):
-            raise UsageFailure("A virtual transducer needs a datasheet or a profile.", hint="Give exactly one of them.")
+            raise UsageError("A virtual transducer needs a datasheet or a profile.", hint="Give exactly one of them.")
         if len(self._all) >= MOST:
-            raise UsageFailure(f"This station already has {MOST} virtual transducers.", hint="Remove one first.")
+            raise UsageError(f"This station already has {MOST} virtual transducers.", hint="Remove one first.")
         folder = self._home / secrets.token_hex(6)
         try:
             one = self._create(folder, name or "", source, content, profile)
@@ -168,17 +168,17 @@ class Virtuals:
     def _require_free(self, uuid: bytes, address: int, name: str) -> None:
         """Refuse a UUID, an address or a name that another node has: that one would be tried again for ever."""
         if uuid.hex() in self._all or self._station.nodes.is_known(uuid):
-            raise UsageFailure(
+            raise UsageError(
                 f"Node {uuid.hex()} already exists.",
                 hint="Clear the UUID in its Meta-TEDS; a new one is generated.",
             )
         if address in self._addresses():
-            raise UsageFailure(
+            raise UsageError(
                 f"Another virtual transducer already uses CAN address 0x{address:02X}.",
                 hint="Clear the UUID in the datasheet's Meta-TEDS; a suitable one is generated.",
             )
         if name and (others := self._station.nodes.all_named(name)):
-            raise UsageFailure(f"Node {others[0].hex()} already has the name {name!r}.", hint="Choose another name.")
+            raise UsageError(f"Node {others[0].hex()} already has the name {name!r}.", hint="Choose another name.")
 
     def _addresses(self) -> set[int]:
         return {default_can_address(bytes.fromhex(uuid)) for uuid in self._all}
@@ -211,7 +211,7 @@ class Virtuals:
         return path.read_text(encoding="utf-8") if path.exists() else None
 
     def forget(self, uuid: str) -> Virtual:
-        """It is none of the station's any more, and still runs until :meth:`end`; raises NotFound."""
+        """It is none of the station's any more, and still runs until :meth:`end`; raises NotFoundError."""
         one, octets, station = self._virtual_of(uuid), bytes.fromhex(uuid), self._station
         with station.durable("virtual"):
             station.pins.remove(octets)
@@ -235,7 +235,7 @@ class Virtuals:
         with self._guard:
             found = self._all.get(uuid)
         if found is None:
-            raise NotFound(f"{uuid} is not a virtual transducer of this station.")
+            raise NotFoundError(f"{uuid} is not a virtual transducer of this station.")
         return found
 
     # -- the processes -----------------------------------------------------------------------------------------------
@@ -308,11 +308,11 @@ def _check_source(text: str) -> None:
     """Refuse what its process would refuse: that one would be started again and again."""
     kind, _, rest = text.partition(":")
     if not _SOURCES.match(text):
-        raise UsageFailure(
+        raise UsageError(
             f"{text!r} is not a valid source.", hint="Use noise, sine:SECONDS, ramp:SECONDS, file:/PATH or unix:/PATH."
         )
     if kind in ("sine", "ramp") and seconds_of(rest, kind) > _LONGEST_PERIOD:
-        raise UsageFailure(f"{text!r} is longer than a day.", hint=f"Give seconds, such as {kind}:2.")
+        raise UsageError(f"{text!r} is longer than a day.", hint=f"Give seconds, such as {kind}:2.")
 
 
 def _end(process: subprocess.Popen[bytes] | None) -> None:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
-from teds_provision.errors import AddressConflict, Frozen, LinkFailure, NodeBusy, TedsProvisionError
+from teds_provision.errors import AddressConflictError, FrozenError, LinkError, NodeBusyError, TedsProvisionError
 from teds_provision.links import Contact, Notice, Port, Trace
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.port import CanPort
@@ -31,7 +31,7 @@ from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.looking import Look, as_problem, look, read_anew
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.conversation import Conversation, SessionLostError
 
 # Whether a node that was seen on a bus is still there: it is asked itself, twice, before it is said to have left.
 #
@@ -72,9 +72,9 @@ class StillThere:
             try:
                 first = seconds == PATIENCE[0]
                 identity = self._port.identify(last.address, seconds=seconds, until_announced=first)
-            except AddressConflict:  # somebody is there, and that two are is told by whoever finds out
+            except AddressConflictError:  # somebody is there, and that two are is told by whoever finds out
                 return Sighting(last.identity, last.address, last.port, time.monotonic())
-            except LinkFailure:
+            except LinkError:
                 return None
             if identity is not None:
                 same = identity.uuid == last.uuid
@@ -226,7 +226,7 @@ class Watch:
             if self._anew.is_set():
                 self._anew.clear()
                 self._look_for_all()
-                with suppress(LinkFailure):
+                with suppress(LinkError):
                     bus.lookout.discover()
             failure = bus.lookout.failure
             self._say("up" if failure is None else "down", failure)
@@ -316,7 +316,7 @@ class Watch:
         if notice.kind == "node-left" and notice.uuid is not None:
             self._left(notice.uuid.hex())
         elif notice.kind == "reader-lost":
-            self._say("down", LinkFailure(notice.text))
+            self._say("down", LinkError(notice.text))
             self._roster.forget_place(self.place)
         elif notice.kind == "reader-ready":
             self._say("up")
@@ -394,13 +394,13 @@ class Watch:
             with self._turns.of(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
                 if not self._taps.serve_node(node):
                     self._look(node)
-        except Frozen:  # its measurement verified it, and says how it does
+        except FrozenError:  # its measurement verified it, and says how it does
             if contact.identity.state == NodeState.FACTORY:  # so it may be let go: who adopts looks at it then
                 self._looked_for.add(uuid)
             return
-        except NodeBusy as error:
+        except NodeBusyError as error:
             self._roster.note(uuid, problem=as_problem(error))
-        except SessionLost as lost:
+        except SessionLostError as lost:
             self._roster.note(uuid, "problem", problem=as_problem(lost.cause))
         except TedsProvisionError as error:
             self._roster.note(uuid, "problem", problem=as_problem(error))
@@ -445,7 +445,7 @@ class Watch:
                 Conversation(contact, notice=self._notice) as node,
             ):
                 found = read_anew(self._station, node)
-        except (TedsProvisionError, SessionLost):
+        except (TedsProvisionError, SessionLostError):
             return  # it was not read: what is shown stays as it was kept, and is read at the next look
         except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
             _log.exception("Reading the rest of node %s failed.", uuid)

@@ -18,16 +18,16 @@ from starlette.responses import JSONResponse, Response
 
 from teds_provision.api import schema
 from teds_provision.errors import (
-    Frozen,
-    LinkFailure,
-    NodeBusy,
-    NodeRefused,
-    NotFound,
-    StoreFailure,
+    FrozenError,
+    LinkError,
+    NodeBusyError,
+    NodeRefusedError,
+    NotFoundError,
+    StoreError,
     TedsProvisionError,
 )
 from teds_provision.ncap.sinks import for_readers
-from teds_provision.ncap.web.guard import CALLER, Caller, Refusal
+from teds_provision.ncap.web.guard import CALLER, Caller, RequestRefusedError
 from teds_provision.protocol.messages.frames import Reason
 
 Shape = TypeVar("Shape")
@@ -39,11 +39,11 @@ _CHANGING: Final = ThreadPoolExecutor(8, "works with a node")
 _MOVING: Final = ThreadPoolExecutor(16, "moves an actuator")
 
 _STATUS: Final[tuple[tuple[type[TedsProvisionError], int], ...]] = (
-    (NotFound, 404),
-    (Frozen, 409),
-    (NodeBusy, 423),
-    (LinkFailure, 503),
-    (StoreFailure, 503),
+    (NotFoundError, 404),
+    (FrozenError, 409),
+    (NodeBusyError, 423),
+    (LinkError, 503),
+    (StoreError, 503),
 )
 ASKED: Final = "teds.asked"
 """Where in a request's scope the short members of its body stand, for the audit log."""
@@ -53,7 +53,7 @@ _OTHERS: Final = 422  # guard, limits, bad data, policy: the request is understo
 
 def status_of(error: TedsProvisionError) -> int:
     """The status of an error (docs/contract/api.md)."""
-    if isinstance(error, NodeRefused) and error.reason == Reason.BUSY:
+    if isinstance(error, NodeRefusedError) and error.reason == Reason.BUSY:
         return 423
     return next((status for kind, status in _STATUS if isinstance(error, kind)), _OTHERS)
 
@@ -68,7 +68,7 @@ def answer_error(request: Request, error: Exception) -> Response:
 
 def answer_refusal(_request: Request, refusal: Exception) -> Response:
     """A Refusal from within a route (a body that is too long, or does not match its schema)."""
-    assert isinstance(refusal, Refusal)
+    assert isinstance(refusal, RequestRefusedError)
     error = {"code": refusal.code, "message": refusal.message, "hint": refusal.hint}
     return JSONResponse({"error": error}, refusal.status)
 
@@ -80,11 +80,11 @@ def answer_bug(_request: Request, error: Exception) -> Response:
 
 
 async def body_of(request: Request, shape: type[Shape]) -> Shape:
-    """The body of a request as its type; raises Refusal (422 bad-request) where the description forbids it."""
+    """The body of a request as its type; raises RequestRefusedError (422 bad-request) if the description forbids it."""
     try:
         found = schema.read(shape, await request.body())
-    except schema.BadRequest as error:
-        raise Refusal(422, "bad-request", error.message, error.hint) from error
+    except schema.BadRequestError as error:
+        raise RequestRefusedError(422, "bad-request", error.message, error.hint) from error
     request.scope[ASKED] = {name: one for name, one in vars(found).items() if _is_short(one)}
     return found
 

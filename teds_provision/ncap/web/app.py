@@ -18,13 +18,13 @@ from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from teds_provision.api.operations import API
-from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
+from teds_provision.errors import NotFoundError, StoreError, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import LiveClient
 from teds_provision.ncap.web import metrics
 from teds_provision.ncap.web.answers import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.clause12 import Clause12
-from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, Refusal
+from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, RequestRefusedError
 from teds_provision.ncap.web.resources import Resources
 from teds_provision.ncap.web.tokens import Tokens
 
@@ -60,7 +60,7 @@ def build(daemon: Daemon) -> Starlette:
         routes.append(Mount("/", _Page(directory=PAGE, html=True)))
     handlers: dict[Any, Any] = {
         TedsProvisionError: _noted(daemon),
-        Refusal: answer_refusal,
+        RequestRefusedError: answer_refusal,
         404: _no_page,
         405: _no_method,
         Exception: answer_bug,
@@ -80,12 +80,12 @@ def _noted(daemon: Daemon) -> Callable[[Request, Exception], Awaitable[Response]
         node = str(request.path_params.get("uuid") or members.get("uuid", ""))
         uuid = bytes.fromhex(node) if _UUID.fullmatch(node) else None
         facts = {"method": request.method, "path": request.url.path[:_LONGEST_PATH], "why": error.message}
-        with suppress(StoreFailure):
+        with suppress(StoreError):
             daemon.station.audit("api", uuid, error.code, **{**asked, **facts})
 
     async def answer(request: Request, error: Exception) -> Response:
         assert isinstance(error, TedsProvisionError)
-        told = not isinstance(error, NotFound | StoreFailure) and "number" not in request.path_params
+        told = not isinstance(error, NotFoundError | StoreError) and "number" not in request.path_params
         if request.method not in SAFE and told:
             await changing(note, request, error)
         return answer_error(request, error)
@@ -114,7 +114,7 @@ def _no_method(request: Request, error: Exception) -> Response:
 
 
 async def _nothing(_request: Request) -> Response:
-    raise NotFound("Resource not found.", hint="See /api/v1/openapi.json.")
+    raise NotFoundError("Resource not found.", hint="See /api/v1/openapi.json.")
 
 
 class Places:
@@ -200,7 +200,7 @@ async def _end_in_time(socket: WebSocket, tokens: Tokens, caller: Caller, leavin
 def _is_good(tokens: Tokens, digest: str) -> bool:
     try:
         return tokens.is_good(digest)
-    except StoreFailure:  # a file that cannot be read lets nobody in, nor stay
+    except StoreError:  # a file that cannot be read lets nobody in, nor stay
         return False
 
 

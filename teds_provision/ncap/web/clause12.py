@@ -18,7 +18,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from teds_provision.errors import NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import NotFoundError, TedsProvisionError, UsageError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.web.answers import reading
 from teds_provision.sanitize import printable
@@ -49,13 +49,15 @@ class Clause12:
         path = request.path_params["path"].removesuffix(".htm")
         name = next((one for one in self._resources if one.lower() == path.lower()), None)
         if name is None:
-            raise NotFound("This clause 12 path is not supported.", hint=f"Supported: {', '.join(self._resources)}.")
+            raise NotFoundError(
+                "This clause 12 path is not supported.", hint=f"Supported: {', '.join(self._resources)}."
+            )
         given = {key.lower(): value for key, value in request.query_params.items()}
         try:
             fields = {"errorCode": NO_ERROR, **await reading(self._resources[name], given)}
-        except NotFound as error:
+        except NotFoundError as error:
             fields = {"errorCode": NO_SUCH, "errorMessage": error.message}
-        except UsageFailure as error:
+        except UsageError as error:
             fields = {"errorCode": BAD_ARGUMENT, "errorMessage": error.message}
         except TedsProvisionError as error:
             fields = {"errorCode": FAILED, "errorMessage": error.message}
@@ -83,7 +85,7 @@ class Clause12:
         """The last value of a channel."""
         uuid, channel = self._uuid(given), _integer(given, "channelId")
         if channel not in {number for number, _ in self._daemon.roster.channel_names(uuid)}:
-            raise NotFound(f"Node {uuid} has no channel {channel}.")
+            raise NotFoundError(f"Node {uuid} has no channel {channel}.")
         last = self._daemon.live.last(uuid, channel)
         ids = {"timId": self._number(uuid), "channelId": channel}
         if last is None or last.value is None:
@@ -99,14 +101,14 @@ class Clause12:
                 fields = {field.get("name", ""): field.get("text", "") for field in one["fields"]}
                 ids = {"timId": self._number(uuid), "channelId": channel, "tedsType": code}
                 return {**ids, "teds": json.dumps(fields, ensure_ascii=False)}
-        raise NotFound(f"Node {uuid} has no TEDS {code} of channel {channel}.")
+        raise NotFoundError(f"Node {uuid} has no TEDS {code} of channel {channel}.")
 
     def read_raw_teds(self, given: dict[str, str]) -> Fields:
         """One TEDS, its octets in base64."""
         uuid, channel, code = self._teds(given)
         octets = self._daemon.sheets.read(uuid).image.blocks.get((channel, code))
         if octets is None:
-            raise NotFound(f"Node {uuid} has no TEDS {code} of channel {channel}.")
+            raise NotFoundError(f"Node {uuid} has no TEDS {code} of channel {channel}.")
         raw = base64.b64encode(octets).decode()
         return {"timId": self._number(uuid), "channelId": channel, "tedsType": code, "rawTEDS": raw}
 
@@ -122,7 +124,7 @@ class Clause12:
         if found is not None:
             return found
         if not word:
-            raise UsageFailure("timId is missing.")
+            raise UsageError("timId is missing.")
         return self._daemon.known(word)
 
     def _teds(self, given: dict[str, str]) -> tuple[str, int, int]:
@@ -133,7 +135,7 @@ class Clause12:
 def _integer(given: dict[str, str], name: str) -> int:
     word = given.get(name.lower(), "")
     if not word.isdecimal() or int(word) > 0xFFFF:
-        raise UsageFailure(f"{name} must be a number.")
+        raise UsageError(f"{name} must be a number.")
     return int(word)
 
 

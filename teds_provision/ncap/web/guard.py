@@ -18,7 +18,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final, Literal
 from urllib.parse import parse_qs
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import StoreError
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.store.audit import ACTOR, by_token
@@ -73,7 +73,7 @@ class Caller:
 
 
 @dataclass(eq=False)
-class Refusal(Exception):
+class RequestRefusedError(Exception):
     """A request that goes no further: status, and code, message and hint as everywhere."""
 
     status: int
@@ -141,8 +141,8 @@ class Guard:
             ACTOR.set(scope[CALLER].actor)
             _require_form(scope, headers, scope[CALLER])
             await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, with_headers)
-        except (Refusal, StoreFailure) as error:
-            refusal = error if isinstance(error, Refusal) else _unreadable(error)
+        except (RequestRefusedError, StoreError) as error:
+            refusal = error if isinstance(error, RequestRefusedError) else _unreadable(error)
             if not begun:
                 await _refuse(scope, with_headers, refusal, as_page=_wants_html(scope))
 
@@ -156,28 +156,30 @@ class Guard:
         cookie, bearer = _cookie(headers, self.front.cookie), _bearer(headers)
         given = bearer or cookie
         if not given:
-            raise Refusal(401, "no-token", "A token is required.", "Open the page with: teds-provision ncap open")
+            raise RequestRefusedError(
+                401, "no-token", "A token is required.", "Open the page with: teds-provision ncap open"
+            )
         found = await asyncio.to_thread(self.tokens.find, given)
         if found is None:
             raise await self._wrong_token()
         if scope["type"] == "websocket" and found.kind == "browser" and "origin" not in headers:
-            raise Refusal(403, "no-origin", "The WebSocket request has no Origin header.")
+            raise RequestRefusedError(403, "no-origin", "The WebSocket request has no Origin header.")
         return Caller(found.name, found.kind, found.read_only, found.digest)
 
-    async def _login(self, scope: Scope) -> Refusal:
+    async def _login(self, scope: Scope) -> RequestRefusedError:
         """Trade the token of `ncap open` for a cookie; told as a redirection to the page without it."""
         assert self.front is not None
         if scope["method"] != "GET":
-            return Refusal(405, "usage", "The login address takes GET requests only.")
+            return RequestRefusedError(405, "usage", "The login address takes GET requests only.")
         given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
         cookie = await asyncio.to_thread(self.tokens.login, given)
         if cookie is None:
             return await self._wrong_token()
         secure = "; Secure" if self.front.tls else ""
         value = f"{self.front.cookie}={cookie}; HttpOnly; SameSite=Strict; Path=/; Max-Age=2592000{secure}"
-        return Refusal(303, "", "", headers=((b"set-cookie", value.encode()), (b"location", b"/")))
+        return RequestRefusedError(303, "", "", headers=((b"set-cookie", value.encode()), (b"location", b"/")))
 
-    async def _wrong_token(self) -> Refusal:
+    async def _wrong_token(self) -> RequestRefusedError:
         now = time.monotonic()
         while self._wrong and now - self._wrong[0] > _WRONG_WITHIN:
             self._wrong.popleft()
@@ -186,8 +188,8 @@ class Guard:
             if len(self._wrong) > 10 * _WRONG_TOKENS:
                 self._wrong.popleft()
             await self._slow_down()  # a right token is never slowed down: nobody can lock the others out
-            return Refusal(429, "too-many", "Too many wrong tokens.", headers=((b"retry-after", b"60"),))
-        return Refusal(
+            return RequestRefusedError(429, "too-many", "Too many wrong tokens.", headers=((b"retry-after", b"60"),))
+        return RequestRefusedError(
             401, "wrong-token", "This token is invalid or has expired.", "Get a new one: teds-provision ncap open"
         )
 
@@ -200,10 +202,10 @@ class Guard:
                 self._slowed -= 1
 
 
-def _unreadable(failure: StoreFailure) -> Refusal:
+def _unreadable(failure: StoreError) -> RequestRefusedError:
     """The file of the tokens cannot be read: nobody is let in, and whoever asks is told no folder."""
     told = for_readers({"message": failure.message, "hint": failure.hint})
-    return Refusal(503, failure.code, told["message"], told["hint"])
+    return RequestRefusedError(503, failure.code, told["message"], told["hint"])
 
 
 def _headers(scope: Scope) -> dict[str, str]:
@@ -211,10 +213,10 @@ def _headers(scope: Scope) -> dict[str, str]:
     for name, value in scope["headers"]:
         key = name.decode("latin-1").lower()
         if key in found and key in ("host", "origin", "content-length", "content-type", "authorization"):
-            raise Refusal(400, "usage", f"Header {key} appears twice.")
+            raise RequestRefusedError(400, "usage", f"Header {key} appears twice.")
         found[key] = value.decode("latin-1") if key not in found else f"{found[key]}; {value.decode('latin-1')}"
     if "content-length" in found and "transfer-encoding" in found:  # RFC 9112, section 6.3: who reads which is unknown
-        raise Refusal(
+        raise RequestRefusedError(
             400,
             "usage",
             "A request must not have both Content-Length and Transfer-Encoding.",
@@ -225,16 +227,16 @@ def _headers(scope: Scope) -> dict[str, str]:
 
 def _require_origin(named: Front, headers: Mapping[str, str]) -> None:
     if headers.get("host", "").lower() not in named.hosts:
-        raise Refusal(
+        raise RequestRefusedError(
             421,
             "foreign-host",
             "This host name is not allowed.",
             "Use the address that ncap open prints; see --http-allow.",
         )
     if "origin" in headers and headers["origin"].lower() not in named.origins:
-        raise Refusal(403, "foreign-origin", "Requests from another origin are not allowed.")
+        raise RequestRefusedError(403, "foreign-origin", "Requests from another origin are not allowed.")
     if headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
-        raise Refusal(403, "foreign-origin", "Requests from another site are not allowed.")
+        raise RequestRefusedError(403, "foreign-origin", "Requests from another site are not allowed.")
 
 
 def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> None:
@@ -243,16 +245,16 @@ def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> N
         return
     length = headers.get("content-length", "")
     if length.isdecimal() and int(length) > LARGEST_BODY:
-        raise Refusal(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
+        raise RequestRefusedError(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
     if scope["method"] in SAFE:
         return
     if caller.read_only:
-        raise Refusal(
+        raise RequestRefusedError(
             403, "read-only", f"Token {caller.name!r} is read-only.", "Use a token that was added without --read-only."
         )
     empty = scope["method"] == "DELETE" and length in ("", "0") and "transfer-encoding" not in headers
     if not empty and headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise Refusal(
+        raise RequestRefusedError(
             415, "not-json", "Requests that change something must be JSON.", "Send Content-Type: application/json."
         )
 
@@ -266,7 +268,7 @@ def _limited(receive: Receive) -> Receive:
         message = await receive()
         taken += len(message.get("body", b""))
         if taken > LARGEST_BODY:
-            raise Refusal(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
+            raise RequestRefusedError(413, "too-large", f"The request body may have at most {LARGEST_BODY} octets.")
         return message
 
     return next_message
@@ -290,7 +292,7 @@ def _wants_html(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] == "GET" and b"text/html" in accept
 
 
-async def _refuse(scope: Scope, send: Send, refusal: Refusal, *, as_page: bool) -> None:
+async def _refuse(scope: Scope, send: Send, refusal: RequestRefusedError, *, as_page: bool) -> None:
     """Tell it as JSON, to a browser's address line as a plain page."""
     if as_page and refusal.code:
         text = f"<!doctype html><html lang=en><meta charset=utf-8><title>{refusal.status}</title>"

@@ -24,7 +24,7 @@ from teds_provision.api.operations import (
     MOST_POINTS,
     document,
 )
-from teds_provision.errors import NotFound, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.measuring import LONGEST_LOAN, Loan
 from teds_provision.ncap.nodes.directory import for_reader
@@ -103,14 +103,16 @@ class Resources:
         """GET /plant."""
         found = await asyncio.to_thread(self._daemon.plant.status)
         if found is None:
-            raise NotFound("This station has joined no registry.", hint="Join one: teds-provision registry connect")
+            raise NotFoundError(
+                "This station has joined no registry.", hint="Join one: teds-provision registry connect"
+            )
         return _shown(request, found)
 
     async def plant_nodes(self, request: Request) -> Response:
         """GET /plant/nodes."""
         text = request.query_params.get("text", "")
         if len(text) > LONGEST_TEXT:
-            raise UsageFailure(f"text may have at most {LONGEST_TEXT} characters.")
+            raise UsageError(f"text may have at most {LONGEST_TEXT} characters.")
         return _shown(request, await reading(self._daemon.plant.nodes, text))
 
     async def jobs(self, request: Request) -> Response:
@@ -142,7 +144,7 @@ class Resources:
         before = _integer(request, "before", 0, FURTHEST, least=1) or None
         text = words.get("text")
         if text is not None and len(text) > LONGEST_TEXT:
-            raise UsageFailure(f"text may have at most {LONGEST_TEXT} characters.")
+            raise UsageError(f"text may have at most {LONGEST_TEXT} characters.")
         failed = words.get("failed", "0") not in ("0", "", "false")
         since = _moment("since", words["since"]) if words.get("since") else None
         choice = Choice(act=words.get("act") or None, failed=failed, text=text or None, before=before, since=since)
@@ -181,7 +183,7 @@ class Resources:
         caller: Caller = request.scope[CALLER]
         body = await body_of(request, bodies.LoginLink)
         if caller.kind != "socket":
-            raise PolicyRefused(
+            raise PolicyError(
                 "Login links are only issued on the station's own machine.", hint="Run there: teds-provision ncap open"
             )
         return JSONResponse({"url": self._daemon.login_url(read_only=bool(body.read_only))})
@@ -190,7 +192,7 @@ class Resources:
         """GET /lend: the readers are the caller's for as long as this answer is not ended; over the socket alone."""
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket":
-            raise PolicyRefused("Readers can only be borrowed on the station's own machine.")
+            raise PolicyError("Readers can only be borrowed on the station's own machine.")
         watches = list(self._daemon.watches)
 
         async def lent() -> AsyncIterator[str]:
@@ -214,7 +216,7 @@ class Resources:
         """
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket":
-            raise PolicyRefused("A measured node is only let go to a command on the station's own machine.")
+            raise PolicyError("A measured node is only let go to a command on the station's own machine.")
         uuid = request.path_params["uuid"].lower()
         measuring, until = self._daemon.measuring, time.monotonic() + LONGEST_LOAN
         why = f"let go for {request.query_params.get('for', 'a command')[:40]}"
@@ -373,7 +375,7 @@ class Resources:
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket" and source.startswith(("file:", "unix:")):
             # An error about a file quotes a piece of it: no token reads this user's files.
-            raise PolicyRefused(
+            raise PolicyError(
                 "A file or socket can only be named as a source on the station's own machine.",
                 hint="Use noise, sine:S or ramp:S.",
             )
@@ -387,7 +389,7 @@ class Resources:
         """DELETE /virtual/UUID."""
         uuid = request.path_params["uuid"].lower()
         if uuid not in self._daemon.virtuals:
-            raise NotFound(f"{uuid} is not a virtual transducer of this station.")
+            raise NotFoundError(f"{uuid} is not a virtual transducer of this station.")
         await changing(self._daemon.drop_virtual, uuid)
         return JSONResponse({"virtual": self._daemon.virtuals.all()})
 
@@ -403,7 +405,7 @@ def _integer(request: Request, name: str, default: int, most: int, least: int = 
     if text is None:
         return default
     if not (text.isascii() and text.isdecimal() and len(text) <= _DIGITS and least <= int(text) <= most):
-        raise UsageFailure(f"{name} must be a whole number from {least} to {most}.")
+        raise UsageError(f"{name} must be a whole number from {least} to {most}.")
     return int(text)
 
 
@@ -421,7 +423,7 @@ def _moment(name: str, text: str) -> str:
         at = datetime.fromtimestamp(float(text), UTC) if _UNIX.fullmatch(text) else datetime.fromisoformat(text)
         return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))  # a zone may leave the years that there are
     except (ValueError, OverflowError, OSError):
-        raise UsageFailure(f"{name} must be a time such as 2026-11-22T10:00:00Z, or unix seconds.") from None
+        raise UsageError(f"{name} must be a time such as 2026-11-22T10:00:00Z, or unix seconds.") from None
 
 
 def _sentence(outcome: str, detail: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.ncap.settings import Settings
 from teds_provision.ncap.web.guard import CALLER, App
 
@@ -113,7 +113,7 @@ class _Server(uvicorn.Server):
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening TCP socket; raises LinkFailure where the address is taken or not this machine's."""
+    """A listening TCP socket; raises LinkError where the address is taken or not this machine's."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -122,7 +122,7 @@ def listen(host: str, port: int) -> socket.socket:
         listener.listen(128)
     except (OSError, OverflowError) as error:
         listener.close()
-        raise LinkFailure(
+        raise LinkError(
             f"Cannot serve the page on {host}:{port}: {getattr(error, 'strerror', None) or error}.",
             hint="Choose another address with --http.",
         ) from error

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from teds_provision.errors import NotFound, StoreFailure, UsageFailure
+from teds_provision.errors import NotFoundError, StoreError, UsageError
 from teds_provision.files import open_lock, read_limited, write_whole
 
 FILE: Final = "ncap-tokens.json"
@@ -61,24 +61,24 @@ class Tokens:
     # -- for the command line ----------------------------------------------------------------------------------------
 
     def add(self, name: str, *, read_only: bool = False) -> str:
-        """Make a token for a script; it is given back once and nowhere else. Raises UsageFailure for a taken name."""
+        """Make a token for a script; it is given back once and nowhere else. Raises UsageError for a taken name."""
         if not name.strip() or not name.isprintable() or len(name) > _LONGEST_NAME:
-            raise UsageFailure(f"{name!r} is not a valid token name.", hint="Use up to 64 printable characters.")
+            raise UsageError(f"{name!r} is not a valid token name.", hint="Use up to 64 printable characters.")
         with self._changing() as tokens:
             if any(one.name == name and one.kind == "script" for one in tokens):
-                raise UsageFailure(f"Token {name!r} already exists.", hint=f"Remove it: ncap token remove {name}")
+                raise UsageError(f"Token {name!r} already exists.", hint=f"Remove it: ncap token remove {name}")
             token = secrets.token_urlsafe(32)
             tokens.append(Token(name, "script", digest_of(token), read_only, time.time()))
         return token
 
     def remove(self, name: str) -> int:
-        """Take tokens of this name away, at once also for who uses one now; raises NotFound."""
+        """Take tokens of this name away, at once also for who uses one now; raises NotFoundError."""
         with self._changing() as tokens:
             kept = [one for one in tokens if one.name != name]
             gone = len(tokens) - len(kept)
             if not gone:
                 known = ", ".join(dict.fromkeys(one.name for one in tokens)) or "none"
-                raise NotFound(f"No token is named {name!r}.", hint=f"Known tokens: {known}.")
+                raise NotFoundError(f"No token is named {name!r}.", hint=f"Known tokens: {known}.")
             tokens[:] = kept
         return gone
 
@@ -140,7 +140,7 @@ class Tokens:
             stamp = status.st_mtime_ns, status.st_ino
             if stamp != self._stamp:
                 self._known, self._stamp = (
-                    _parsed(read_limited(path, _MOST_OCTETS, "tokens", failure=StoreFailure)),
+                    _parsed(read_limited(path, _MOST_OCTETS, "tokens", failure=StoreError)),
                     stamp,
                 )
             return self._known
@@ -164,7 +164,7 @@ def _parsed(octets: bytes) -> list[Token]:
         rows: list[dict[str, Any]] = json.loads(octets)["tokens"]
         return [Token(**row) for row in rows]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise StoreFailure(
+        raise StoreError(
             f"{FILE} cannot be read, so no token is accepted.",
             hint="Remove the file and create new tokens: ncap token add NAME",
         ) from error

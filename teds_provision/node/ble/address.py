@@ -7,7 +7,7 @@ import secrets
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import StoreFailure, TedsProvisionError
+from teds_provision.errors import StoreError, TedsProvisionError
 from teds_provision.files import read_limited, whole_file
 from teds_provision.links.hints import BleAddress
 
@@ -37,7 +37,7 @@ class StaticAddress:
         return BleAddress(self._octets, random=True)
 
     def look(self, *, factory: bool) -> bool:
-        """Take note of the node's state; True where the address has changed. Raises StoreFailure."""
+        """Take note of the node's state; True where the address has changed. Raises StoreError."""
         if self._keyed and factory:
             self._renew(keyed=False)
             return True
@@ -54,7 +54,7 @@ class StaticAddress:
             with whole_file(self._path, replace=True) as file:
                 file.write(json.dumps({"address": octets.hex(), "keyed": keyed}).encode())
         except OSError as error:
-            raise StoreFailure(f"{self._path} cannot be written: {error.strerror}.") from error
+            raise StoreError(f"{self._path} cannot be written: {error.strerror}.") from error
         self._octets, self._keyed = octets, keyed
 
     def _read(self) -> tuple[bytes, bool]:

@@ -12,7 +12,7 @@ from collections.abc import Coroutine
 from contextlib import suppress
 from typing import Any, Final, TypeVar
 
-from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.errors import LinkError, NoReaderError, UsageError
 from teds_provision.lazy import how_to_install
 from teds_provision.links.hints import BleAddress
 from teds_provision.node.ble.address import StaticAddress
@@ -26,13 +26,13 @@ _SEND_SECONDS: Final = 2.0
 
 
 class BleServer:
-    """Serves ``node`` over the controller ``transport``; see LinkServer. Raises UsageFailure without bumble."""
+    """Serves ``node`` over the controller ``transport``; see LinkServer. Raises UsageError without bumble."""
 
     def __init__(self, transport: str, node: InTheAir, address: StaticAddress) -> None:
         try:
             import bumble  # noqa: F401
         except ImportError:
-            raise UsageFailure(
+            raise UsageError(
                 "A node's BLE needs bumble, which is not installed.",
                 hint=how_to_install("ble-node"),
             ) from None
@@ -48,14 +48,14 @@ class BleServer:
         return self._address.address
 
     def start(self) -> None:
-        """Open the controller; raises NoReader where it does not answer."""
+        """Open the controller; raises NoReaderError where it does not answer."""
         self._thread.start()
         try:
             self._run(self._open(), _OPEN_SECONDS)
         except (OSError, ValueError, TimeoutError, RuntimeError) as error:
             self.stop()
             why = str(error) or type(error).__name__
-            raise NoReader(
+            raise NoReaderError(
                 f"The Bluetooth controller {self._transport} does not open: {why}.",
                 hint="usb:0 needs a dongle that the kernel leaves alone (hciconfig hci0 down), and the right to it.",
             ) from error
@@ -74,14 +74,14 @@ class BleServer:
             self._loop.call_soon_threadsafe(self._peripheral.tapped)
 
     def send_data(self, frame: DataFrame) -> None:
-        """Send a data message; waits until the controller has taken it. Raises LinkFailure."""
+        """Send a data message; waits until the controller has taken it. Raises LinkError."""
         peripheral = self._peripheral
         if peripheral is None:
             return
         try:
             self._run(peripheral.notify_data(frame.link_source, frame.data), _SEND_SECONDS)
         except TimeoutError as error:
-            raise LinkFailure("The Bluetooth controller takes no data.") from error
+            raise LinkError("The Bluetooth controller takes no data.") from error
 
     async def _open(self) -> None:
         from bumble.host import Host

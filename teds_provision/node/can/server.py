@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
+from teds_provision.errors import LinkError, NoReaderError, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, Reassembly, addresses, physical_id, read_single, single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
@@ -194,7 +194,7 @@ class CanServer:
         self._nodes.append((handler, counts_as_tapped, measuring))
 
     def start(self) -> None:
-        """Open the bus and listen; raises NoReader or UsageFailure where it cannot."""
+        """Open the bus and listen; raises NoReaderError or UsageError where it cannot."""
         self._bus = Bus(self._spec)
         self._stop.clear()
         self._crew = Crew()
@@ -236,7 +236,7 @@ class CanServer:
             pairs.difference_update([entry for entry in pairs if entry[0] is seat])
 
     def send_data(self, handler: NodeHandler, identifier: int, data: bytes, *, fd: bool) -> None:
-        """Put a data frame of a node on the bus; raises LinkFailure where that is lost.
+        """Put a data frame of a node on the bus; raises LinkError where that is lost.
 
         The bus may take its time over it: what others send is heard meanwhile.
         """
@@ -256,7 +256,7 @@ class CanServer:
             while not self._stop.is_set():
                 try:
                     self._serve_one(woken)
-                except LinkFailure:
+                except LinkError:
                     with self._lock:
                         self._lose_lines()
                     if time.monotonic() - came_back > 2 * _LAST_REOPEN:
@@ -400,7 +400,7 @@ class CanServer:
             self._end_answer_to_everyone(line, pair)
             try:
                 pair.send(reply)
-            except LinkFailure:
+            except LinkError:
                 return  # the reading thread meets the same failure and deals with it
             line.replying = pair
             self._note(line.seat, pair)
@@ -453,7 +453,7 @@ class CanServer:
         while not self._stop.wait(seconds):
             try:
                 self._bus = Bus(self._spec)
-            except (LinkFailure, NoReader):
+            except (LinkError, NoReaderError):
                 continue
             with self._lock:
                 self._addresses.announce_all()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.node import sources
 from teds_provision.node.hardware.clock import NANOSECONDS, NodeClock
 from teds_provision.node.hardware.converter import Converter
@@ -97,7 +97,7 @@ class Board:
     """Channels of ``sheet``; ``source`` is the text of ``--source``.
 
     ``shown`` is called with what actuators do, from any thread, and must return at once; ``tell`` is given what a
-    person should know. Raises BadData where a channel cannot be imitated, and what the source raises.
+    person should know. Raises BadDataError where a channel cannot be imitated, and what the source raises.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class Board:
             return RawReading(bytes(converter.form.octets), valid=False)
         try:
             return RawReading(converter.octets(given))
-        except BadData:  # no way from a value to a sample: nothing that could be shown
+        except BadDataError:  # no way from a value to a sample: nothing that could be shown
             return RawReading(bytes(converter.form.octets), valid=False)
 
     @property
@@ -228,7 +228,7 @@ class Board:
         converter = self.converters[channel]
         try:
             return converter.octets(Reading(value=converter.low) if math.isfinite(converter.low) else Reading(raw=0.0))
-        except BadData:
+        except BadDataError:
             return bytes(converter.form.octets)
 
     def _raw_limits(self, channel: int) -> tuple[float, float]:
@@ -236,7 +236,7 @@ class Board:
         converter = self.converters[channel]
         try:
             ends = sorted(converter.raw(limit) for limit in (converter.low, converter.high))
-        except (BadData, OverflowError):
+        except (BadDataError, OverflowError):
             return -math.inf, math.inf
         if not all(map(math.isfinite, ends)):
             return -math.inf, math.inf
@@ -269,7 +269,7 @@ def _self_test_seconds(stated: float) -> float:
 
 def _facts(channel: Channel) -> ChannelHardware:
     if channel.sample is None or channel.kind is None:
-        raise BadData(f"The datasheet does not say how a sample of channel {channel.number} is coded.")
+        raise BadDataError(f"The datasheet does not say how a sample of channel {channel.number} is coded.")
     period = channel.period if math.isfinite(channel.period) and channel.period > 0 else 0.0
     return ChannelHardware(
         ChannelKind(channel.kind),

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.node.sources.base import Place, Reading
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import DataModel, SampleReader
@@ -26,12 +26,12 @@ class Converter:
     """Converts for one channel of the datasheet that the node was made with.
 
     Where that has no calibration, an integer channel is an ideal converter: its range is spread evenly over the raw
-    numbers. Raises BadData where samples of that form cannot be made.
+    numbers. Raises BadDataError where samples of that form cannot be made.
     """
 
     def __init__(self, sheet: Sheet, channel: Channel) -> None:
         if channel.sample is None:
-            raise BadData(f"The datasheet does not say how a sample of channel {channel.number} is coded.")
+            raise BadDataError(f"The datasheet does not say how a sample of channel {channel.number} is coded.")
         self.form = channel.sample
         self._writer = SampleReader(channel.sample)
         self._channel = channel
@@ -58,7 +58,7 @@ class Converter:
     def octets(self, reading: Reading) -> bytes:
         """The sample that the channel gives; values are kept within the limits, and rounded to what a sample holds.
 
-        Raises BadData where there is no way from the value to a sample.
+        Raises BadDataError where there is no way from the value to a sample.
         """
         return self.write(reading.raw if reading.raw is not None else self.raw(reading.value or 0.0))
 
@@ -119,7 +119,7 @@ class Converter:
         knots = np.linspace(self._from, self._to, 2 * _KNOTS - 1)
         try:
             raws = self._interpreter.raw_numbers(knots)
-        except BadData:
+        except BadDataError:
             return None
         between = (raws[0:-1:2] + raws[2::2]) / 2
         tolerance = _INTEGER_TOLERANCE if self.form.integer else _FLOAT_TOLERANCE * float(np.abs(raws).max())

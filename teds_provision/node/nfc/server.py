@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.links.nfc.nfcpy import nfc
 from teds_provision.links.nfc.udp import NodeDevice, address_of, frontend
 from teds_provision.node.handler import NodeHandler
@@ -79,7 +79,7 @@ class NfcServer:
     ``uid`` has 4, 7 or 10 octets (Type 2: 7), random when None. ``wt_int`` (0 to 63) and ``n_wait`` (0 to 15) are
     announced; ``max_ndef`` octets is the longest NDEF message, by default 4160 (Type 4) or 499 (Type 2, its most).
     ``pace`` makes every frame last as long as on air at 106 kbit/s; with ``queue`` it waits while another node lies
-    there. ``extras`` are further records of the initial message. Raises UsageFailure for what does not fit.
+    there. ``extras`` are further records of the initial message. Raises UsageError for what does not fit.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class NfcServer:
         self._address = address_of(path)
         self._uid = uid or (b"\x08" + os.urandom(3) if tag == "4" else b"\x02" + os.urandom(6))
         if len(self._uid) not in ((7,) if tag == "2" else (4, 7, 10)):
-            raise UsageFailure(f"A Type {tag} tag cannot have a UID of {len(self._uid)} octets.")
+            raise UsageError(f"A Type {tag} tag cannot have a UID of {len(self._uid)} octets.")
         self._type4, self._type2 = None, None
         if tag == "4":
             self._type4 = nfc_type4.Type4Memory(max_ndef or TYPE4_MAX_NDEF)
@@ -113,15 +113,19 @@ class NfcServer:
         self._thread = threading.Thread(target=self._serve, name="nfc-tag", daemon=True)
 
     def start(self) -> None:
-        """Lie down on the reader. Raises NoReader, also where another node lies there and does not leave."""
+        """Lie down on the reader. Raises NoReaderError, also where another node lies there and does not leave."""
         self._device = NodeDevice(*self._address)
         if self._pace:
             self._device.air = Air()
         try:
             if not self._bound() and not self._queue:
-                raise NoReader(f"Another node or program is using {self._path}.", hint="Stop it, or use another port.")
+                raise NoReaderError(
+                    f"Another node or program is using {self._path}.", hint="Stop it, or use another port."
+                )
         except OSError as error:
-            raise NoReader(f"The node cannot use {self._path}: {error.strerror}.", hint="Try another port.") from error
+            raise NoReaderError(
+                f"The node cannot use {self._path}: {error.strerror}.", hint="Try another port."
+            ) from error
         self._tnep.start()
         self._thread.start()
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.hints import MIME, OUT_OF_BAND
 from teds_provision.links.nfc.message import WELL_KNOWN, NdefRecord
@@ -201,7 +201,7 @@ class TnepTag:
             if payload is None or not self._selected:
                 return message.encode([tnep.status(tnep.PROTOCOL_ERROR)])
             piece = self._responder.answer(Piece.decode(payload), room(self._memory.max_ndef, STATUS_OCTETS))
-        except Garbled:
+        except GarbledError:
             return message.encode([tnep.status(tnep.GARBLED_REQUEST)])
         return message.encode([tnep.status(tnep.SUCCESS), tnep.payload_record(piece.encode())])
 

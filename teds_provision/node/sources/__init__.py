@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.node.sources import command, lines, noise, ramp, recorded, sine
 from teds_provision.node.sources.base import Place, Source, Tell
 
@@ -25,10 +25,10 @@ ONE_NODE_ONLY: Final = frozenset({"-", "unix"})
 
 
 def kind_of(text: str) -> str:
-    """The word before the colon of ``--source``; raises UsageFailure for one that is not known."""
+    """The word before the colon of ``--source``; raises UsageError for one that is not known."""
     kind = text.partition(":")[0]
     if kind not in SOURCES:
-        raise UsageFailure(
+        raise UsageError(
             f"--source {text!r} is not known.",
             hint="Use noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH or exec:COMMAND.",
         )
@@ -36,6 +36,6 @@ def kind_of(text: str) -> str:
 
 
 def make_source(text: str, places: Sequence[Place], tell: Tell) -> Source:
-    """The source that ``--source`` names, for these sensors; raises UsageFailure, NotFound or BadData."""
+    """The source that ``--source`` names, for these sensors; raises UsageError, NotFoundError or BadDataError."""
     kind = kind_of(text)
     return SOURCES[kind](text.partition(":")[2], places, tell)

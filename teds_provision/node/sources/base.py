@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 
 
 class Reading(NamedTuple):
@@ -106,5 +106,5 @@ def seconds_of(text: str, word: str) -> float:
     except ValueError:
         period = math.nan
     if not (math.isfinite(period) and period > 0):
-        raise UsageFailure(f"{word}:{text} has no period.", hint=f"Write seconds: {word}:2, or {word}:20ms.")
+        raise UsageError(f"{word}:{text} has no period.", hint=f"Write seconds: {word}:2, or {word}:20ms.")
     return period

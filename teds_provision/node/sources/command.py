@@ -10,7 +10,7 @@ import subprocess
 import threading
 from collections.abc import Mapping, Sequence
 
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import NotFoundError, UsageError
 from teds_provision.node.sources.base import Drive, Place, Tell
 from teds_provision.node.sources.lines import Lines, feed
 
@@ -27,7 +27,7 @@ class CommandSource(Lines):
         self._stopped = False
 
     def start(self, drive: Drive) -> None:
-        """Start the program; raises NotFound where there is none. Its errors go to our standard error."""
+        """Start the program; raises NotFoundError where there is none. Its errors go to our standard error."""
         try:
             self._process = subprocess.Popen(
                 self._words,
@@ -36,7 +36,7 @@ class CommandSource(Lines):
                 start_new_session=True,  # Ctrl-C is for the node, which then ends its program
             )
         except OSError as error:
-            raise NotFound(f"The program {self._words[0]} cannot be started: {error.strerror}.") from error
+            raise NotFoundError(f"The program {self._words[0]} cannot be started: {error.strerror}.") from error
         assert self._process.stdin is not None
         os.set_blocking(self._process.stdin.fileno(), False)
         self.begin(drive)
@@ -76,7 +76,7 @@ def make(argument: str, places: Sequence[Place], tell: Tell) -> CommandSource:
     try:
         words = shlex.split(argument)
     except ValueError as error:
-        raise UsageFailure(f"exec: {error}.", hint="Close the quotes.") from error
+        raise UsageError(f"exec: {error}.", hint="Close the quotes.") from error
     if not words:
-        raise UsageFailure("exec: needs a program.", hint="Write --source 'exec:./hand --rate 100'.")
+        raise UsageError("exec: needs a program.", hint="Write --source 'exec:./hand --rate 100'.")
     return CommandSource(places, tell, words)

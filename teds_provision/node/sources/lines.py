@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Final, TypeGuard
 
-from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.node.sources.base import Drive, Place, Reading, Tell
 
 LONGEST_LINE: Final = 1 << 20
@@ -183,11 +183,11 @@ class UnixSocket(Lines):
         self._thread: threading.Thread | None = None
 
     def start(self, drive: Drive) -> None:
-        """Listen; a socket that a killed node left is replaced. Raises NoReader."""
+        """Listen; a socket that a killed node left is replaced. Raises NoReaderError."""
         try:
             self._listening = self._bound()
         except OSError as error:
-            raise NoReader(
+            raise NoReaderError(
                 f"The node cannot listen on {self._path}: {error.strerror or error}.", hint="Name another path."
             ) from error
         self._thread = threading.Thread(target=self._run, args=(drive,), name="source", daemon=True)
@@ -268,5 +268,5 @@ def make_stream(argument: str, places: Sequence[Place], tell: Tell) -> StandardI
 def make_socket(argument: str, places: Sequence[Place], tell: Tell) -> UnixSocket:
     """``unix:/run/user/1000/hand.sock``."""
     if not argument:
-        raise UsageFailure("unix: needs a path.", hint="Write --source unix:/tmp/hand.sock.")
+        raise UsageError("unix: needs a path.", hint="Write --source unix:/tmp/hand.sock.")
     return UnixSocket(places, tell, Path(argument))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.node.sources.base import Generated, Place, Reading, Tell
 
 
@@ -21,5 +21,5 @@ class Noise(Generated):
 def make(argument: str, places: Sequence[Place], tell: Tell) -> Noise:
     """``noise`` takes no argument."""
     if argument:
-        raise UsageFailure(f"noise takes no argument, not {argument!r}.", hint="Write --source noise.")
+        raise UsageError(f"noise takes no argument, not {argument!r}.", hint="Write --source noise.")
     return Noise(places)

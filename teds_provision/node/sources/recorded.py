@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import read_text
 from teds_provision.node.sources.base import Generated, Place, Reading, Tell
 
@@ -49,9 +49,9 @@ class Recorded(Generated):
 
 
 def make(argument: str, places: Sequence[Place], tell: Tell) -> Recorded:
-    """``file:run.csv``; raises NotFound, and BadData with the line that is wrong."""
+    """``file:run.csv``; raises NotFoundError, and BadDataError with the line that is wrong."""
     if not argument:
-        raise UsageFailure("file: needs a file.", hint="Write --source file:run.csv.")
+        raise UsageError("file: needs a file.", hint="Write --source file:run.csv.")
     return read(Path(argument), places, tell)
 
 
@@ -75,7 +75,7 @@ def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> 
     """Each row with the number of its line; every one has as many fields as the first line names."""
     for (line, _), row in zip(lines[1:], fields[1:], strict=True):
         if len(row) != len(fields[0]):
-            raise BadData(f"{path}, line {line}: {len(row)} fields, the first line names {len(fields[0])}.")
+            raise BadDataError(f"{path}, line {line}: {len(row)} fields, the first line names {len(fields[0])}.")
         yield line, row
 
 
@@ -84,14 +84,16 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     text = read_text(path, MOST_OCTETS, "file of values")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if len(lines) < 2:
-        raise BadData(f"{path} has no rows of values.", hint="First line: t,NAME,NAME …; then a row for each instant.")
+        raise BadDataError(
+            f"{path} has no rows of values.", hint="First line: t,NAME,NAME …; then a row for each instant."
+        )
     return lines
 
 
 def _time(path: Path, line: int, text: str, before: list[float]) -> float:
     time = _number(path, line, text)
     if time is None or (before and time < before[-1]):
-        raise BadData(f"{path}, line {line}: times must be ascending numbers.")
+        raise BadDataError(f"{path}, line {line}: times must be ascending numbers.")
     return time
 
 
@@ -106,16 +108,16 @@ def _columns(path: Path, header: list[str], places: Sequence[Place]) -> list[tup
     numbers = {place.name: place.number for place in places if place.name}
     found: list[tuple[int, int, bool]] = []
     if not any(name.lower() in _TIME_NAMES for name in header):
-        raise BadData(f"{path}: there is no column t.", hint="First line: t,NAME,NAME …")
+        raise BadDataError(f"{path}: there is no column t.", hint="First line: t,NAME,NAME …")
     for index, name in enumerate(header):
         raw = name.startswith(_RAW)
         number = numbers.get(name.removeprefix(_RAW))
         if number is not None:
             if any(number == other for other, _, _ in found):
-                raise BadData(f"{path}: two columns are for the channel {name.removeprefix(_RAW)}.")
+                raise BadDataError(f"{path}: two columns are for the channel {name.removeprefix(_RAW)}.")
             found.append((number, index, raw))
         elif name.lower() not in _TIME_NAMES:
-            raise BadData(f"{path}: the node has no sensor named {name!r}.", hint=f"It has: {', '.join(numbers)}.")
+            raise BadDataError(f"{path}: the node has no sensor named {name!r}.", hint=f"It has: {', '.join(numbers)}.")
     return found
 
 
@@ -126,5 +128,5 @@ def _number(path: Path, line: int, text: str) -> float | None:
     try:
         number = float(text)
     except ValueError:
-        raise BadData(f"{path}, line {line}: {text[:40]!r} is not a number.") from None
+        raise BadDataError(f"{path}, line {line}: {text[:40]!r} is not a number.") from None
     return number if math.isfinite(number) else None

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Literal, cast
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.envelope import PIECE, Sealing, Source, Unsealed, as_file, read_envelope, unseal
@@ -91,13 +91,13 @@ class Bundle:
 def check_rules(bundle: Bundle) -> None:
     """The rules between members, the same for sender and receiver."""
     if bundle.mode == "move" and len(bundle.to) != 1:
-        raise PolicyRefused(f"A move has exactly one receiver, this one {len(bundle.to)}.")
+        raise PolicyError(f"A move has exactly one receiver, this one {len(bundle.to)}.")
     if not bundle.to:
-        raise BadData("The bundle names no receiver.")
+        raise BadDataError("The bundle names no receiver.")
     if bundle.expires <= bundle.created:
-        raise BadData("The bundle expires before it was made.")
+        raise BadDataError("The bundle expires before it was made.")
     if len({node.uuid for node in bundle.nodes}) != len(bundle.nodes):
-        raise BadData("The bundle names an UUID twice.")
+        raise BadDataError("The bundle names an UUID twice.")
 
 
 def _check_writable(node: BundledNode) -> None:
@@ -108,7 +108,7 @@ def _check_writable(node: BundledNode) -> None:
         and 0 <= node.sequence <= LAST_U32
         and all(map(is_label, filter(None, (node.profile, node.name, *node.groups))))
     ):
-        raise BadData(f"The node {node.uuid.hex()} cannot be put into a bundle: a member is out of its range.")
+        raise BadDataError(f"The node {node.uuid.hex()} cannot be put into a bundle: a member is out of its range.")
 
 
 def payload_of(bundle: Bundle) -> bytes:
@@ -143,7 +143,7 @@ def payload_pieces(bundle: Bundle, nodes: Iterable[BundledNode], count: int) -> 
             yield bytes(piece)
             piece.clear()
     if len(seen) != count:
-        raise BadData(f"The bundle was to hold {count} different nodes, and holds {len(seen)}.")
+        raise BadDataError(f"The bundle was to hold {count} different nodes, and holds {len(seen)}.")
     yield bytes(piece) + b"]" + (b',"revoked":' + dump(list(bundle.revoked)) if bundle.revoked else b"") + b"}"
 
 
@@ -167,17 +167,17 @@ def _text(text: str | None) -> str:
 
 
 def from_json(octets: bytearray) -> Bundle:
-    """Read what was signed; ``octets`` is emptied on the way. Raises BadData, NotAuthentic, PolicyRefused."""
+    """Read what was signed; ``octets`` is emptied on the way. Raises BadDataError, NotAuthenticError, PolicyError."""
     read = _NodeReader()
     members = Members(load_long(octets, "The bundle", "nodes", read.each), "The bundle")
     if members.get("format") != FORMAT:
-        raise BadData(f"The bundle's format is not {FORMAT}.", hint="A newer teds-provision may read it.")
+        raise BadDataError(f"The bundle's format is not {FORMAT}.", hint="A newer teds-provision may read it.")
     mode = members.get("mode")
     if mode not in ("copy", "move"):
-        raise BadData("The bundle's mode is neither copy nor move.")
+        raise BadDataError("The bundle's mode is neither copy nor move.")
     nodes = members.list_of("nodes")
     if members.u32("count") != len(nodes):
-        raise BadData(f"The bundle says that it holds {members.get('count')} nodes, and holds {len(nodes)}.")
+        raise BadDataError(f"The bundle says that it holds {members.get('count')} nodes, and holds {len(nodes)}.")
     bundle = Bundle(
         id=members.random_id("id"),
         sender=members.sha256("from"),
@@ -199,7 +199,7 @@ class _NodeReader:
 
     def __init__(self) -> None:
         self._number = 0
-        self._complaint: BadData | NotAuthentic | None = None
+        self._complaint: BadDataError | NotAuthenticError | None = None
 
     def each(self, node: object) -> BundledNode | None:
         """Read the next node, None from the first on that cannot be read."""
@@ -207,7 +207,7 @@ class _NodeReader:
         if self._complaint is None:
             try:
                 return _read_node(Members(node, "It"))
-            except (BadData, NotAuthentic) as error:
+            except (BadDataError, NotAuthenticError) as error:
                 text = f"Node {self._number} of the bundle cannot be taken. {error.message}"
                 self._complaint = type(error)(text)
                 self._complaint.__cause__ = error
@@ -234,7 +234,7 @@ def _read_node(members: Members) -> BundledNode:
         teds_sha256=members.sha256_or_none("teds_sha256"),
     )
     if kid != node.kid:
-        raise NotAuthentic("The kid is not that of its link key.")
+        raise NotAuthenticError("The kid is not that of its link key.")
     return node
 
 
@@ -245,7 +245,7 @@ def _shared(text: str | None) -> str | None:
 
 def _signatures(value: object) -> dict[str, bytes]:
     if not isinstance(value, dict):
-        raise BadData("The bundle's station_signatures are not an object.")
+        raise BadDataError("The bundle's station_signatures are not an object.")
     receivers = fingerprints(list(value), "The list of station_signatures")
     return {
         receiver: decode_base64url(signature, "A station signature")
@@ -255,7 +255,7 @@ def _signatures(value: object) -> dict[str, bytes]:
 
 def _statement(text: object) -> str:
     if not isinstance(text, str):
-        raise BadData("A revocation in the bundle is not a compact JWS.")
+        raise BadDataError("A revocation in the bundle is not a compact JWS.")
     return text
 
 
@@ -312,14 +312,14 @@ def seal_pieces(
 
     Its ``signed_sha256``, the digest of what was signed, is what the receipt will name.
 
-    Raises BadData or PolicyRefused where the payload breaks a rule that :func:`open_bundle` would hold against it.
+    Raises BadDataError or PolicyError where the payload breaks a rule that :func:`open_bundle` would hold against it.
     """
     if any(not is_point(point) for point in recipients):
-        raise BadData("A recipient's key is not a P-256 point.")
+        raise BadDataError("A recipient's key is not a P-256 point.")
     if payload.sender != fingerprint(sender.point):
-        raise BadData("The bundle names another sender than the key that signs it.")
+        raise BadDataError("The bundle names another sender than the key that signs it.")
     if sorted(payload.to) != sorted(map(fingerprint, recipients)):
-        raise BadData("The bundle names other recipients than the keys that it is sealed to.")
+        raise BadDataError("The bundle names other recipients than the keys that it is sealed to.")
     check_rules(payload)
     for point in recipients:
         _station_signature(payload, point)
@@ -328,12 +328,12 @@ def seal_pieces(
 
 
 def _within(pieces: Iterable[bytes], count: int) -> Iterator[bytes]:
-    """Pieces of a payload; raises BadData where the bundle becomes longer than a reader takes."""
+    """Pieces of a payload; raises BadDataError where the bundle becomes longer than a reader takes."""
     octets = 0
     for piece in pieces:
         octets += len(piece)
         if octets > _MAX_PAYLOAD_OCTETS:
-            raise BadData(f"{count} nodes are too many for one bundle.", hint="Export them in groups.")
+            raise BadDataError(f"{count} nodes are too many for one bundle.", hint="Export them in groups.")
         yield piece
 
 
@@ -349,12 +349,12 @@ def open_bundle(
 
     Without ``now`` its times are left to :func:`check_times`: one that was taken in before gives its receipt again.
 
-    Raises PolicyRefused (not for this station, expired, dated in the future, algorithm), NotAuthentic (unknown sender,
-    signature, tag, SIG104, kid of a key) or BadData (form, ranges, count, an UUID twice).
+    Raises PolicyError (not for this station, expired, dated in the future, algorithm), NotAuthenticError (unknown
+    sender, signature, tag, SIG104, kid of a key) or BadDataError (form, ranges, count, an UUID twice).
     """
     bundle, opened = _opened(source, recipient, trusted, max_octets)
     if fingerprint(recipient.point) not in bundle.to:
-        raise PolicyRefused("The bundle does not name this station as a receiver, though it is sealed to it.")
+        raise PolicyError("The bundle does not name this station as a receiver, though it is sealed to it.")
     if now is not None:
         check_times(bundle, now)
     revocations, unknown = open_revocations(bundle.revoked, trusted)
@@ -370,19 +370,19 @@ def open_bundle(
 
 
 def check_times(bundle: Bundle, now: datetime) -> None:
-    """Raise PolicyRefused for a bundle that has expired, or that was made in the future."""
+    """Raise PolicyError for a bundle that has expired, or that was made in the future."""
     if bundle.created > now + CLOCK_TOLERANCE:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The bundle was made in the future ({time_text(bundle.created)}).", hint="Compare both stations' clocks."
         )
     if now >= bundle.expires:
-        raise PolicyRefused(
+        raise PolicyError(
             f"The bundle expired at {time_text(bundle.expires)}.", hint="Ask the sender to export it again."
         )
 
 
 def peek_bundle(source: Source) -> BundleHeader:
-    """Read the header and the recipients of a bundle without any key; raises BadData."""
+    """Read the header and the recipients of a bundle without any key; raises BadDataError."""
     envelope = read_envelope(as_file(source), MAX_BUNDLE_OCTETS)
     header = jose.header_of(envelope.document)
     return BundleHeader(
@@ -400,7 +400,7 @@ def _opened(source: Source, recipient: PrivateKey, trusted: FindKey, max_octets:
     opened = unseal(source, recipient, trusted, typ=TYPE, cty=CONTENT_TYPE, max_octets=max_octets)
     bundle = from_json(opened.payload)
     if bundle.sender != opened.kid:
-        raise NotAuthentic("The bundle names another sender than the one who signed it.")
+        raise NotAuthenticError("The bundle names another sender than the one who signed it.")
     return bundle, opened
 
 
@@ -408,5 +408,5 @@ def _station_signature(bundle: Bundle, station: bytes) -> bytes | None:
     """SIG104 over ``station``, verified; None where there is none."""
     signature = bundle.station_signatures.get(fingerprint(station))
     if signature is not None and not verify(bundle.ca, station_key_message(station), signature):
-        raise NotAuthentic("The CA's signature over the receiver's key does not verify under the bundle's CA.")
+        raise NotAuthenticError("The CA's signature over the receiver's key does not verify under the bundle's CA.")
     return signature

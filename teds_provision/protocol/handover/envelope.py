@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 
 from cryptography.exceptions import InvalidTag
 
-from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.errors import BadDataError, NotAuthenticError
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover.jose import (
     CHANGED_CONTENT,
@@ -135,7 +135,7 @@ def as_file(source: Source) -> BinaryIO:
 def unseal(source: Source, key: PrivateKey, find_key: FindKey, *, typ: str, cty: str, max_octets: int) -> Unsealed:
     """Open a JWE that names ``key`` among its recipients, and check the JWS in it by a key that ``find_key`` trusts.
 
-    Raises NotAuthentic, PolicyRefused or BadData, as :func:`.jose.decrypt` and :func:`.jose.verify_compact` do.
+    Raises NotAuthenticError, PolicyError or BadDataError, as :func:`.jose.decrypt` and :func:`.jose.verify_compact` do.
     """
     file = as_file(source)
     envelope = read_envelope(file, max_octets)
@@ -147,13 +147,13 @@ def unseal(source: Source, key: PrivateKey, find_key: FindKey, *, typ: str, cty:
     try:
         opener.finalize()
     except InvalidTag as error:
-        raise NotAuthentic(CHANGED_CONTENT) from error
+        raise NotAuthenticError(CHANGED_CONTENT) from error
     kid, signer = check_signature(*jws.signed(), find_key, typ)
     return Unsealed(kid, signer, jws.payload(), jws.sha256, envelope.sha256)
 
 
 def read_envelope(file: BinaryIO, max_octets: int) -> Envelope:
-    """Read the JSON of a JWE, leaving the inner part of a long ciphertext where it is; raises BadData.
+    """Read the JSON of a JWE, leaving the inner part of a long ciphertext where it is; raises BadDataError.
 
     A run of base64url characters in a JSON text is replaced by another one and what is read is the same but for that
     run; so it is no matter in which member, or in which piece of the file, it begins.
@@ -183,7 +183,7 @@ class _Outline:
         self._separators = 0
 
     def take(self, piece: bytes) -> None:
-        """Read on; raises BadData for more separators than a JWE has."""
+        """Read on; raises BadDataError for more separators than a JWE has."""
         here, self.octets = self.octets, self.octets + len(piece)
         self.digest.update(piece)
         if not self._is_run(piece, here):
@@ -224,11 +224,11 @@ def _ciphertext(file: BinaryIO, envelope: Envelope) -> Iterator[bytes]:
 
 def _ascii(text: object) -> bytes:
     if not isinstance(text, str):
-        raise BadData("The ciphertext is not a base64url string.")
+        raise BadDataError("The ciphertext is not a base64url string.")
     try:
         return text.encode("ascii")
     except UnicodeEncodeError as error:
-        raise BadData("The ciphertext is not base64url without padding.") from error
+        raise BadDataError("The ciphertext is not base64url without padding.") from error
 
 
 class _SplitJws:
@@ -244,7 +244,7 @@ class _SplitJws:
         self._dots = 0
         self._hash = hashlib.sha256()
         self._digest = b""
-        self._fault: BadData | None = None
+        self._fault: BadDataError | None = None
 
     def more(self, text: bytes) -> None:
         """Take the next characters."""
@@ -258,13 +258,13 @@ class _SplitJws:
             self._part(part)
 
     def signed(self) -> tuple[bytes, bytes, bytes]:
-        """Return header and signature as they came, and the digest of what was signed; raises BadData."""
+        """Return header and signature as they came, and the digest of what was signed; raises BadDataError."""
         if self._dots != 2:
-            raise BadData(NO_COMPACT_JWS)
+            raise BadDataError(NO_COMPACT_JWS)
         return bytes(self._edges[0]), bytes(self._edges[1]), self._digest
 
     def payload(self) -> bytearray:
-        """Return the payload, once the signature is known to be good; raises BadData."""
+        """Return the payload, once the signature is known to be good; raises BadDataError."""
         if self._fault is not None:
             raise self._fault
         return self._octets
@@ -285,6 +285,6 @@ class _SplitJws:
         if self._fault is None:
             try:
                 self._octets += read()
-            except BadData as fault:
+            except BadDataError as fault:
                 self._fault = fault
                 self._octets.clear()

@@ -3,8 +3,8 @@
 RFC 7515, 7516 and 7518 sections 3.4, 4.6 and 5.3, on ``cryptography``, for keys that may lie in a token: a
 :class:`PrivateKey` signs and agrees, nothing here sees its scalar. Exactly these algorithms exist; a header cannot ask
 for another one, for compression, or for anything "critical". Every octet string ends in a value or in
-:class:`NotAuthentic` (signature, tag), :class:`PolicyRefused` (algorithm, extension, recipient) or :class:`BadData`
-(form, size). What a key in a token raises (``VaultFailure``) passes through.
+:class:`NotAuthenticError` (signature, tag), :class:`PolicyError` (algorithm, extension, recipient) or
+:class:`BadDataError` (form, size). What a key in a token raises (``VaultError``) passes through.
 
 The profile's rule that s must be low does not hold in JOSE: other people's signers give either s.
 """
@@ -29,7 +29,7 @@ from cryptography.hazmat.primitives.ciphers.modes import GCM
 from cryptography.hazmat.primitives.kdf.concatkdf import ConcatKDFHash
 from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
 
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover.strict_json import (
     Base64urlWriter,
@@ -104,12 +104,12 @@ def signed_header(key: PrivateKey, typ: str) -> bytes:
 def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: int) -> VerifiedJws:
     """Check a compact JWS of this ``typ`` whose ``kid`` is the fingerprint of a key that ``find_key`` trusts.
 
-    The payload is decoded only under a good signature. Raises NotAuthentic, PolicyRefused or BadData.
+    The payload is decoded only under a good signature. Raises NotAuthenticError, PolicyError or BadDataError.
     """
     check_size(len(octets), max_octets, "the signed document")
     parts = octets.split(b".", 3)
     if len(parts) != 3:
-        raise BadData(NO_COMPACT_JWS)
+        raise BadDataError(NO_COMPACT_JWS)
     message = memoryview(octets)[: len(octets) - len(parts[2]) - 1]
     kid, signer = check_signature(parts[0], parts[2], hashlib.sha256(message).digest(), find_key, typ)
     return VerifiedJws(kid, signer, decode_base64url(parts[1], "The payload"))
@@ -120,24 +120,24 @@ def check_signature(
 ) -> tuple[str, bytes]:
     """Check the header and the signature of a compact JWS; ``digest`` is the SHA-256 of what is signed.
 
-    Returns ``kid`` and point of the signer. Raises NotAuthentic, PolicyRefused or BadData.
+    Returns ``kid`` and point of the signer. Raises NotAuthenticError, PolicyError or BadDataError.
     """
     header = _header(header_text, "The JWS header")
     _only(header, "alg", (SIGNATURE_ALGORITHM,), "signature algorithm")
     _no_extensions(header)
     if str(header.get("typ", "")).lower().removeprefix("application/") != typ:
-        raise BadData(f"This document says that it is {_shown(header.get('typ'))}, not {typ}.")
+        raise BadDataError(f"This document says that it is {_shown(header.get('typ'))}, not {typ}.")
     kid = header.get("kid")
     if not isinstance(kid, str):
-        raise BadData("The JWS header names no signer (kid).")
+        raise BadDataError("The JWS header names no signer (kid).")
     signer = find_key(kid)
     if signer is None or fingerprint(signer) != kid:
-        raise NotAuthentic(
+        raise NotAuthenticError(
             f"Nobody trusted here has the key {kid[:16]!r} that signed this.",
             hint="Compare the fingerprint with its owner by voice, then: teds-provision trust add NAME FILE.",
         )
     if not _es256_good(signer, digest, decode_base64url(signature_text, "The signature")):
-        raise NotAuthentic(f"The signature does not verify under the key {kid[:16]}: the content was changed.")
+        raise NotAuthenticError(f"The signature does not verify under the key {kid[:16]}: the content was changed.")
     return kid, signer
 
 
@@ -157,12 +157,12 @@ class JweWriter:
     """A JWE in the General JSON serialization, written a piece at a time: ``begin``, ``more`` of the payload, ``end``.
 
     Algorithms and ``cty`` are in the protected header, ``kid`` (the fingerprint) and ``epk`` with each recipient. The
-    tag comes last: without :meth:`end` nobody can open what was written. Raises BadData for a bad point.
+    tag comes last: without :meth:`end` nobody can open what was written. Raises BadDataError for a bad point.
     """
 
     def __init__(self, recipients: Sequence[bytes], *, cty: str) -> None:
         if not 1 <= len(recipients) <= MAX_RECIPIENTS:
-            raise BadData(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients, not {len(recipients)}.")
+            raise BadDataError(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients, not {len(recipients)}.")
         protected = encode_base64url(dump({"alg": KEY_ALGORITHM, "cty": cty, "enc": CONTENT_ALGORITHM}))
         content_key, iv = os.urandom(_KEY_OCTETS), os.urandom(_IV_OCTETS)
         entries = [_recipient_entry(point, content_key) for point in recipients]
@@ -211,7 +211,7 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
     """Open a JWE that names ``key`` among its recipients; General or Flattened JSON serialization.
 
     A recipient entry is ours where its ``kid`` is our fingerprint, or where it has no ``kid``. Size is looked at before
-    anything is parsed. Raises NotAuthentic, PolicyRefused or BadData.
+    anything is parsed. Raises NotAuthenticError, PolicyError or BadDataError.
     """
     document = _document(octets, max_octets)
     content_key, seal = content_key_for(document, key, cty=cty)
@@ -219,7 +219,7 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
     try:
         return AESGCM(content_key).decrypt(seal.iv, ciphertext + seal.tag, seal.additional)
     except InvalidTag as error:
-        raise NotAuthentic(CHANGED_CONTENT) from error
+        raise NotAuthenticError(CHANGED_CONTENT) from error
 
 
 @dataclass(frozen=True)
@@ -251,25 +251,25 @@ def content_key_for(document: Mapping[str, Any], key: PrivateKey, *, cty: str) -
         _only(header, "enc", (CONTENT_ALGORITHM,), "content encryption")
         _no_extensions(header)
         if str(header.get("cty", "")).lower() != cty.lower():
-            raise BadData(f"The sealed content says that it is {_shown(header.get('cty'))}, not {cty}.")
+            raise BadDataError(f"The sealed content says that it is {_shown(header.get('cty'))}, not {cty}.")
         content_key = _content_key(header, entry, key)
         if content_key is not None:
             return content_key, _seal(document)
     if not named:
-        raise PolicyRefused(
+        raise PolicyError(
             f"This was not sealed for this station ({own[:16]}).",
             hint="Ask the sender to export it for this station; teds-provision show FILE names the recipients.",
         )
-    raise NotAuthentic("The sealed key does not open: it was changed, or made for another key under this name.")
+    raise NotAuthenticError("The sealed key does not open: it was changed, or made for another key under this name.")
 
 
 def read_header(octets: bytes, *, max_octets: int) -> JweHeader:
-    """Read what a JWE says in the clear, without any key; raises BadData."""
+    """Read what a JWE says in the clear, without any key; raises BadDataError."""
     return header_of(_document(octets, max_octets))
 
 
 def header_of(document: Mapping[str, Any]) -> JweHeader:
-    """Read what a JWE that :func:`parse_document` gave says in the clear; raises BadData."""
+    """Read what a JWE that :func:`parse_document` gave says in the clear; raises BadDataError."""
     shared = _shared_header(document)
     headers = [
         _merged(shared, _mapping(entry.get("header"), "The header of a recipient")) for entry in _entries(document)
@@ -289,9 +289,9 @@ def _document(octets: bytes, max_octets: int) -> dict[str, Any]:
 
 
 def parse_document(octets: bytes) -> dict[str, Any]:
-    """Read the JSON of a JWE, whose size the caller has bounded; raises BadData."""
+    """Read the JSON of a JWE, whose size the caller has bounded; raises BadDataError."""
     if octets[:64].lstrip(b" \t\r\n")[:1] != b"{":
-        raise BadData("This is not a JWE in a JSON serialization.")
+        raise BadDataError("This is not a JWE in a JSON serialization.")
     refuse_many(separators(octets), MAX_SEPARATORS, "a JWE")
     return load_object(octets, "The sealed document")
 
@@ -299,7 +299,7 @@ def parse_document(octets: bytes) -> dict[str, Any]:
 def _shared_header(document: Mapping[str, Any]) -> dict[str, Any]:
     protected = _header(document.get("protected"), "The protected header")
     if "enc" not in protected:
-        raise BadData("The protected header names no content encryption (enc).")
+        raise BadDataError("The protected header names no content encryption (enc).")
     return _merged(protected, _mapping(document.get("unprotected"), "The unprotected header"))
 
 
@@ -309,9 +309,9 @@ def _entries(document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
         return iter((document,))
     entries = document["recipients"]
     if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_RECIPIENTS:
-        raise BadData(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients.")
+        raise BadDataError(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients.")
     if "encrypted_key" in document or "header" in document:
-        raise BadData("A JWE is in the General or in the Flattened form, not in both.")
+        raise BadDataError("A JWE is in the General or in the Flattened form, not in both.")
     return iter([_mapping(entry, "A recipient") for entry in entries])
 
 
@@ -321,7 +321,7 @@ def _content_key(header: Mapping[str, Any], entry: Mapping[str, Any], key: Priva
     wrapped = decode_base64url(entry.get("encrypted_key"), "The encrypted key")
     party_u, party_v = _party_info(header, "apu"), _party_info(header, "apv")
     if len(wrapped) != _WRAPPED_OCTETS:
-        raise BadData(f"The encrypted key has {len(wrapped)} octets, not {_WRAPPED_OCTETS}.")
+        raise BadDataError(f"The encrypted key has {len(wrapped)} octets, not {_WRAPPED_OCTETS}.")
     try:
         return aes_key_unwrap(_wrapping_key(key.ecdh(one_time), party_u, party_v), wrapped)
     except InvalidUnwrap:
@@ -331,14 +331,16 @@ def _content_key(header: Mapping[str, Any], entry: Mapping[str, Any], key: Priva
 def _party_info(header: Mapping[str, Any], name: str) -> bytes:
     octets = decode_base64url(header[name], name) if name in header else b""
     if len(octets) > _MAX_PARTY_INFO_OCTETS:
-        raise BadData(f"The header {name} is longer than {_MAX_PARTY_INFO_OCTETS} octets.")
+        raise BadDataError(f"The header {name} is longer than {_MAX_PARTY_INFO_OCTETS} octets.")
     return octets
 
 
 def _seal(document: Mapping[str, Any]) -> Seal:
     iv, tag = decode_base64url(document.get("iv"), "The iv"), decode_base64url(document.get("tag"), "The tag")
     if len(iv) != _IV_OCTETS or len(tag) != _TAG_OCTETS:
-        raise BadData(f"The iv has {_IV_OCTETS} octets and the tag {_TAG_OCTETS}; these have {len(iv)} and {len(tag)}.")
+        raise BadDataError(
+            f"The iv has {_IV_OCTETS} octets and the tag {_TAG_OCTETS}; these have {len(iv)} and {len(tag)}."
+        )
     additional = str(document.get("protected"))
     if "aad" in document:
         decode_base64url(document["aad"], "The aad")
@@ -348,7 +350,7 @@ def _seal(document: Mapping[str, Any]) -> Seal:
 
 def _header(text: object, what: str) -> dict[str, Any]:
     if isinstance(text, str | bytes) and len(text) > _MAX_HEADER_CHARACTERS:
-        raise BadData(f"{what} is longer than {_MAX_HEADER_CHARACTERS} characters.")
+        raise BadDataError(f"{what} is longer than {_MAX_HEADER_CHARACTERS} characters.")
     return load_object(decode_base64url(text, what), what)
 
 
@@ -356,26 +358,26 @@ def _mapping(value: object, what: str) -> dict[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, dict):
-        raise BadData(f"{what} is not an object.")
+        raise BadDataError(f"{what} is not an object.")
     return value
 
 
 def _merged(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
     """Join two headers, which must share no name (RFC 7516 section 7.2.1)."""
     if not first.keys().isdisjoint(second):
-        raise BadData("A header parameter stands in two headers.")
+        raise BadDataError("A header parameter stands in two headers.")
     return first | second
 
 
 def _only(header: Mapping[str, Any], name: str, allowed: tuple[str, ...], what: str) -> None:
     if header.get(name) not in allowed:
-        raise PolicyRefused(f"The {what} {_shown(header.get(name))} is not accepted; only {', '.join(allowed)} is.")
+        raise PolicyError(f"The {what} {_shown(header.get(name))} is not accepted; only {', '.join(allowed)} is.")
 
 
 def _no_extensions(header: Mapping[str, Any]) -> None:
     for name in ("crit", "zip", "b64"):
         if name in header:
-            raise PolicyRefused(f"The header parameter {name} is not accepted.")
+            raise PolicyError(f"The header parameter {name} is not accepted.")
 
 
 def _text(value: object) -> str:
@@ -409,20 +411,20 @@ def public_jwk(point: bytes) -> dict[str, str]:
 def point_of(jwk: object, what: str) -> bytes:
     """Return the point (65 octets) of a public P-256 JWK; members that do not matter (kid, use, alg) are passed over.
 
-    Raises BadData that names ``what``: another key type or curve, a private key, wrong lengths, not on the curve.
+    Raises BadDataError that names ``what``: another key type or curve, a private key, wrong lengths, not on the curve.
     The test of the curve is plain arithmetic on public values, as ten thousand of them stand in a bundle.
     """
     if not isinstance(jwk, dict):
-        raise BadData(f"{what} is not a JSON Web Key.")
+        raise BadDataError(f"{what} is not a JSON Web Key.")
     if "d" in jwk or jwk.get("kty") == "oct":
-        raise BadData(f"{what} holds a private or secret key where a public one belongs.")
+        raise BadDataError(f"{what} holds a private or secret key where a public one belongs.")
     if jwk.get("kty") != "EC" or jwk.get("crv") != "P-256":
-        raise BadData(f"{what} is not a P-256 key; stations, CAs and nodes have P-256 keys.")
+        raise BadDataError(f"{what} is not a P-256 key; stations, CAs and nodes have P-256 keys.")
     x, y = decode_base64url(jwk.get("x"), what), decode_base64url(jwk.get("y"), what)
     if len(x) != _COORDINATE_OCTETS or len(y) != _COORDINATE_OCTETS:
-        raise BadData(f"{what} has coordinates that are not {_COORDINATE_OCTETS} octets each.")
+        raise BadDataError(f"{what} has coordinates that are not {_COORDINATE_OCTETS} octets each.")
     if not _on_curve(int.from_bytes(x, "big"), int.from_bytes(y, "big")):
-        raise BadData(f"{what} is not a point of the curve P-256.")
+        raise BadDataError(f"{what} is not a point of the curve P-256.")
     return b"\x04" + x + y
 
 
@@ -431,13 +433,13 @@ def _on_curve(x: int, y: int) -> bool:
 
 
 def link_key_of(jwk: object, what: str) -> tuple[bytes, str]:
-    """Return a link key (16 octets) and the ``kid`` that it claims, in lower case; raises BadData."""
+    """Return a link key (16 octets) and the ``kid`` that it claims, in lower case; raises BadDataError."""
     if not isinstance(jwk, dict) or jwk.get("kty") != "oct":
-        raise BadData(f"{what} is not a symmetric JSON Web Key.")
+        raise BadDataError(f"{what} is not a symmetric JSON Web Key.")
     key = decode_base64url(jwk.get("k"), what)
     if len(key) != _LINK_KEY_OCTETS:
-        raise BadData(f"{what} has {len(key)} octets, a link key has {_LINK_KEY_OCTETS}.")
+        raise BadDataError(f"{what} has {len(key)} octets, a link key has {_LINK_KEY_OCTETS}.")
     kid = jwk.get("kid")
     if not isinstance(kid, str):
-        raise BadData(f"{what} has no kid.")
+        raise BadDataError(f"{what} has no kid.")
     return key, kid.lower()

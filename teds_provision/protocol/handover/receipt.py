@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 
-from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.errors import BadDataError, NotAuthenticError
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import Members, dump, load_object, time_text
@@ -43,9 +43,9 @@ class Receipt:
 
 
 def seal_receipt(receipt: Receipt, signer: PrivateKey) -> bytes:
-    """Sign a receipt; returns the octets of the file. Raises BadData where ``sender`` is not the signer."""
+    """Sign a receipt; returns the octets of the file. Raises BadDataError where ``sender`` is not the signer."""
     if receipt.sender != fingerprint(signer.point):
-        raise BadData("The receipt names another sender than the key that signs it.")
+        raise BadDataError("The receipt names another sender than the key that signs it.")
     members = {
         "format": FORMAT,
         "id": receipt.id,
@@ -62,13 +62,13 @@ def seal_receipt(receipt: Receipt, signer: PrivateKey) -> bytes:
 def open_receipt(octets: bytes, trusted: Callable[[str], bytes | None]) -> Receipt:
     """Check a receipt; whether it answers a bundle of ours is for the caller to compare (id, digest, to).
 
-    White space around it (an editor's last line) does no harm. Raises NotAuthentic, PolicyRefused or BadData.
+    White space around it (an editor's last line) does no harm. Raises NotAuthenticError, PolicyError or BadDataError.
     """
     check_size(len(octets), MAX_RECEIPT_OCTETS, "the receipt")
     verified = jose.verify_compact(octets.strip(), trusted, typ=TYPE, max_octets=MAX_RECEIPT_OCTETS)
     members = Members(load_object(verified.payload, "The receipt"), "The receipt")
     if members.get("format") != FORMAT:
-        raise BadData(f"The receipt's format is not {FORMAT}.")
+        raise BadDataError(f"The receipt's format is not {FORMAT}.")
     receipt = Receipt(
         id=members.random_id("id"),
         bundle_sha256=members.sha256("bundle_sha256"),
@@ -79,10 +79,10 @@ def open_receipt(octets: bytes, trusted: Callable[[str], bytes | None]) -> Recei
         created=members.time("created"),
     )
     if receipt.sender != verified.kid:
-        raise NotAuthentic("The receipt names another sender than the one who signed it.")
+        raise NotAuthenticError("The receipt names another sender than the one who signed it.")
     uuids = [*receipt.imported, *(node.uuid for node in receipt.refused)]
     if len(set(uuids)) != len(uuids):
-        raise BadData("The receipt names an UUID twice.")
+        raise BadDataError("The receipt names an UUID twice.")
     return receipt
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.errors import BadDataError, NotAuthenticError
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import Members, dump, load_object, time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint
@@ -53,18 +53,18 @@ def seal_revocation(signer: PrivateKey, *, uuid: bytes, node: str | None, why: s
 
 
 def open_revocation(statement: str, trusted: Callable[[str], bytes | None]) -> Revocation:
-    """Check one statement; raises NotAuthentic (signer unknown, signature), PolicyRefused or BadData."""
+    """Check one statement; raises NotAuthenticError (signer unknown, signature), PolicyError or BadDataError."""
     try:
         octets = statement.encode("ascii")
     except UnicodeEncodeError as error:
-        raise BadData("A revocation is not a compact JWS.") from error
+        raise BadDataError("A revocation is not a compact JWS.") from error
     verified = jose.verify_compact(octets, trusted, typ=TYPE, max_octets=MAX_OCTETS)
     members = Members(load_object(verified.payload, "The revocation"), "The revocation")
     if members.get("format") != FORMAT:
-        raise BadData(f"The revocation's format is not {FORMAT}.")
+        raise BadDataError(f"The revocation's format is not {FORMAT}.")
     sender = members.sha256("from")
     if sender != verified.kid:
-        raise NotAuthentic("The revocation names another signer than the one who signed it.")
+        raise NotAuthenticError("The revocation names another signer than the one who signed it.")
     return Revocation(
         members.uuid("uuid"),
         members.sha256_or_none("fingerprint"),
@@ -96,7 +96,7 @@ def open_revocations(
 
         try:
             known.append(open_revocation(statement, find))
-        except NotAuthentic:
+        except NotAuthenticError:
             if not strangers:
                 raise
             unknown += 1

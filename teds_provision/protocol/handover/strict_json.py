@@ -1,7 +1,7 @@
 """JSON and base64url as signed data needs them: one reading, or none (RFC 8259, RFC 4648, RFC 7515 section 2).
 
 Readers that disagree about a duplicate name, a padded string or a spare bit are how signed documents get two meanings.
-Everything here either reads one way or raises :class:`BadData`; nothing else comes out, whatever the octets.
+Everything here either reads one way or raises :class:`BadDataError`; nothing else comes out, whatever the octets.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from io import BytesIO
 from typing import Any
 from uuid import UUID
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 
 _TO_URL = bytes.maketrans(b"+/", b"-_")
 # The two characters of plain base64 and the padding become one that no alphabet holds.
@@ -71,14 +71,14 @@ class Base64urlReader:
         self._rest = b""
 
     def more(self, text: bytes) -> bytes:
-        """Return the octets of all whole groups of four characters so far; raises BadData."""
+        """Return the octets of all whole groups of four characters so far; raises BadDataError."""
         text = self._rest + text
         whole = len(text) - len(text) % 4
         self._rest = text[whole:]
         return decode_base64url(text[:whole], self._what)
 
     def end(self) -> bytes:
-        """Return the last octets; raises BadData."""
+        """Return the last octets; raises BadDataError."""
         return decode_base64url(self._rest, self._what)
 
 
@@ -88,19 +88,22 @@ def encode_base64url(octets: bytes) -> str:
 
 
 def decode_base64url(text: object, what: str) -> bytes:
-    """Read base64url (text or ASCII octets) without padding, spare bits zero; raises BadData that names ``what``."""
+    """Read base64url (text or ASCII octets) without padding, spare bits zero.
+
+    Raises BadDataError that names ``what``.
+    """
     try:
         if isinstance(text, str):
             octets = text.encode("ascii").translate(_FROM_URL)
         elif isinstance(text, bytes):
             octets = text.translate(_FROM_URL)
         else:
-            raise BadData(f"{what} is not a base64url string.")
+            raise BadDataError(f"{what} is not a base64url string.")
         plain = binascii.a2b_base64(octets + _PADDING[len(octets) % 4], strict_mode=True)
     except ValueError as error:
-        raise BadData(f"{what} is not base64url without padding.") from error
+        raise BadDataError(f"{what} is not base64url without padding.") from error
     if octets and octets[-1] not in _LAST[len(octets) % 4]:
-        raise BadData(f"{what} has spare bits set in its last base64url character.")
+        raise BadDataError(f"{what} has spare bits set in its last base64url character.")
     return plain
 
 
@@ -115,20 +118,23 @@ def separators(octets: bytes) -> int:
 
 
 def refuse_many(count: int, most: int, what: str) -> None:
-    """Raise BadData where a JSON text has more separators than ``what`` ever has: it would cost far more than it is."""
+    """Raise BadDataError if a JSON text has more separators than ``what`` ever has.
+
+    It would cost far more than it is.
+    """
     if count > most:
-        raise BadData(f"This JSON has far more members than {what}.")
+        raise BadDataError(f"This JSON has far more members than {what}.")
 
 
 def load_object(octets: bytes, what: str) -> dict[str, Any]:
     """Read one JSON object; refuses other encodings than UTF-8, duplicate names, NaN and what is nested too deeply.
 
-    The caller has bounded the size. Raises BadData that names ``what``.
+    The caller has bounded the size. Raises BadDataError that names ``what``.
     """
     with _failing_as(what):
         value = _DECODER.decode(_decoded(octets))
     if not isinstance(value, dict):
-        raise BadData(f"{what} is JSON, but not an object.")
+        raise BadDataError(f"{what} is JSON, but not an object.")
     return value
 
 
@@ -137,7 +143,7 @@ def load_exact(octets: bytes, what: str) -> dict[str, Any]:
     with _failing_as(what):
         value = _EXACT.decode(_decoded(octets))
     if not isinstance(value, dict):
-        raise BadData(f"{what} is JSON, but not an object.")
+        raise BadDataError(f"{what} is JSON, but not an object.")
     return value
 
 
@@ -152,7 +158,7 @@ def load_long(octets: bytearray, what: str, name: str, make: Callable[[object], 
         if walk.next() == "{":
             return walk.members(name, make)
         _DECODER.decode(walk.rest())
-    raise BadData(f"{what} is JSON, but not an object.")
+    raise BadDataError(f"{what} is JSON, but not an object.")
 
 
 @contextmanager
@@ -161,10 +167,10 @@ def _failing_as(what: str) -> Iterator[None]:
     try:
         yield
     except RecursionError as error:
-        raise BadData(f"{what} is nested too deeply.") from error
+        raise BadDataError(f"{what} is nested too deeply.") from error
     except ValueError as error:
-        detail = error.args[0] if isinstance(error, _DuplicateName) else "it is damaged or something else"
-        raise BadData(f"{what} is not the JSON that it should be: {detail}.") from error
+        detail = error.args[0] if isinstance(error, _DuplicateNameError) else "it is damaged or something else"
+        raise BadDataError(f"{what} is not the JSON that it should be: {detail}.") from error
 
 
 def _decoded(octets: bytes | bytearray) -> str:
@@ -202,7 +208,7 @@ class _Walk:
                 raise ValueError("a member has no name")
             key = self._value()
             if key in members:
-                raise _DuplicateName(_TWICE)
+                raise _DuplicateNameError(_TWICE)
             if self.next() != ":":
                 raise ValueError("a member has no value")
             self._at += 1
@@ -264,14 +270,14 @@ class _Walk:
         return True
 
 
-class _DuplicateName(ValueError):
+class _DuplicateNameError(ValueError):
     """Two members of one object have the same name."""
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     members = dict(pairs)
     if len(members) != len(pairs):
-        raise _DuplicateName(_TWICE)
+        raise _DuplicateNameError(_TWICE)
     return members
 
 
@@ -307,7 +313,7 @@ class Members:
 
     def __init__(self, members: object, where: str) -> None:
         if not isinstance(members, dict):
-            raise BadData(f"{where} is not an object.")
+            raise BadDataError(f"{where} is not an object.")
         self._members: Mapping[str, Any] = members
         self._where = where
 
@@ -386,8 +392,8 @@ class Members:
             raise self._bad(name, complaint)
         return value
 
-    def _bad(self, name: str, complaint: str) -> BadData:
-        return BadData(f"{self._where}: {name} {complaint}.")
+    def _bad(self, name: str, complaint: str) -> BadDataError:
+        return BadDataError(f"{self._where}: {name} {complaint}.")
 
 
 def is_label(text: str) -> bool:
@@ -396,10 +402,10 @@ def is_label(text: str) -> bool:
 
 
 def fingerprints(values: list[Any], what: str) -> tuple[str, ...]:
-    """Read a list of fingerprints, each once; raises BadData that names ``what``."""
+    """Read a list of fingerprints, each once; raises BadDataError that names ``what``."""
     found = tuple(value.lower() for value in values if isinstance(value, str) and _SHA256.fullmatch(value))
     if len(found) != len(values) or len(set(found)) != len(found):
-        raise BadData(f"{what} is no list of fingerprints, each of 64 hex digits and each once.")
+        raise BadDataError(f"{what} is no list of fingerprints, each of 64 hex digits and each once.")
     return found
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.messages.tables import ENUMERATIONS, ERROR_SOURCES, ERRORS, FLAGS
 from teds_provision.teds.codec.model import Finding, TimeInstance
 from teds_provision.teds.codec.tables import name_of
@@ -197,18 +197,18 @@ def _meaning(name: str, value: object) -> str:
 
 
 def write_plain(layout: str, values: Mapping[str, MessageValue | Blocks], *, of: str) -> bytes:
-    """Write arguments one after the other; raises BadData naming the argument of the message ``of``."""
+    """Write arguments one after the other; raises BadDataError naming the argument of the message ``of``."""
     unknown = set(values) - {name for name, _ in words(layout)}
     if unknown:
-        raise BadData(f"{of} has no argument {sorted(unknown)[0]!r}.")
+        raise BadDataError(f"{of} has no argument {sorted(unknown)[0]!r}.")
     out = b""
     for name, kind in words(layout):
         if name not in values:
-            raise BadData(f"{of} needs the argument {name!r}.")
+            raise BadDataError(f"{of} needs the argument {name!r}.")
         try:
             out += _octets(kind, values[name])
         except (TypeError, ValueError, OverflowError, AttributeError, struct.error) as error:
-            raise BadData(f"The argument {name!r} of {of} does not fit {kind}: {values[name]!r}.") from error
+            raise BadDataError(f"The argument {name!r} of {of} does not fit {kind}: {values[name]!r}.") from error
     return out
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 
 COMMAND_HEADER: Final = 6
 REPLY_HEADER: Final = 3
@@ -76,7 +76,7 @@ class Reason(IntEnum):
     FAULT = 23
 
 
-class Refused(Exception):
+class CommandRefusedError(Exception):
     """A command is refused for ``reason``; nothing was changed. Raised and caught inside the node."""
 
     def __init__(self, reason: Reason) -> None:
@@ -117,12 +117,12 @@ class Reply:
 
 
 def decode_reply(frame: bytes) -> Reply:
-    """Read a whole reply frame; raises Garbled when its length is not what it says."""
+    """Read a whole reply frame; raises GarbledError when its length is not what it says."""
     if len(frame) < REPLY_HEADER:
-        raise Garbled(f"A reply frame has at least {REPLY_HEADER} octets, this one {len(frame)}.")
+        raise GarbledError(f"A reply frame has at least {REPLY_HEADER} octets, this one {len(frame)}.")
     flag, length = struct.unpack_from(">BH", frame)
     if length != len(frame) - REPLY_HEADER:
-        raise Garbled(f"A reply frame announces {length} octets and carries {len(frame) - REPLY_HEADER}.")
+        raise GarbledError(f"A reply frame announces {length} octets and carries {len(frame) - REPLY_HEADER}.")
     return Reply(flag != 0, frame[REPLY_HEADER:])
 
 
@@ -194,18 +194,18 @@ class TedsStatus:
 
     @classmethod
     def decode(cls, octets: bytes) -> TedsStatus:
-        """Read the 12 octets; raises Garbled."""
+        """Read the 12 octets; raises GarbledError."""
         if len(octets) != 12:
-            raise Garbled(f"A Query TEDS reply has 12 octets, this one {len(octets)}.")
+            raise GarbledError(f"A Query TEDS reply has 12 octets, this one {len(octets)}.")
         attributes, status, size, checksum, max_size = struct.unpack(">BBIHI", octets)
         return cls(attributes, size, checksum, max_size, status)
 
 
 def decode_list(payload: bytes) -> list[tuple[int, int]]:
-    """Read the reply to List: (channel, access code) ascending; raises Garbled."""
+    """Read the reply to List: (channel, access code) ascending; raises GarbledError."""
     if len(payload) % 3:
-        raise Garbled(f"A List reply has a multiple of 3 octets, this one {len(payload)}.")
+        raise GarbledError(f"A List reply has a multiple of 3 octets, this one {len(payload)}.")
     keys = [(int.from_bytes(payload[i : i + 2], "big"), payload[i + 2]) for i in range(0, len(payload), 3)]
     if keys != sorted(set(keys)):
-        raise Garbled("A List reply is not in ascending order.")
+        raise GarbledError("A List reply is not in ascending order.")
     return keys

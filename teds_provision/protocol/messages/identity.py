@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 
 _LAYOUT = struct.Struct(">B10sBIIHB")
 IDENTITY_OCTETS = _LAYOUT.size  # 23
@@ -43,17 +43,17 @@ class Identity:
 
     @classmethod
     def decode(cls, octets: bytes) -> Identity:
-        """Read the 23 octets; raises BadData when they are not an Identify payload of version 1."""
+        """Read the 23 octets; raises BadDataError when they are not an Identify payload of version 1."""
         if len(octets) != IDENTITY_OCTETS:
-            raise BadData(f"An Identify payload has {IDENTITY_OCTETS} octets, this one {len(octets)}.")
+            raise BadDataError(f"An Identify payload has {IDENTITY_OCTETS} octets, this one {len(octets)}.")
         version, uuid, state, epoch, sequence, max_message, address = _LAYOUT.unpack(octets)
         if version != 1:
-            raise BadData(f"The node speaks version {version} of the profile; this tool speaks version 1.")
+            raise BadDataError(f"The node speaks version {version} of the profile; this tool speaks version 1.")
         if state > NodeState.PROVISIONED:
-            raise BadData(f"Identify names a state {state} that the profile does not know.")
+            raise BadDataError(f"Identify names a state {state} that the profile does not know.")
         if not LEAST_MESSAGE <= max_message <= MOST_MESSAGE:
             least, most = LEAST_MESSAGE, MOST_MESSAGE
-            raise BadData(f"Identify names a maxMessage of {max_message}; the profile allows {least} to {most}.")
+            raise BadDataError(f"Identify names a maxMessage of {max_message}; the profile allows {least} to {most}.")
         if address > 239:
-            raise BadData(f"Identify names a CAN address {address}; the profile allows 1 to 239, 0 for none.")
+            raise BadDataError(f"Identify names a CAN address {address}; the profile allows 1 to 239, 0 for none.")
         return cls(uuid, NodeState(state), epoch, sequence, max_message, address)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.messages.arguments import (
     Argument,
     Blocks,
@@ -92,12 +92,12 @@ def decode_message(octets: bytes, *, request: Message | None = None) -> Message:
 def compose_command(
     channel: int, group: int, function: int, arguments: Mapping[str, MessageValue | Blocks] | None = None
 ) -> bytes:
-    """Write a 2007 command frame by argument names (see :data:`.tables.COMMANDS`); raises BadData."""
+    """Write a 2007 command frame by argument names (see :data:`.tables.COMMANDS`); raises BadDataError."""
     spec = COMMANDS.get((group, function))
     if spec is None:
-        raise BadData(f"There is no command {group}.{function}.")
+        raise BadDataError(f"There is no command {group}.{function}.")
     if not 0 <= channel <= 0xFFFF:
-        raise BadData(f"A channel is a number from 0 to 65535, not {channel}.")
+        raise BadDataError(f"A channel is a number from 0 to 65535, not {channel}.")
     asked = spec.answer is not None and not arguments
     payload = b"" if asked else write_plain(spec.arguments, arguments or {}, of=spec.name)
     head = channel.to_bytes(2, "big") + bytes([group, function])
@@ -107,17 +107,17 @@ def compose_command(
 def compose_service(
     service: int, number: int, message_type: int, arguments: Mapping[str, MessageValue | Blocks]
 ) -> bytes:
-    """Write a 2024 network-service message by argument names (see :data:`.tables.NETWORK`); raises BadData."""
+    """Write a 2024 network-service message by argument names (see :data:`.tables.NETWORK`); raises BadDataError."""
     spec = NETWORK.get((service, number))
     if spec is None or message_type not in MESSAGE_TYPES:
-        raise BadData(f"There is no network service {service}.{number} with message type {message_type}.")
+        raise BadDataError(f"There is no network service {service}.{number} with message type {message_type}.")
     body = write_plain(_service_layout(spec, message_type), arguments, of=spec.name)
     return bytes([service, number, message_type]) + _u16(len(body), spec.name) + body
 
 
 def _u16(length: int, name: str) -> bytes:
     if length > 0xFFFF:
-        raise BadData(f"{name} would carry {length} octets; a message carries at most 65535.")
+        raise BadDataError(f"{name} would carry {length} octets; a message carries at most 65535.")
     return length.to_bytes(2, "big")
 
 

@@ -1,7 +1,7 @@
 """Payloads of claims and single values and their replies: builders and parsers for both roles (operation.md 1, 2).
 
 ``encode`` gives the octets of a payload, ``command`` the whole command. ``decode`` of a command (node side) raises
-Refused with reason 4 for a wrong form; ``decode`` of a reply (station side) raises Garbled.
+Refused with reason 4 for a wrong form; ``decode`` of a reply (station side) raises GarbledError.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import Any, Final
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 from teds_provision.protocol.messages.frames import (
     COMMON,
     EITHER,
     OPERATE,
     Command,
+    CommandRefusedError,
     Function,
     Reason,
-    Refused,
     security_command,
 )
 
@@ -38,13 +38,13 @@ NOT_VALID: Final = 0x01
 
 
 def demand_form(holds: bool) -> None:
-    """Raise Refused with reason 4 unless ``holds``."""
+    """Raise CommandRefusedError with reason 4 unless ``holds``."""
     if not holds:
-        raise Refused(Reason.BAD_FORM)
+        raise CommandRefusedError(Reason.BAD_FORM)
 
 
 def channel_list(octets: bytes, most: int) -> tuple[int, ...]:
-    """Read a list of 1 to ``most`` channels, each 1 to 255 and once; raises Refused (4)."""
+    """Read a list of 1 to ``most`` channels, each 1 to 255 and once; raises CommandRefusedError (4)."""
     demand_form(1 <= len(octets) <= most and 0 not in octets and len(set(octets)) == len(octets))
     return tuple(octets)
 
@@ -108,12 +108,12 @@ class OperationReply:
 
     @classmethod
     def decode(cls, payload: bytes) -> OperationReply:
-        """Read the reply; raises Garbled."""
+        """Read the reply; raises GarbledError."""
         if len(payload) % 3 != 1 or payload[0] > 1:
-            raise Garbled("The node's reply to Operation has a wrong form.")
+            raise GarbledError("The node's reply to Operation has a wrong form.")
         numbers = payload[1::3]
         if list(numbers) != sorted(set(numbers)) or 0 in numbers:
-            raise Garbled("The node's reply to Operation does not ascend.")
+            raise GarbledError("The node's reply to Operation does not ascend.")
         states = zip(map(ChannelState, payload[2::3]), payload[3::3], strict=True)
         return cls(payload[0] == 1, dict(zip(numbers, states, strict=True)))
 
@@ -130,9 +130,9 @@ def read_data_set(channel: int) -> Command:
 
 
 def decode_data_set(payload: bytes, octets: int) -> bytes:
-    """The data set of a reply to 3.1; raises Garbled where it has not ``octets`` octets from offset 0 on."""
+    """The data set of a reply to 3.1; raises GarbledError where it has not ``octets`` octets from offset 0 on."""
     if len(payload) != 4 + octets or payload[:4] != bytes(4):
-        raise Garbled(f"A data set of {octets} octets came as {max(0, len(payload) - 4)}.")
+        raise GarbledError(f"A data set of {octets} octets came as {max(0, len(payload) - 4)}.")
     return payload[4:]
 
 
@@ -160,9 +160,9 @@ class Sampled:
 
     @classmethod
     def decode(cls, payload: bytes, octets: int) -> Sampled:
-        """Read the reply whose data sets have ``octets`` octets together; raises Garbled."""
+        """Read the reply whose data sets have ``octets`` octets together; raises GarbledError."""
         if len(payload) != 9 + octets:
-            raise Garbled(f"A reply to Sample has {len(payload)} octets, not {9 + octets}.")
+            raise GarbledError(f"A reply to Sample has {len(payload)} octets, not {9 + octets}.")
         return cls(int.from_bytes(payload[:8], "big"), payload[8], payload[9:])
 
     @property
@@ -235,9 +235,9 @@ class Power:
 
     @classmethod
     def decode(cls, payload: bytes) -> Power:
-        """Read the 7 octets; raises Garbled."""
+        """Read the 7 octets; raises GarbledError."""
         if len(payload) != 7:
-            raise Garbled(f"A reply to Power has 7 octets, this one {len(payload)}.")
+            raise GarbledError(f"A reply to Power has 7 octets, this one {len(payload)}.")
         flags, level, voltage, current, temperature = struct.unpack(">BBHhb", payload)
         return cls(
             flags,

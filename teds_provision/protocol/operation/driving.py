@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from teds_provision.errors import Garbled, NotAuthentic
+from teds_provision.errors import GarbledError, NotAuthenticError
 from teds_provision.protocol.operation.datagram import (
     LAST_COUNTER,
     DatagramSealer,
@@ -23,13 +23,13 @@ _WRAP: Final = 1 << 32
 class Driver:
     """Seals the values of one run of Drive; ``layout`` says channels and widths, ``dead_man`` the smallest of them, ms.
 
-    ``after`` is the session's last run of Drive. Raises NotAuthentic where the reply's length is not the one computed,
-    or its run is not a new one.
+    ``after`` is the session's last run of Drive. Raises NotAuthenticError where the reply's length is not the one
+    computed, or its run is not a new one.
     """
 
     def __init__(self, layout: Layout, reply: Driven, message_key: bytes, *, dead_man: int, after: int = 0) -> None:
         if reply.length != drive_length(layout.octets):
-            raise NotAuthentic(
+            raise NotAuthenticError(
                 f"The node takes Drive messages of {reply.length} octets; {drive_length(layout.octets)} were computed."
             )
         require_new_run(reply.run, after)
@@ -42,12 +42,12 @@ class Driver:
         """One message with these data sets, in the layout's order.
 
         It holds for ``hold`` ns from the earliest that the node's tick can be now (the dead-man by default, and never
-        longer), so that it is never too far ahead for the node. Raises Garbled where the counters are used up.
+        longer), so that it is never too far ahead for the node. Raises GarbledError where the counters are used up.
         """
         if tuple(map(len, values)) != self.layout.widths:
-            raise Garbled("The data sets of a Drive message do not have the widths of its channels.")
+            raise GarbledError("The data sets of a Drive message do not have the widths of its channels.")
         if self.next > LAST_COUNTER:
-            raise Garbled("This Drive has used up its counters; ask for a new one.")
+            raise GarbledError("This Drive has used up its counters; ask for a new one.")
         until = (now.low + min(self._dead_man, hold or self._dead_man)) // MICRO % _WRAP
         message = self._sealer.seal(self.next, DriveValues(until, b"".join(values)).encode())
         self.next += 1

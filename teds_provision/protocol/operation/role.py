@@ -18,9 +18,9 @@ from teds_provision.protocol.messages.frames import (
     READ_OVERHEAD,
     SECURITY,
     Command,
+    CommandRefusedError,
     Function,
     Reason,
-    Refused,
     Reply,
 )
 from teds_provision.protocol.operation.claims import SECOND, Claims
@@ -116,7 +116,7 @@ class OperationRole:
         return (command.command_class, command.function) in self._commands
 
     def run(self, inner: Inner) -> Reply:
-        """Run one inner command that it knows; raises Refused."""
+        """Run one inner command that it knows; raises CommandRefusedError."""
         self.poll()  # what is due by now goes first: a lease or dead-man that ran out, samples taken before a Stop
         self._ports[inner.session] = inner.port
         return Reply(True, self._commands[inner.command.command_class, inner.command.function](inner))
@@ -182,7 +182,7 @@ class OperationRole:
         # an actuator is claimed once: by this session already (13), or by another (17)
         held = self.claims.actuators.get(number)
         if held is not None:
-            raise Refused(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
+            raise CommandRefusedError(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
         low = self._hardware.power().flags & PowerFlag.TOO_LOW
         demand(not low and not any(map(self._hardware.fault, wanted)), Reason.FAULT)
         if asked.dead_man is not None:
@@ -268,7 +268,7 @@ class OperationRole:
             demand_form(channel != 0 and channel not in values)
             facts = self._hardware.channels.get(channel)
             if facts is None:
-                raise Refused(Reason.WRONG_STATE)
+                raise CommandRefusedError(Reason.WRONG_STATE)
             octets = payload[at + 1 : at + 1 + facts.octets]
             demand_form(len(octets) == facts.octets)
             values[channel] = octets
@@ -300,7 +300,7 @@ class OperationRole:
     def _addressed(self, inner: Inner) -> tuple[int, ChannelHardware]:
         facts = self._hardware.channels.get(inner.command.channel)
         if facts is None:
-            raise Refused(Reason.UNKNOWN_COMMAND)
+            raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
         return inner.command.channel, facts
 
     def _demand_claimed(self, session: NodeSession, *channels: int) -> None:

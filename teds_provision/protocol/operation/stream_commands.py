@@ -1,7 +1,7 @@
 """Payloads of streams, Drive, Clock and Arm and their replies: builders and parsers for both roles (operation.md 4, 5).
 
-``command`` gives the whole command. ``decode`` of a command (node side) raises Refused with reason 4 for a wrong form;
-``decode`` of a reply (station side) raises Garbled.
+``command`` gives the whole command. ``decode`` of a command (node side) raises CommandRefusedError with reason 4 for a
+wrong form; ``decode`` of a reply (station side) raises GarbledError.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 from teds_provision.protocol.messages.frames import Command, Function, security_command
 from teds_provision.protocol.operation.commands import TEST_PATTERN, channel_list, demand_form
 
@@ -92,9 +92,9 @@ class Subscribed:
 
     @classmethod
     def decode(cls, payload: bytes) -> Subscribed:
-        """Read the 12 octets; raises Garbled."""
+        """Read the 12 octets; raises GarbledError."""
         if len(payload) != 12:
-            raise Garbled(f"A reply to Subscribe has 12 octets, this one {len(payload)}.")
+            raise GarbledError(f"A reply to Subscribe has 12 octets, this one {len(payload)}.")
         return cls(*struct.unpack(">HHQ", payload))
 
 
@@ -104,9 +104,9 @@ def stop(stream: int) -> Command:
 
 
 def decode_stopped(payload: bytes) -> int:
-    """The counter that the next message would have had; raises Garbled."""
+    """The counter that the next message would have had; raises GarbledError."""
     if len(payload) != 4:
-        raise Garbled(f"A reply to Stop has 4 octets, this one {len(payload)}.")
+        raise GarbledError(f"A reply to Stop has 4 octets, this one {len(payload)}.")
     return int.from_bytes(payload, "big")
 
 
@@ -128,9 +128,9 @@ class Driven:
 
     @classmethod
     def decode(cls, payload: bytes) -> Driven:
-        """Read the 4 octets; raises Garbled."""
+        """Read the 4 octets; raises GarbledError."""
         if len(payload) != 4:
-            raise Garbled(f"A reply to Drive has 4 octets, this one {len(payload)}.")
+            raise GarbledError(f"A reply to Drive has 4 octets, this one {len(payload)}.")
         return cls(*struct.unpack(">HH", payload))
 
 
@@ -156,9 +156,9 @@ class Clock:
 
     @classmethod
     def decode(cls, payload: bytes) -> Clock:
-        """Read the 34 octets; raises Garbled."""
+        """Read the 34 octets; raises GarbledError."""
         if len(payload) != 34:
-            raise Garbled(f"A reply to Clock has 34 octets, this one {len(payload)}.")
+            raise GarbledError(f"A reply to Clock has 34 octets, this one {len(payload)}.")
         return cls(*struct.unpack(">QQQIHI", payload))
 
 
@@ -184,6 +184,6 @@ class Arm:
 
     @classmethod
     def decode(cls, payload: bytes) -> Arm:
-        """Read the payload; raises Refused (4)."""
+        """Read the payload; raises CommandRefusedError (4)."""
         demand_form(len(payload) == 18)
         return cls(payload[:16], payload[16], payload[17])

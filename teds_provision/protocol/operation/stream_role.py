@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from teds_provision.protocol.messages.frames import Reason, Refused
+from teds_provision.protocol.messages.frames import CommandRefusedError, Reason
 from teds_provision.protocol.operation import budget
 from teds_provision.protocol.operation.can_frames import StreamAssembly
 from teds_provision.protocol.operation.claims import Claims
@@ -78,9 +78,9 @@ class _Measuring:
 
 
 def demand(holds: bool, reason: Reason) -> None:
-    """Raise Refused unless ``holds``."""
+    """Raise CommandRefusedError unless ``holds``."""
     if not holds:
-        raise Refused(reason)
+        raise CommandRefusedError(reason)
 
 
 class StreamRole:
@@ -163,7 +163,7 @@ class StreamRole:
         demand_form(len(payload) == 1)
         stream = self._find(session, payload[0])
         if stream is None:
-            raise Refused(Reason.WRONG_STATE)
+            raise CommandRefusedError(Reason.WRONG_STATE)
         if stream.start is not None:
             stream.sample(self._hardware, self._hardware.now())
         self._end(stream)

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from teds_provision.errors import NotAuthentic
+from teds_provision.errors import NotAuthenticError
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
 from teds_provision.protocol.operation.datagram import (
@@ -93,24 +93,24 @@ class StreamPlan:
     def accept(self, payload: bytes, now: TickBounds, *, after: int = 0) -> Subscribed:
         """Read the reply; ``now`` bounds the node's tick when it came (it may have been made up to 1 s before).
 
-        ``after`` is the session's last run. Raises Garbled, or NotAuthentic where length or start are not those that
-        were asked, or the run is not a new one: end and report the stream.
+        ``after`` is the session's last run. Raises GarbledError, or NotAuthenticError where length or start are not
+        those that were asked, or the run is not a new one: end and report the stream.
         """
         reply, asked = Subscribed.decode(payload), self.subscribe.start
         if reply.length != self.length:
-            raise NotAuthentic(f"The node streams {reply.length} octets a message; {self.length} were computed.")
+            raise NotAuthenticError(f"The node streams {reply.length} octets a message; {self.length} were computed.")
         good = now.low <= reply.start + START_WITHIN and reply.start <= now.high + START_WITHIN
         if reply.start != asked and not (asked == SOON and good):
-            raise NotAuthentic("The node's stream begins at another time than was asked.")
+            raise NotAuthenticError("The node's stream begins at another time than was asked.")
         require_new_run(reply.run, after)
         return reply
 
 
 def require_new_run(run: int, after: int) -> None:
-    """Raise NotAuthentic where a session's run is not above the last one: two runs would have one key."""
+    """Raise NotAuthenticError where a session's run is not above the last one: two runs would have one key."""
     if run <= after:
         said = f"run {run} after run {after}" if after else f"run {run}; runs begin at 1"
-        raise NotAuthentic(f"The node names {said}.", hint="Its firmware does not keep to the profile.")
+        raise NotAuthenticError(f"The node names {said}.", hint="Its firmware does not keep to the profile.")
 
 
 def most_instants(kind: StreamKind, octets: int, most: int = MOST_OCTETS) -> int:

@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from teds_provision.errors import NotAuthentic
+from teds_provision.errors import NotAuthenticError
 from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
 from teds_provision.protocol.operation.stream_commands import Action, Arm, Clock
 from teds_provision.protocol.operation.subscription import TickBounds
@@ -21,7 +21,7 @@ MILLION: Final = 10**6
 class ClockSample:
     """One exchange of Clock; station times in ns: ``asked`` when the first copy left, ``answered`` when all was there.
 
-    Raises NotAuthentic where the node's two ticks cannot be: its clock lies.
+    Raises NotAuthenticError where the node's two ticks cannot be: its clock lies.
     """
 
     asked: int
@@ -31,7 +31,7 @@ class ClockSample:
     def __post_init__(self) -> None:
         inside = self.reply.sent - self.reply.received
         if not 0 <= inside <= self.answered - self.asked:
-            raise NotAuthentic("The node's clock lies: its answer took longer than the exchange.")
+            raise NotAuthenticError("The node's clock lies: its answer took longer than the exchange.")
 
     @property
     def offset(self) -> float:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, load_exact
@@ -48,7 +48,7 @@ SIGN_REQUEST: Final = DocumentKind("teds-sign-request+jws", 1 << 20, "teds-sign-
 SIGNED: Final = DocumentKind("teds-signed+jws", 64 << 10, "teds-signed/1", "the office's answer")
 
 
-class NewerFormat(BadData):
+class NewerFormatError(BadDataError):
     """The document is of a newer version of its format; whoever knows it can read it."""
 
     code = "newer-format"
@@ -71,7 +71,7 @@ def payload(members: Mapping[str, Any]) -> bytes:
 
 
 def seal(members: Mapping[str, Any], key: PrivateKey, kind: DocumentKind) -> bytes:
-    """Sign a document; raises BadData where it is larger than anybody reads."""
+    """Sign a document; raises BadDataError where it is larger than anybody reads."""
     octets = jose.sign_compact(payload(members), key, typ=kind.typ)
     check_size(len(octets), kind.most, kind.what)
     return octets
@@ -85,23 +85,23 @@ def hash_of(octets: bytes) -> str:
 def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: DocumentKind) -> SignedDocument:
     """Check who signed a document and read its members; their values are the caller's to look at.
 
-    ``find_key`` gives the point of a fingerprint that may sign this kind. Raises NotAuthentic (nobody known signed
-    this), BadData (no such document), NewerFormat.
+    ``find_key`` gives the point of a fingerprint that may sign this kind. Raises NotAuthenticError (nobody known signed
+    this), BadDataError (no such document), NewerFormatError.
     """
     check_size(len(octets), kind.most, kind.what)
     header = load_exact(decode_base64url(octets.partition(b".")[0], "The JWS header"), "The JWS header")
     if header.keys() != _HEADER or header["typ"] != kind.typ:
-        raise BadData(f"The header of {kind.what} does not hold exactly alg, kid and typ {kind.typ}.")
+        raise BadDataError(f"The header of {kind.what} does not hold exactly alg, kid and typ {kind.typ}.")
     verified = jose.verify_compact(octets, find_key, typ=kind.typ, max_octets=kind.most)
     members = load_exact(verified.payload, f"T{kind.what[1:]}")
     told = members.get("format")
     if told != kind.format:
         newer = isinstance(told, str) and re.fullmatch(re.escape(kind.format[:-1]) + r"[1-9]\d{0,8}", told)
         if newer:
-            raise NewerFormat(
+            raise NewerFormatError(
                 f"T{kind.what[1:]} is of a newer version ({told}).", hint="Use a newer version of teds-provision."
             )
-        raise BadData(f"The format of {kind.what} is not {kind.format}.")
+        raise BadDataError(f"The format of {kind.what} is not {kind.format}.")
     return SignedDocument(verified.kid, verified.signer, hash_of(octets), members, octets)
 
 
@@ -164,7 +164,7 @@ class Fields:
 
     def __init__(self, members: object, where: str) -> None:
         if not isinstance(members, dict):
-            raise BadData(f"{where} is not an object.")
+            raise BadDataError(f"{where} is not an object.")
         self.members: dict[str, Any] = members
         self._where = where
 
@@ -244,9 +244,9 @@ class Fields:
                 return number, named
         raise self.bad(name, "is no page as [number, H]")
 
-    def bad(self, name: str, complaint: str) -> BadData:
+    def bad(self, name: str, complaint: str) -> BadDataError:
         """The error for one member."""
-        return BadData(f"{self._where}: {name} {complaint}.")
+        return BadDataError(f"{self._where}: {name} {complaint}.")
 
 
 # -- a station that wants to be a member -------------------------------------------------------------------------------
@@ -283,7 +283,10 @@ class MemberRequest:
 
 
 def open_request(octets: bytes) -> MemberRequest:
-    """Read a request, which its own key signed; who that is, a person compares. Raises NotAuthentic, BadData."""
+    """Read a request, which its own key signed; who that is, a person compares.
+
+    Raises NotAuthenticError, BadDataError.
+    """
     octets = octets.strip()
     check_size(len(octets), MEMBER_REQUEST.most, MEMBER_REQUEST.what)
     parts = octets.split(b".")

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import check_size
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.handover.strict_json import LAST_U32, Members, load_object, refuse_many, separators
@@ -118,7 +118,7 @@ def canonical(facts: Mapping[str, Any], subject: object) -> bytes:
     try:
         return _spelled({"facts": facts, "subject": subject}).encode()
     except UnicodeEncodeError as error:  # half a surrogate pair
-        raise BadData("A text of the evidence is not Unicode.") from error
+        raise BadDataError("A text of the evidence is not Unicode.") from error
 
 
 def challenge(nonce: bytes, bound: bytes) -> bytes:
@@ -200,19 +200,21 @@ class Evidence:
 
 
 def read(octets: bytes) -> Evidence:
-    """Read an envelope; raises BadData for what is not of our form, whatever the octets."""
+    """Read an envelope; raises BadDataError for what is not of our form, whatever the octets."""
     check_size(len(octets), MAX_OCTETS, "the evidence")
     if len(octets) > _MAX_SEPARATORS:
         refuse_many(separators(octets), 64, "an envelope of evidence")
     envelope = load_object(octets, "The evidence")
     if envelope.keys() != {"payload", "payloadType", "signatures"} or envelope["payloadType"] != PAYLOAD_TYPE:
-        raise BadData(f"This is not a DSSE envelope of {PAYLOAD_TYPE}.", hint="Evidence comes from: evidence export")
+        raise BadDataError(
+            f"This is not a DSSE envelope of {PAYLOAD_TYPE}.", hint="Evidence comes from: evidence export"
+        )
     signatures = envelope["signatures"]
     if not isinstance(signatures, list) or len(signatures) != 1 or not isinstance(signatures[0], dict):
-        raise BadData("The envelope of the evidence has not exactly one signature.")
+        raise BadDataError("The envelope of the evidence has not exactly one signature.")
     keyid, signature = signatures[0].get("keyid"), base64_of(signatures[0].get("sig"), "sig")
     if signatures[0].keys() != {"keyid", "sig"}:
-        raise BadData("The signature of the envelope has other members than keyid and sig.")
+        raise BadDataError("The signature of the envelope has other members than keyid and sig.")
     payload = base64_of(envelope["payload"], "payload")
     return _statement(payload, keyid if isinstance(keyid, str) else "", signature)
 
@@ -222,7 +224,7 @@ def _statement(payload: bytes, keyid: str, signature: bytes) -> Evidence:
         refuse_many(separators(payload), _MAX_SEPARATORS, "evidence")
     statement = load_object(payload, "The statement")
     if statement.get("_type") != STATEMENT_TYPE or statement.get("predicateType") != PREDICATE_TYPE:
-        raise BadData(f"This is no in-toto Statement v1 of {PREDICATE_TYPE}.")
+        raise BadDataError(f"This is no in-toto Statement v1 of {PREDICATE_TYPE}.")
     subject = statement.get("subject")
     uuid, digest = _subject(subject)
     predicate = Members(statement.get("predicate"), "The predicate")
@@ -232,10 +234,10 @@ def _statement(payload: bytes, keyid: str, signature: bytes) -> Evidence:
     station = Members(predicate.get("station"), "The station of the evidence")
     nonce, proof = _hex(node, "nonce", (0, NONCE_OCTETS)), _hex(node, "proof", (0, SIGNATURE_OCTETS))
     if bool(nonce) != bool(proof):
-        raise BadData("The evidence holds one of nonce and proof, not both.")
+        raise BadDataError("The evidence holds one of nonce and proof, not both.")
     verdict = predicate.text("verdict")
     if verdict not in (PASSED, FAILED):
-        raise BadData(f"The verdict of the evidence is neither {PASSED} nor {FAILED}.")
+        raise BadDataError(f"The verdict of the evidence is neither {PASSED} nor {FAILED}.")
     return Evidence(
         uuid,
         digest,
@@ -280,7 +282,7 @@ def ready(evidence: Evidence) -> Ready:
     """Look at everything that comes before the signatures."""
     try:
         shown, signed = security.decode_with_tbs(evidence.uuid, evidence.teds)
-    except BadData as error:
+    except BadDataError as error:
         return Ready(evidence, None, error.message, b"", b"")
     asked = prove_message(evidence.uuid, challenge(evidence.nonce, evidence.bound)) if evidence.proof else b""
     return Ready(evidence, shown, "", signed, asked)
@@ -368,7 +370,7 @@ def blocks_of(shown: SecurityTeds) -> tuple[tuple[int, int, str], ...]:
 def _signed_by(point: bytes, message: bytes, der: bytes) -> bool:
     try:
         public_key(point).verify(der, message, ec.ECDSA(hashes.SHA256()))
-    except (InvalidSignature, BadData):
+    except (InvalidSignature, BadDataError):
         return False
     return True
 
@@ -379,7 +381,7 @@ def _subject(subject: object) -> tuple[bytes, str]:
             found = _UUID_NAME.fullmatch(name)
             if found and _DIGEST.fullmatch(digest) and not more_digests and not more:
                 return bytes.fromhex(found[1]), digest
-    raise BadData("The subject of the statement is not one teds:UUID with its SHA-256.")
+    raise BadDataError("The subject of the statement is not one teds:UUID with its SHA-256.")
 
 
 def _facts(members: Members, raw: dict[str, Any]) -> BoardFacts:
@@ -405,12 +407,12 @@ def _facts(members: Members, raw: dict[str, Any]) -> BoardFacts:
 
 
 def _require_plain(value: object, depth: int = _DEPTH) -> None:
-    """Raise BadData for what RFC 8785 would have to spell: floating numbers, true and false, huge integers."""
+    """Raise BadDataError for what RFC 8785 would have to spell: floating numbers, true and false, huge integers."""
     kind = type(value)
     if kind is str or value is None or (kind is int and 0 <= value <= LAST_U32):  # type: ignore[operator]
         return
     if not depth or kind not in (dict, list):
-        raise BadData("The facts hold something else than texts, whole numbers, lists and null.")
+        raise BadDataError("The facts hold something else than texts, whole numbers, lists and null.")
     for one in value.values() if isinstance(value, dict) else value:  # type: ignore[attr-defined]
         if type(one) is not str:  # the most of them, without a call
             _require_plain(one, depth - 1)
@@ -418,7 +420,7 @@ def _require_plain(value: object, depth: int = _DEPTH) -> None:
 
 def _short(steps: list[Any]) -> list[Any]:
     if len(steps) > _MAX_STEPS:
-        raise BadData(f"The facts name {len(steps)} steps; at most {_MAX_STEPS} are read.")
+        raise BadDataError(f"The facts name {len(steps)} steps; at most {_MAX_STEPS} are read.")
     return steps
 
 
@@ -429,7 +431,7 @@ def _block(one: object) -> tuple[int, int, str]:
         small = type(channel) is int and type(code) is int and channel <= 0xFFFF and code <= 0xFF
         if small and type(digest) is str and _DIGEST.fullmatch(digest):
             return channel, code, digest
-    raise BadData("A block of the facts is not [channel, access code, SHA-256].")
+    raise BadDataError("A block of the facts is not [channel, access code, SHA-256].")
 
 
 def _step(one: object) -> tuple[str, str, int]:
@@ -438,14 +440,14 @@ def _step(one: object) -> tuple[str, str, int]:
         texts = type(name) is str and type(result) is str and name.isprintable() and result.isprintable()
         if texts and type(milliseconds) is int:
             return name, result, milliseconds
-    raise BadData("A step of the facts is not [name, result, milliseconds].")
+    raise BadDataError("A step of the facts is not [name, result, milliseconds].")
 
 
 def _heads(heads: object) -> tuple[str, int]:
     match heads:
         case [str(digits), int(count)] if re.fullmatch(r"[0-9a-f]{16}", digits):
             return digits, count
-    raise BadData("The heads of the facts are not [16 digits, number of chains].")
+    raise BadDataError("The heads of the facts are not [16 digits, number of chains].")
 
 
 def _sha256(members: Members, name: str) -> str:
@@ -454,7 +456,7 @@ def _sha256(members: Members, name: str) -> str:
     if isinstance(text, str) and _DIGEST.fullmatch(text):
         return text
     members.sha256(name)
-    raise BadData(f"The facts: {name} is not in lower case.")
+    raise BadDataError(f"The facts: {name} is not in lower case.")
 
 
 def _sha256_or_none(members: Members, name: str) -> str | None:
@@ -464,7 +466,7 @@ def _sha256_or_none(members: Members, name: str) -> str | None:
 def _time(members: Members, name: str) -> str:
     text = members.text(name)
     if not _TIME.fullmatch(text):
-        raise BadData(f"The evidence: {name} is not a time like 2026-01-31T12:00:00Z.")
+        raise BadDataError(f"The evidence: {name} is not a time like 2026-01-31T12:00:00Z.")
     members.time(name)  # the 31st of February is none either
     return text
 
@@ -477,20 +479,20 @@ def _hex(members: Members, name: str, lengths: tuple[int, ...] | None) -> bytes:
         octets = None
     # fromhex skips spaces and takes capitals, and the one spelling is three times as fast to compare as to match
     if octets is None or octets.hex() != text or (lengths and len(octets) not in lengths):
-        raise BadData(f"The evidence: {name} is not hex of the right length.")
+        raise BadDataError(f"The evidence: {name} is not hex of the right length.")
     if name == "point" and not is_point(octets):
-        raise BadData("The evidence holds a key that is no point of P-256.")
+        raise BadDataError("The evidence holds a key that is no point of P-256.")
     return octets
 
 
 def base64_of(text: object, name: str) -> bytes:
-    """Read a text of base64 that is spelled one way; raises BadData that calls it ``name``."""
+    """Read a text of base64 that is spelled one way; raises BadDataError that calls it ``name``."""
     try:
         octets = binascii.a2b_base64(text, strict_mode=True) if isinstance(text, str) else None
     except ValueError as error:
-        raise BadData(f"The evidence: {name} is not base64.") from error
+        raise BadDataError(f"The evidence: {name} is not base64.") from error
     # Strict reading leaves the end open, its spare bits and padding: that alone is spelled again, not all 4,000 octets.
     end = (len(octets) - 1) // 3 if octets else 0
     if octets is None or binascii.b2a_base64(octets[3 * end :], newline=False).decode() != str(text)[4 * end :]:
-        raise BadData(f"The evidence: {name} is not base64 in its one spelling.")
+        raise BadDataError(f"The evidence: {name} is not base64 in its one spelling.")
     return octets

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final, Literal
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint
 from teds_provision.protocol.plant.document import JOB, Fields, is_form, is_name, is_number, open_document, seal
@@ -142,14 +142,17 @@ class Job:
 
 
 def seal_job(job: Job, key: PrivateKey) -> bytes:
-    """Sign a job; what no reader would take raises BadData."""
+    """Sign a job; what no reader would take raises BadDataError."""
     octets = seal(job.unsigned(), key, JOB)
     open_job(octets, lambda kid: key.point if kid == fingerprint(key.point) else None)
     return octets
 
 
 def open_job(octets: bytes, find_key: Callable[[str], bytes | None]) -> Job:
-    """Read a job; ``find_key`` gives the point of a keeper. Raises NotAuthentic, BadData, NewerFormat."""
+    """Read a job; ``find_key`` gives the point of a keeper.
+
+    Raises NotAuthenticError, BadDataError, NewerFormatError.
+    """
     document = open_document(octets.strip(), find_key, JOB)
     fields = Fields(document.members, "The job")
     count, boards = _nodes(fields)
@@ -243,9 +246,9 @@ def _pattern(fields: Fields) -> str:
 
 
 def require_pattern(pattern: str) -> None:
-    """Raise BadData for a pattern of names with other fields than {unit}, {unit:03}, {uuid} and {uuid8}."""
+    """Raise BadDataError for a pattern of names with other fields than {unit}, {unit:03}, {uuid} and {uuid8}."""
     rest = _FIELD.sub("", pattern)
     if "{" in rest or "}" in rest or not is_name(pattern):
-        raise BadData(
+        raise BadDataError(
             f"The pattern of names {pattern!r} holds something else than {{unit}}, {{unit:03}}, {{uuid}}, {{uuid8}}."
         )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint
 from teds_provision.protocol.plant.document import (
@@ -53,14 +53,14 @@ class Page:
 def open_page(octets: bytes, registry: str, find_key: Callable[[str], bytes | None]) -> Page:
     """Read a page of a member of this registry.
 
-    Raises NotAuthentic or BadData (nobody's page: junk), NewerFormat (the chain waits).
+    Raises NotAuthenticError or BadDataError (nobody's page: junk), NewerFormatError (the chain waits).
     """
     document = open_document(octets, find_key, PAGE)
     fields = Fields(document.members, "The page")
     if fields.of("random_id", "registry") != registry:
-        raise BadData("The page is of another registry.")
+        raise BadDataError("The page is of another registry.")
     if fields.of("sha256", "station") != document.signer:
-        raise BadData("The page names another station than the one that signed it.")
+        raise BadDataError("The page names another station than the one that signed it.")
     n = fields.number("n", 1)
     previous = fields.members.get("previous")
     if not (is_form("sha256", previous) if n > 1 else previous == ""):
@@ -111,9 +111,9 @@ class PageDraft:
 
 
 def seal_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: PrivateKey) -> bytes:
-    """Sign a page; raises BadData where more is in it than a page takes."""
+    """Sign a page; raises BadDataError where more is in it than a page takes."""
     if len(events) > MOST_EVENTS:
-        raise BadData(f"A page takes {MOST_EVENTS} events, not {len(events)}.")
+        raise BadDataError(f"A page takes {MOST_EVENTS} events, not {len(events)}.")
     members = {
         "format": PAGE.format,
         "registry": draft.registry,
@@ -127,5 +127,5 @@ def seal_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: Privat
         "events": list(events),
     }
     if len(payload(members)) > MOST_PAYLOAD:
-        raise BadData(f"The payload of a page has at most {MOST_PAYLOAD} octets.")
+        raise BadDataError(f"The payload of a page has at most {MOST_PAYLOAD} octets.")
     return seal(members, key, PAGE)

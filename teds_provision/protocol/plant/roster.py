@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 from functools import cached_property
 from typing import Any, Final, Literal
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol.handover.strict_json import base64url, time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
 from teds_provision.protocol.plant.document import ROSTER, Fields, is_form, is_name, open_document, seal
@@ -184,24 +184,24 @@ def _signed_up_to(place: Place | None) -> dict[str, object]:
 
 
 def seal_roster(roster: Roster, ca: PrivateKey) -> bytes:
-    """Sign a roster; what no reader would take raises BadData."""
+    """Sign a roster; what no reader would take raises BadDataError."""
     octets = seal(roster.unsigned(), ca, ROSTER)
     open_roster(octets, ca.point)
     return octets
 
 
 def open_roster(octets: bytes, ca: bytes) -> Roster:
-    """Read a roster that this CA (65 octets) signed. Raises NotAuthentic, BadData, NewerFormat."""
+    """Read a roster that this CA (65 octets) signed. Raises NotAuthenticError, BadDataError, NewerFormatError."""
     document = open_document(octets.strip(), lambda kid: ca if kid == fingerprint(ca) else None, ROSTER)
     return read_roster(document.members, ca, document.hash, document.octets)
 
 
 def read_roster(members: object, ca: bytes, hash: str = "", octets: bytes = b"") -> Roster:
-    """Read what a roster says, signed or still a draft; raises BadData."""
+    """Read what a roster says, signed or still a draft; raises BadDataError."""
     fields = Fields(members, "The roster")
     created, expires = fields.time("created"), fields.time("expires")
     if not created < expires <= created + LONGEST:
-        raise BadData(f"The roster: expires is not within {LONGEST.days} days after created.")
+        raise BadDataError(f"The roster: expires is not within {LONGEST.days} days after created.")
     version = fields.number("version", 1)
     previous = fields.members.get("previous")
     if version > 1 or previous != "":
@@ -220,9 +220,9 @@ def read_roster(members: object, ca: bytes, hash: str = "", octets: bytes = b"")
         octets,
     )
     if len(roster.by_key) != len(roster.members) + len(roster.removed):
-        raise BadData("The roster names a key twice.")
+        raise BadDataError("The roster names a key twice.")
     if len({member.name for member in roster.members}) != len(roster.members):
-        raise BadData("The roster names two members alike.")
+        raise BadDataError("The roster names two members alike.")
     return roster
 
 

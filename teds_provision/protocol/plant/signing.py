@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey
@@ -114,12 +114,15 @@ class SignRequest:
 
 
 def seal_request(request: SignRequest, line: PrivateKey) -> bytes:
-    """Sign a request; raises BadData where it is larger than an office reads."""
+    """Sign a request; raises BadDataError where it is larger than an office reads."""
     return seal(request.unsigned(), line, SIGN_REQUEST)
 
 
 def open_request(octets: bytes, find_key: Callable[[str], bytes | None]) -> SignRequest:
-    """Read a request under its line's signature; nothing else of it is verified. Raises NotAuthentic, BadData."""
+    """Read a request under its line's signature; nothing else of it is verified.
+
+    Raises NotAuthenticError, BadDataError.
+    """
     document = open_document(octets.strip(), find_key, SIGN_REQUEST)
     fields = Fields(document.members, "The sign request")
     node = Fields(document.members.get("node"), "The node of the sign request")
@@ -177,7 +180,7 @@ def seal_answer(answer: Answer, office: PrivateKey) -> bytes:
 
 
 def open_answer(octets: bytes, find_key: Callable[[str], bytes | None]) -> Answer:
-    """Read an answer under the office's signature; raises NotAuthentic, BadData."""
+    """Read an answer under the office's signature; raises NotAuthenticError, BadDataError."""
     fields = Fields(open_document(octets.strip(), find_key, SIGNED).members, "The office's answer")
     of = fields.of("sha256", "of")
     if "refused" in fields.members:
@@ -224,6 +227,6 @@ def _sized(fields: Fields, octets: bytes, wanted: int, name: str) -> bytes:
 
 
 def require_name(name: str | None) -> None:
-    """Raise BadData for a name that no request may hold."""
+    """Raise BadDataError for a name that no request may hold."""
     if name is not None and not is_name(name):
-        raise BadData(f"The name {name!r} is none of 1 to 100 printable characters without space at either end.")
+        raise BadDataError(f"The name {name!r} is none of 1 to 100 printable characters without space at either end.")

@@ -19,7 +19,7 @@ from teds_provision.protocol.agreement import (
 )
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, Verify, station_key_message, verify
-from teds_provision.protocol.messages.frames import Reason, Refused
+from teds_provision.protocol.messages.frames import CommandRefusedError, Reason
 from teds_provision.protocol.session import NodeSession, OneTime
 from teds_provision.protocol.tim.permission import Origin
 
@@ -55,18 +55,18 @@ class Agreeing:
     def request(self, payload: bytes, origin: Origin, flash: Flash) -> bytes:
         """Request: length 4, points 15, P(CA) other than the kept one 14, SIG104 5; a good one replaces what pends."""
         if len(payload) != REQUEST_OCTETS:
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         request = RequestPayload.decode(payload)
         if not (good_point(request.station, flash.node_key) and good_point(request.ca, flash.node_key)):
-            raise Refused(Reason.BAD_POINT)
+            raise CommandRefusedError(Reason.BAD_POINT)
         if not good_one_time(request.one_time, flash.node_key, request.station):
-            raise Refused(Reason.BAD_POINT)
+            raise CommandRefusedError(Reason.BAD_POINT)
         if flash.ca is not None and request.ca != flash.ca:
-            raise Refused(Reason.UNTRUSTED_STATION)
+            raise CommandRefusedError(Reason.UNTRUSTED_STATION)
         if not self._verify(request.ca, station_key_message(request.station), request.station_signature):
-            raise Refused(Reason.BAD_SIGNATURE)
+            raise CommandRefusedError(Reason.BAD_SIGNATURE)
         if flash.epoch == LAST_EPOCH:
-            raise Refused(Reason.WRONG_EPOCH)
+            raise CommandRefusedError(Reason.WRONG_EPOCH)
         agreement = NodeAgreement.answer(
             self._key,
             flash.uuid,
@@ -88,13 +88,13 @@ class Agreeing:
             or pending.link != origin.link
             or pending.session is not origin.session
         ):
-            raise Refused(Reason.WRONG_STATE)
+            raise CommandRefusedError(Reason.WRONG_STATE)
         if len(payload) != TAG_OCTETS:
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         agreement = pending.agreement
         if not hmac.compare_digest(payload, agreement.station_tag):
             self._pending = None
-            raise Refused(Reason.BAD_TAG)
+            raise CommandRefusedError(Reason.BAD_TAG)
         ca = agreement.ca if flash.ca is None else flash.ca
         return replace(flash, key=agreement.key, epoch=agreement.epoch, station=agreement.station, ca=ca)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from teds_provision.protocol.announce import LAST_ADDRESS
-from teds_provision.protocol.flash import ChipFailure, Flash, FlashFailure, FlashMemory, in_factory_state
+from teds_provision.protocol.flash import ChipError, Flash, FlashError, FlashMemory, in_factory_state
 from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
     PrivateKey,
@@ -22,9 +22,9 @@ from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
     SECURITY,
     Command,
+    CommandRefusedError,
     Function,
     Reason,
-    Refused,
     Reply,
     TedsFunction,
     refusal,
@@ -246,18 +246,18 @@ class Tim:
     def _run(self, frame: bytes, origin: Origin) -> Reply:
         try:
             if len(frame) > self.max_message:
-                raise Refused(Reason.TOO_LARGE)
+                raise CommandRefusedError(Reason.TOO_LARGE)
             if len(frame) < COMMAND_HEADER:
-                raise Refused(Reason.BAD_FORM)
+                raise CommandRefusedError(Reason.BAD_FORM)
             length = int.from_bytes(frame[4:6], "big")
             command = Command(int.from_bytes(frame[:2], "big"), frame[2], frame[3], frame[COMMAND_HEADER:])
             self._permission.check(command, origin)
             if length != len(command.payload):
-                raise Refused(Reason.BAD_FORM)
+                raise CommandRefusedError(Reason.BAD_FORM)
             return self._dispatch(command, origin)
-        except Refused as refused:
+        except CommandRefusedError as refused:
             return refusal(refused.reason)
-        except (FlashFailure, ChipFailure):
+        except (FlashError, ChipError):
             return refusal(Reason.FLASH_FAILURE)
 
     def _dispatch(self, command: Command, origin: Origin) -> Reply:
@@ -268,7 +268,7 @@ class Tim:
         if security is not None:
             return Reply(True, security(command.payload, origin))
         if self._role is None or origin.session is None or not self._role.knows(command):
-            raise Refused(Reason.UNKNOWN_COMMAND)
+            raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
         return self._role.run(Inner(command, origin.session, origin.port, origin.received))
 
     # -- class 128: each gives the payload of its reply ------------------------------------------------------------
@@ -365,11 +365,11 @@ class Tim:
     def _set_can_address(self, payload: bytes, origin: Origin) -> bytes:
         _length(payload, 1)
         if not 1 <= payload[0] <= LAST_ADDRESS:
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         if payload[0] != self._flash.can_address:  # what stands there already is not written again
             now, last = self.clock(), self._address_written_at
             if last is not None and now - last < _ADDRESS_SECONDS:
-                raise Refused(Reason.BUSY)
+                raise CommandRefusedError(Reason.BUSY)
             self._commit(replace(self._flash, can_address=payload[0]))
             self._address_written_at = now
         self._taken_address = None
@@ -381,10 +381,10 @@ class Tim:
             self._role.claims.everything_safe()
         self.memory.commit(state)
         if self.memory.load() != state:
-            raise FlashFailure  # it took something else: what is not there does not count
+            raise FlashError  # it took something else: what is not there does not count
         self._flash = state
 
 
 def _length(payload: bytes, octets: int) -> None:
     if len(payload) != octets:
-        raise Refused(Reason.BAD_FORM)
+        raise CommandRefusedError(Reason.BAD_FORM)

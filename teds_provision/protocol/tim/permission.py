@@ -9,7 +9,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, Refused, TedsFunction
+from teds_provision.protocol.messages.frames import (
+    COMMON,
+    SECURITY,
+    Command,
+    CommandRefusedError,
+    Function,
+    Reason,
+    TedsFunction,
+)
 from teds_provision.protocol.operation.hardware import SessionPort
 from teds_provision.protocol.operation.role import OperationRole
 from teds_provision.protocol.session import OPEN_OCTETS, NodeSession
@@ -57,39 +65,39 @@ class Permission:
     _stranger_at: float | None = None
 
     def check(self, command: Command, origin: Origin) -> None:
-        """Raise Refused where the command may not be run now, or is not known."""
+        """Raise CommandRefusedError where the command may not be run now, or is not known."""
         if command.command_class == SECURITY:
             # class 128 goes to channel 0; a function that nobody knows gets 1 in every state
             unknown = command.function not in _FUNCTIONS or (
                 command.function == Function.SET_CAN_ADDRESS and not self.has_can
             )
             if command.channel != 0 or unknown:
-                raise Refused(Reason.UNKNOWN_COMMAND)
+                raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
             if origin.session is None:
                 self._plain_security(Function(command.function), command.payload, origin)
             else:
                 # inside a session a node answers 1 to what it does not measure
                 if command.function in _PLAIN_ALONE:
-                    raise Refused(Reason.NOT_PERMITTED)
+                    raise CommandRefusedError(Reason.NOT_PERMITTED)
                 if command.function in _MEASURING and not self._measures(command):
-                    raise Refused(Reason.UNKNOWN_COMMAND)
+                    raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
         elif origin.session is None:
             # Other classes outside a session: Query and Read alone
             if not of_teds(command) or command.function not in (TedsFunction.QUERY, TedsFunction.READ):
-                raise Refused(Reason.NOT_PERMITTED)
+                raise CommandRefusedError(Reason.NOT_PERMITTED)
             if command.function == TedsFunction.READ:
                 self._hold_strangers_back()
         elif not self._measures(command) and not of_teds(command):
-            raise Refused(Reason.UNKNOWN_COMMAND)
+            raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
         self._change(command, origin)
 
     def _plain_security(self, function: Function, payload: bytes, origin: Origin) -> None:
         """The columns "factory" and "keyed or provisioned"."""
         self._permitted_plain(function, origin)
         if function == Function.OPEN and self.in_factory():
-            raise Refused(Reason.WRONG_STATE)
+            raise CommandRefusedError(Reason.WRONG_STATE)
         if function == Function.SEALED and not self.open_on(origin.link):
-            raise Refused(Reason.WRONG_STATE)
+            raise CommandRefusedError(Reason.WRONG_STATE)
         if function == Function.PROVE or (function == Function.OPEN and len(payload) == OPEN_OCTETS):
             self._spare_actuators()
         if function == Function.LIST:
@@ -97,11 +105,11 @@ class Permission:
 
     def _permitted_plain(self, function: Function, origin: Origin) -> None:
         if function in _TAPPED and not origin.tapped:
-            raise Refused(Reason.NOT_PERMITTED)
+            raise CommandRefusedError(Reason.NOT_PERMITTED)
         if function == Function.CLOSE or function in _MEASURING:
-            raise Refused(Reason.NOT_PERMITTED)
+            raise CommandRefusedError(Reason.NOT_PERMITTED)
         if function == Function.RESET and not self.in_factory():
-            raise Refused(Reason.NOT_PERMITTED)
+            raise CommandRefusedError(Reason.NOT_PERMITTED)
 
     def _measures(self, command: Command) -> bool:
         return self.role is not None and self.role.knows(command)
@@ -116,7 +124,7 @@ class Permission:
     def _spare_actuators(self) -> None:
         """No stranger's point arithmetic may hold up the values of a claimed actuator."""
         if self.role is not None and self.role.claims.actuators and not self.quick_points:
-            raise Refused(Reason.BUSY)
+            raise CommandRefusedError(Reason.BUSY)
 
     def _hold_strangers_back(self) -> None:
         """While a stream runs, plain Read and List beyond one a second get 17, together and over all links."""
@@ -124,7 +132,7 @@ class Permission:
             return
         now = self.clock()
         if self._stranger_at is not None and now - self._stranger_at < _STRANGER_SECONDS:
-            raise Refused(Reason.BUSY)
+            raise CommandRefusedError(Reason.BUSY)
         self._stranger_at = now
 
 

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from teds_provision.protocol.agreement import good_one_time, key_id
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.messages.frames import Reason, Refused
+from teds_provision.protocol.messages.frames import CommandRefusedError, Reason
 from teds_provision.protocol.session import (
     BLOCK_OCTETS,
     COUNTER_OCTETS,
@@ -76,16 +76,16 @@ class Sessions:
         if not payload:
             return counter
         if len(payload) != OPEN_OCTETS:
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         key, station = flash.key, payload[KEY_ID_OCTETS:-TAG_OCTETS]
         if key is None or not hmac.compare_digest(payload[:KEY_ID_OCTETS], key_id(key)):
-            raise Refused(Reason.UNKNOWN_KEY)
+            raise CommandRefusedError(Reason.UNKNOWN_KEY)
         # The mac before the point: a stranger costs no point arithmetic, and each Open is good once.
         if not hmac.compare_digest(payload[-TAG_OCTETS:], open_mac(key, flash.uuid, counter, station)):
-            raise Refused(Reason.BAD_TAG)
+            raise CommandRefusedError(Reason.BAD_TAG)
         self._opens = (self._opens + 1) % (1 << 8 * COUNTER_OCTETS)
         if not good_one_time(station, flash.node_key, *([flash.station] if flash.station is not None else [])):
-            raise Refused(Reason.BAD_POINT)
+            raise CommandRefusedError(Reason.BAD_POINT)
         made = NodeSession(key, flash.uuid, station, self._one_time())
         held = self._links.setdefault(link, _Link())
         held.half_open, held.half_open_at = made, self._clock()
@@ -108,22 +108,24 @@ class Sessions:
         return held.session if held is not None else None
 
     def take(self, payload: bytes, link: str) -> OpenedFrame:
-        """A Sealed frame: tried under the session, then under the half-open Open. Raises Refused; changes nothing then.
+        """A Sealed frame: tried under the session, then under the half-open Open.
+
+        Raises CommandRefusedError; changes nothing then.
 
         A link must have a session or half-open Open (:meth:`any_on`).
         """
         if len(payload) < SEALED_HEAD_OCTETS + BLOCK_OCTETS:
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         held = self._links[link]
         for session in (held.session, held.half_open):
             inner = session.unseal(payload) if session is not None else None
             if session is not None and inner is not None:
                 break
         else:
-            raise Refused(Reason.BAD_TAG)
+            raise CommandRefusedError(Reason.BAD_TAG)
         counter = int.from_bytes(payload[:4], "big")
         if counter <= session.counter:
-            raise Refused(Reason.REPLAY)
+            raise CommandRefusedError(Reason.REPLAY)
         if session is held.half_open:
             held.half_open = None
             if not self._make_room(held):

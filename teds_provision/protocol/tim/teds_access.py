@@ -16,15 +16,15 @@ from teds_provision.protocol.messages.frames import (
     READ_OVERHEAD,
     Attribute,
     Command,
+    CommandRefusedError,
     Reason,
-    Refused,
     Reply,
     TedsStatus,
 )
 from teds_provision.protocol.session import NodeSession
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import MANUFACTURER, TEXT_BASED, AccessCode
-from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
+from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
 
 STAGED_SECONDS: Final = 60.0
@@ -45,13 +45,13 @@ class Staging:
         return self._images if session is self._owner else {}
 
     def require(self, session: NodeSession, *, untouched: float | None = None) -> None:
-        """Raise Refused (17) where something is staged in another session.
+        """Raise CommandRefusedError (17) where something is staged in another session.
 
         ``untouched``: seconds (monotonic) now, for a Write, to which what lies there for too long gives way.
         """
         gives_way = untouched is not None and untouched - self._touched_at >= STAGED_SECONDS
         if self._images and session is not self._owner and not gives_way:
-            raise Refused(Reason.BUSY)
+            raise CommandRefusedError(Reason.BUSY)
 
     def put(self, session: NodeSession, block: BlockId, image: bytes, now: float) -> None:
         """Stage an image; what another session had there goes."""
@@ -91,7 +91,7 @@ class TedsAccess:
         block = _block(command, 5)
         teds = flash.teds(block)
         if teds is None:
-            raise Refused(Reason.NO_SUCH_TEDS)
+            raise CommandRefusedError(Reason.NO_SUCH_TEDS)
         offset = min(int.from_bytes(command.payload[1:5], "big"), len(teds))
         octets = teds[offset : offset + self.max_message - READ_OVERHEAD]
         return Reply(True, offset.to_bytes(4, "big") + octets)
@@ -102,18 +102,18 @@ class TedsAccess:
         ``now`` is a monotonic time in seconds.
         """
         if len(command.payload) < 5:
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         block = _block(command, len(command.payload))
         if block in flash.read_only:
-            raise Refused(Reason.NOT_PERMITTED)
+            raise CommandRefusedError(Reason.NOT_PERMITTED)
         staged = staging.of(session).get(block, b"")
         offset = int.from_bytes(command.payload[1:5], "big")
         if offset > len(staged):
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         staging.require(session, untouched=now)
         image = staged[:offset] + command.payload[5:]
         if len(image) > self.max_teds or not self._can_list({*flash.blocks, *staging.of(session), block, SECURITY}):
-            raise Refused(Reason.TOO_LARGE)
+            raise CommandRefusedError(Reason.TOO_LARGE)
         staging.put(session, block, image, now)
         return Reply(True)
 
@@ -127,13 +127,13 @@ class TedsAccess:
         staging.touch(session, now)
         if block not in staged:
             if block == SECURITY and staged:
-                raise Refused(Reason.WRONG_STATE)
+                raise CommandRefusedError(Reason.WRONG_STATE)
             return self.query(flash, command), None
         state = None
         if block == SECURITY:
             state = verified_commit(flash, staged, self.verify)
         elif not passes_own_check(block, staged[block]):
-            raise Refused(Reason.BAD_FORM)
+            raise CommandRefusedError(Reason.BAD_FORM)
         return Reply(True, self._status(flash, block, staged[block]).encode()), state
 
     def _can_list(self, blocks: set[BlockId]) -> bool:
@@ -156,10 +156,10 @@ class TedsAccess:
 def _block(command: Command, octets: int) -> BlockId:
     """The TEDS that a command names; its payload must have that many octets, and the node be able to hold it."""
     if len(command.payload) != octets:
-        raise Refused(Reason.BAD_FORM)
+        raise CommandRefusedError(Reason.BAD_FORM)
     block = (command.channel, command.payload[0])
     if not can_be_stored(block):
-        raise Refused(Reason.NO_SUCH_TEDS)
+        raise CommandRefusedError(Reason.NO_SUCH_TEDS)
     return block
 
 
@@ -168,17 +168,20 @@ def _block(command: Command, octets: int) -> BlockId:
 
 def _demand(holds: bool, reason: Reason) -> None:
     if not holds:
-        raise Refused(reason)
+        raise CommandRefusedError(reason)
 
 
 def verified_commit(flash: Flash, staged: Mapping[BlockId, bytes], verify: Verify = verify) -> Flash:
-    """Return the state that the commit of ``staged`` leads to; raises Refused with the first check that fails."""
+    """Return the state that the commit of ``staged`` leads to.
+
+    Raises CommandRefusedError with the first check that fails.
+    """
     for block, teds in staged.items():
         _demand(datasheet.passes_own_check(block, teds), Reason.BAD_FORM)
     try:
         signed = security.decode(staged[SECURITY])
-    except NotCanonical:
-        raise Refused(Reason.BAD_FORM) from None
+    except NotCanonicalError:
+        raise CommandRefusedError(Reason.BAD_FORM) from None
     _demand(signed.signed, Reason.BAD_FORM)
     _demand(datasheet.own_values(signed), Reason.BAD_FORM)
     own = (flash.node_key, flash.node_key_signature)
@@ -201,7 +204,7 @@ def _listed_blocks(flash: Flash, staged: Mapping[BlockId, bytes], signed: Securi
     for block, digest in signed.signed_blocks.items():
         teds = staged[block] if block in staged else flash.teds(block)
         if teds is None or hashlib.sha256(teds).digest() != digest:
-            raise Refused(Reason.DIGEST_MISMATCH)
+            raise CommandRefusedError(Reason.DIGEST_MISMATCH)
         blocks[block] = teds
     _demand(staged.keys() - {SECURITY} <= blocks.keys(), Reason.DIGEST_MISMATCH)
     return blocks

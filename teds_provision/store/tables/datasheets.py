@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 from teds_provision.store.database import Database, places
 from teds_provision.store.records import DatasheetRecord, Draft, NodeReading, iso, utc_now
@@ -35,7 +35,7 @@ def datasheet_row(image: Image, profile: str | None, seen: str) -> tuple[Any, ..
     if image.security is not None:
         try:
             said = security.decode(image.security)
-        except BadData:
+        except BadDataError:
             pass
         else:
             sequence, epoch = said.sequence, said.key_epoch

@@ -9,7 +9,7 @@ from dataclasses import replace
 from shlex import quote
 from typing import Any
 
-from teds_provision.errors import PolicyRefused, UsageFailure
+from teds_provision.errors import PolicyError, UsageError
 from teds_provision.store.database import Database, places
 from teds_provision.store.records import Direction, Handover, Holder, RevocationRecord, Tombstone, TrustRecord, utc_now
 
@@ -28,12 +28,12 @@ class HandoverTables:
     def put_trust(self, record: TrustRecord) -> None:
         """Trust a key under a name; the same key and role under another name is renamed.
 
-        Raises PolicyRefused if the name stands for another key or role: it must be removed first.
+        Raises PolicyError if the name stands for another key or role: it must be removed first.
         """
         with self._database.together():
             row = self._database.one("SELECT fingerprint, role FROM trust WHERE name = ?", (record.name,))
             if row and row != (record.fingerprint, record.role):
-                raise PolicyRefused(
+                raise PolicyError(
                     f"The name {record.name!r} already stands for the {row[1]} {row[0][:16]}.",
                     hint=f"Choose another name, or run teds-provision trust remove {quote(record.name)} first.",
                 )
@@ -48,7 +48,7 @@ class HandoverTables:
     def remove_trust(self, name_or_fingerprint: str) -> bool:
         """Trust a key no more, by its name, fingerprint, or at least 16 digits of it; False if none fits.
 
-        Raises UsageFailure if the digits fit several keys.
+        Raises UsageError if the digits fit several keys.
         """
         digits = name_or_fingerprint.strip().lower()
         with self._database.together():
@@ -60,7 +60,7 @@ class HandoverTables:
                 "SELECT DISTINCT fingerprint FROM trust WHERE substr(fingerprint, 1, ?) = ?", (len(digits), digits)
             )
             if len(found) > 1:
-                raise UsageFailure(f"{digits} matches {len(found)} trusted keys.", hint="Give the whole fingerprint.")
+                raise UsageError(f"{digits} matches {len(found)} trusted keys.", hint="Give the whole fingerprint.")
             return bool(found) and self._database.change("DELETE FROM trust WHERE fingerprint = ?", found[0]) > 0
 
     def handovers(self) -> list[Handover]:

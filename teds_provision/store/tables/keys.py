@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFoundError
 from teds_provision.store.database import Database, places
 from teds_provision.store.records import KeyRecord
 
@@ -38,7 +38,7 @@ class KeyTables:
     def add_key(self, record: KeyRecord) -> None:
         """Keep a key durably before returning; one that is there already (same node and key id) stays as it is.
 
-        ``record.seq`` is ignored, the store gives the next. Raises StoreFailure, also for a second active key.
+        ``record.seq`` is ignored, the store gives the next. Raises StoreError, also for a second active key.
         """
         with self._database.together():
             self._database.execute(
@@ -61,10 +61,10 @@ class KeyTables:
             )
 
     def activate_key(self, uuid: bytes, key_id: str) -> None:
-        """Make this key the active one; another active one goes, pending ones stay. Raises NotFound."""
+        """Make this key the active one; another active one goes, pending ones stay. Raises NotFoundError."""
         with self._database.together():
             if not self._database.one("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
-                raise NotFound(f"The store has no key {key_id} of node {uuid.hex()}.")
+                raise NotFoundError(f"The store has no key {key_id} of node {uuid.hex()}.")
             self._database.execute(
                 "DELETE FROM keys WHERE uuid = ? AND key_id <> ? AND state = 'active'", (uuid, key_id)
             )

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, cast
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.store.database import Database, places
 from teds_provision.store.records import DetectionMode, Group, KeptMeasurement
 
@@ -74,10 +74,10 @@ class MeasurementTables:
         return self._database.read_one(_measurement, "SELECT * FROM measurements WHERE id = ?", (measurement_id,))
 
     def put_measurement(self, measurement: KeptMeasurement) -> None:
-        """Keep what the station measures from now on; raises BadData where it names none, or two, of what it may."""
+        """Keep what the station measures from now on; raises BadDataError if it names none, or two, of what it may."""
         one = measurement
         if sum((one.group is not None, bool(one.uuids), one.match is not None)) != 1:
-            raise BadData("A measurement names a group, or nodes by UUID, or says which nodes match.")
+            raise BadDataError("A measurement names a group, or nodes by UUID, or says which nodes match.")
         values = (
             one.id,
             one.group,

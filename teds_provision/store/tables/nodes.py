@@ -11,7 +11,7 @@ from itertools import islice
 from operator import attrgetter
 from typing import Any, Final, TypeVar
 
-from teds_provision.errors import NotFound, OtherKey, UsageFailure
+from teds_provision.errors import KeyMismatchError, NotFoundError, UsageError
 from teds_provision.store.database import PAGE, Database, places
 from teds_provision.store.records import (
     UUID_OCTETS,
@@ -120,7 +120,7 @@ class NodeTables:
     def put_node(self, record: NodeRecord) -> None:
         """Add or replace a node. Epoch and sequence never go back; a known identity key stays.
 
-        Raises OtherKey if the record brings another identity key than the stored one.
+        Raises KeyMismatchError if the record brings another identity key than the stored one.
         """
         with self._database.together():
             self.replace_node(record, self.node(record.uuid))
@@ -128,7 +128,7 @@ class NodeTables:
     def replace_node(self, record: NodeRecord, known: NodeRecord | None) -> None:
         """As :meth:`put_node`, inside a transaction in which ``known`` was read (None: there is no such node)."""
         if known and known.point and record.point and known.point != record.point:
-            raise OtherKey(
+            raise KeyMismatchError(
                 f"Node {record.uuid.hex()} is known with another identity key than the one it shows now.",
                 hint="Do not trust this node. If its chip was really replaced, it needs a new UUID.",
             )
@@ -163,7 +163,7 @@ class NodeTables:
         """Return the UUID that ``text`` means, looking at nodes and whitelist.
 
         ``text`` is a UUID of 20 hex digits (returned even if unknown), a prefix of four or more, either with or
-        without ``0x`` and in any case, or a name. Raises NotFound, or UsageFailure when several nodes fit.
+        without ``0x`` and in any case, or a name. Raises NotFoundError, or UsageError when several nodes fit.
         """
         asked = text.strip()
         digits = asked.removeprefix("0x").removeprefix("0X").lower()
@@ -175,14 +175,14 @@ class NodeTables:
             found.update(self._database.execute(*_by_prefix(digits)))
         candidates = sorted(uuid for (uuid,) in found)
         if not candidates:
-            raise NotFound(
+            raise NotFoundError(
                 f"No node is known as {asked!r}.",
                 hint="Give a UUID (20 hex digits, or its first four or more) or a name; see teds-provision nodes.",
             )
         if len(candidates) > 1:
             shown = ", ".join(uuid.hex() for uuid in candidates[:_SHOWN_CANDIDATES])
             more = f" and {len(candidates) - _SHOWN_CANDIDATES} more" if len(candidates) > _SHOWN_CANDIDATES else ""
-            raise UsageFailure(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
+            raise UsageError(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
         return bytes(candidates[0])
 
     def beginning_with(self, text: str, most: int) -> list[tuple[str, str]]:
@@ -292,7 +292,7 @@ class BulkTables:
         seal_node: Callable[[NodeRecord], bytes | None] = lambda node: node.point_mac,
         seal_entry: Callable[[WhitelistEntry], bytes | None] = lambda entry: entry.mac,
     ) -> None:
-        """Add or replace all of it, or nothing, with seals made as it is written; raises StoreFailure."""
+        """Add or replace all of it, or nothing, with seals made as it is written; raises StoreError."""
         many = self._database.execute_many
         with self._database.together():
             many(REPLACE_NODE, (_node_row(record, seal_node(record)) for record in batch.nodes))

@@ -15,7 +15,7 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_size, load_json
 from teds_provision.teds.calibration.model import PLAIN, Calibration
 from teds_provision.teds.calibration.order import CalibrationOrder, calibration_of
@@ -75,7 +75,7 @@ class _Columns:
 
 
 def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
-    """Read a calibration CSV; raises BadData naming file, line and field."""
+    """Read a calibration CSV; raises BadDataError naming file, line and field."""
     table = CsvTable(file)
     data = _data_lines(table, text, keys)
     delimiter = _delimiter(data[0][1])
@@ -85,7 +85,7 @@ def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
     known = columns or _unnamed(table, *lines[0])
     table.rows = [_row(table, number, cells, known, delimiter != ",") for number, cells in lines]
     if not table.rows:
-        raise BadData(f"{file}:{data[0][0]}: the file holds a header and no points.")
+        raise BadDataError(f"{file}:{data[0][0]}: the file holds a header and no points.")
     return table
 
 
@@ -101,21 +101,21 @@ def _data_lines(table: CsvTable, text: str, keys: Sequence[str]) -> list[tuple[i
         elif stripped.strip(",;\t "):
             data.append((number, line))
     if not data:
-        raise BadData(
+        raise BadDataError(
             f"{file}:1: the file holds no points.", hint="It takes lines of raw value and value, like: 512, 10.5"
         )
     long = next((number for number, line in data if len(line) > _LINE), None)
     if long is not None:
-        raise BadData(f"{file}:{long}: the line has more than {_LINE} characters.")
+        raise BadDataError(f"{file}:{long}: the line has more than {_LINE} characters.")
     if len(data) > MAXIMUM_ROWS:
-        raise BadData(f"{file}:{data[MAXIMUM_ROWS][0]}: more than {MAXIMUM_ROWS} lines.")
+        raise BadDataError(f"{file}:{data[MAXIMUM_ROWS][0]}: more than {MAXIMUM_ROWS} lines.")
     return data
 
 
 def _unnamed(table: CsvTable, number: int, cells: list[str]) -> _Columns:
     """Two columns without a header: raw value and value."""
     if len(cells) != 2:
-        raise BadData(
+        raise BadDataError(
             f"{table.file}:{number}: {len(cells)} columns and no header.",
             hint='Name them in the first line: "raw, value" or "channel, raw, value".',
         )
@@ -129,12 +129,12 @@ def _metadata(table: CsvTable, line: str, number: int, keys: Sequence[str]) -> N
     key = match[1].lower().replace(" ", "-")
     if key in keys:
         if key in table.metadata:
-            raise BadData(f"{table.file}:{number}: {key}: given twice.")
+            raise BadDataError(f"{table.file}:{number}: {key}: given twice.")
         table.metadata[key] = (match[2], number)
         return
     near = get_close_matches(key[:64], keys, n=1, cutoff=0.8)
     if near:
-        raise BadData(f'{table.file}:{number}: {key}: there is no such key. Did you mean "{near[0]}"?')
+        raise BadDataError(f'{table.file}:{number}: {key}: there is no such key. Did you mean "{near[0]}"?')
 
 
 def _delimiter(line: str) -> str:
@@ -188,7 +188,7 @@ def _pair_columns(table: CsvTable, number: int, names: list[str], channel: int |
     """Places of raw value and value: the raw one by its name, else the first."""
     rest = [at for at, name in enumerate(names) if at != channel and not name.startswith(REMARK)]
     if len(rest) != 2:
-        raise BadData(
+        raise BadDataError(
             f"{table.file}:{number}: the header names {len(rest)} columns besides the channel; "
             "raw value and value are two."
         )
@@ -208,10 +208,12 @@ def _segment_columns(table: CsvTable, number: int, names: list[str], channel: in
     wanted = (*SEGMENT, *takewhile(names.__contains__, (f"c{power}" for power in count())))
     twice = next((name for name in wanted if names.count(name) > 1), None)
     if twice is not None:
-        raise BadData(f'{table.file}:{number}: the column "{twice}" appears twice.')
+        raise BadDataError(f'{table.file}:{number}: the column "{twice}" appears twice.')
     wrong = _wrong_columns(names if channel is None else names[:channel] + names[channel + 1 :], wanted)
     if wrong:
-        raise BadData(f"{table.file}:{number}: {wrong}: a table of segments has from, to, offset, c0, c1 and so on.")
+        raise BadDataError(
+            f"{table.file}:{number}: {wrong}: a table of segments has from, to, offset, c0, c1 and so on."
+        )
     table.segments = True
     return _Columns(wanted, tuple(names.index(name) for name in wanted), channel)
 
@@ -226,18 +228,18 @@ def _wrong_columns(names: list[str], wanted: tuple[str, ...]) -> str:
 def _row(table: CsvTable, number: int, cells: list[str], columns: _Columns, decimal_comma: bool) -> Row:
     asked = len(columns.places) + (columns.channel is not None)
     if not asked <= len(cells) <= asked + columns.remarks or len(cells) <= max(columns.places):
-        raise BadData(f"{table.file}:{number}: {len(cells)} columns where {asked + columns.remarks} are expected.")
+        raise BadDataError(f"{table.file}:{number}: {len(cells)} columns where {asked + columns.remarks} are expected.")
     values = []
     for name, place in zip(columns.names, columns.places, strict=True):
         try:
             values.append(_number(cells[place], decimal_comma=decimal_comma))
         except (ValueError, OverflowError) as error:
-            raise BadData(f'{table.file}:{number}: {name}: "{cells[place][:40]}" is not a number.') from error
+            raise BadDataError(f'{table.file}:{number}: {name}: "{cells[place][:40]}" is not a number.') from error
     channel = None
     if columns.channel is not None:
         text = cells[columns.channel]
         if not (text.isascii() and text.isdecimal() and len(text) <= _CHANNEL_DIGITS):
-            raise BadData(f'{table.file}:{number}: channel: "{text[:40]}" is not the number of a channel.')
+            raise BadDataError(f'{table.file}:{number}: channel: "{text[:40]}" is not the number of a channel.')
         channel = int(text)
     return Row(number, channel, tuple(values))
 
@@ -271,7 +273,7 @@ _CHANNELS: Final = re.compile(r"([0-9]{1,5})(?:\s*-\s*([0-9]{1,5}))?\Z")
 def load_calibrations(path: Path, profile: Profile) -> dict[int, Calibration]:
     """Read a calibration file for the channels of a profile: by channel number, fitted as file or profile ask.
 
-    Raises NotFound (no such file) and BadData (file, line, field, and what is wrong).
+    Raises NotFoundError (no such file) and BadDataError (file, line, field, and what is wrong).
     """
     return read_calibrations(read_text(path), str(path), profile)
 
@@ -297,8 +299,8 @@ def read_calibrations(text: str, file: str, profile: Profile) -> dict[int, Calib
 def fit_points(text: str, file: str, *, method: str | None = None, degree: int | None = None) -> dict[int, Calibration]:
     """Fit the points of a CSV for what they are, by channel number: no profile says what they are to be.
 
-    ``method`` and ``degree`` go before what the file says. Raises BadData (file, line, field) as reading one does, and
-    for a file of segments, which has no points.
+    ``method`` and ``degree`` go before what the file says. Raises BadDataError (file, line, field) as reading one does,
+    and for a file of segments, which has no points.
     """
     table = read_csv(text, file, CSV_KEYS)
     out: dict[int, Calibration] = {}
@@ -338,7 +340,7 @@ def _from_csv(table: CsvTable) -> list[CalibrationOrder]:
 def _json(text: str, file: str) -> TomlTable:
     data = load_json(text, "the calibration", octets=LIMITS.text_file, file=file)
     if not isinstance(data, dict):
-        raise BadData(f"{file}:1: an object is expected, with points or coefficients.")
+        raise BadDataError(f"{file}:1: an object is expected, with points or coefficients.")
 
     def line(key: str) -> Where:
         at = text.find(f'"{key}"')
@@ -371,7 +373,7 @@ def _order(table: TomlTable, file: str) -> CalibrationOrder:
         if key not in KEYS or key == "calibration" or isinstance(entry, TomlTable):
             near = get_close_matches(key[:64], KEYS, n=1)
             guess = f' Did you mean "{near[0]}"?' if near else f" Known are: {', '.join(KEYS)}."
-            raise BadData(f"{entry.where}: {key}: there is no such key.{guess}")
+            raise BadDataError(f"{entry.where}: {key}: there is no such key.{guess}")
         order.values[key] = (entry.value, entry.where.line)
     return order
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput, Method
 
@@ -95,7 +95,7 @@ class PreparedCurve:
 
 
 class PreparedInverse:
-    """The way back through a calibration: which input gives a result. Raises BadData where more than one would.
+    """The way back through a calibration: which input gives a result. Raises BadDataError where more than one would.
 
     ``low`` and ``high`` are the ends between which the input ``main`` is looked for; other inputs are given with each
     call. Results beyond what lies between the ends give the nearer end. ``step`` is how close is close enough, 0 for as
@@ -104,7 +104,7 @@ class PreparedInverse:
 
     def __init__(self, curve: PreparedCurve, low: float, high: float, *, main: int = 0, step: float = 0.0) -> None:
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise BadData("A calibration is only inverted between two finite ends.")
+            raise BadDataError("A calibration is only inverted between two finite ends.")
         self._curve, self._low, self._high, self._main = curve, low, high, main
         self._halvings = math.ceil(math.log2((high - low) / step)) + 2 if step > 0 else _HALVINGS
         self._count = len(curve.calibration.inputs)
@@ -122,7 +122,7 @@ class PreparedInverse:
             direction = 1 if results[-1] > results[0] else -1
             if (steps * direction >= -slack).all():
                 return direction
-        raise BadData(
+        raise BadDataError(
             f"The calibration of channel {self._curve.calibration.channel} cannot be inverted: "
             "its curve does not rise or fall all the way.",
         )
@@ -178,11 +178,13 @@ def evaluate(calibration: Calibration, *inputs: object) -> object:
     """Apply the formula and the zero offset to one value, or one array, per input.
 
     Arrays are broadcast against each other; ``outside`` is then an array of the same shape (1 where an input lies
-    outside its boundaries or is NaN), else 0.0 or 1.0. Raises BadData for another number of inputs.
+    outside its boundaries or is NaN), else 0.0 or 1.0. Raises BadDataError for another number of inputs.
     """
     parts: tuple[CalibrationInput, ...] = calibration.inputs
     if len(inputs) != len(parts):
-        raise BadData(f"The calibration of channel {calibration.channel} takes {len(parts)} inputs, not {len(inputs)}.")
+        raise BadDataError(
+            f"The calibration of channel {calibration.channel} takes {len(parts)} inputs, not {len(inputs)}."
+        )
     scalar = all(np.ndim(value) == 0 for value in inputs)  # type: ignore[arg-type]
     arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in inputs))
     curve = PreparedCurve(calibration)
@@ -264,7 +266,7 @@ def left_out(calibration: Calibration) -> tuple[float, ...]:
         others = [point for point in points if point[0] != raw]
         try:
             curve = fit(others, calibration.method, channel=calibration.channel, degree=degree)
-        except BadData:  # too few are left
+        except BadDataError:  # too few are left
             return ()
         found.append(value - evaluate(curve, raw).value)
     return tuple(found)
@@ -284,21 +286,21 @@ def fit(
     linear: least squares, C = [intercept, slope], H = 0. polynomial: least squares about the middle of the points
     (default degree: 3, or what the points allow). table: through every point, straight in between; points of the same
     input are averaged, and with a ``tolerance`` nodes are left out as long as every point stays that close. steps: the
-    value of a point holds up to the next one. Raises BadData for too few points, or more than a TEDS can hold.
+    value of a point holds up to the next one. Raises BadDataError for too few points, or more than a TEDS can hold.
     """
     pairs = oriented(points, actuator=actuator)
     distinct = len({x for x, _ in pairs})
     if distinct < 2:
-        raise BadData(f"A calibration needs points at two different inputs or more; there are {distinct}.")
+        raise BadDataError(f"A calibration needs points at two different inputs or more; there are {distinct}.")
     match method:
         case "linear":
             part, coefficients = _polynomial(pairs, 1, about=0.0)
         case "polynomial":
             wanted = min(3, distinct - 1) if degree is None else degree
             if not 1 <= wanted <= MAXIMUM_DEGREE:
-                raise BadData(f"The degree of a polynomial goes from 1 to {MAXIMUM_DEGREE}, not {wanted}.")
+                raise BadDataError(f"The degree of a polynomial goes from 1 to {MAXIMUM_DEGREE}, not {wanted}.")
             if distinct <= wanted:
-                raise BadData(
+                raise BadDataError(
                     f"A polynomial of degree {wanted} needs {wanted + 1} different inputs; there are {distinct}."
                 )
             xs = [x for x, _ in pairs]
@@ -309,7 +311,7 @@ def fit(
             part, coefficients = _steps(_require_room(_averaged(pairs)))
     curve = CalibrationInput(channel, *part)
     if not curve.ascending:
-        raise BadData("Two inputs of the calibration lie so close together that a Float32 cannot tell them apart.")
+        raise BadDataError("Two inputs of the calibration lie so close together that a Float32 cannot tell them apart.")
     return Calibration(channel, method, (curve,), coefficients, points=tuple(points), actuator=actuator)
 
 
@@ -349,7 +351,7 @@ def _steps(pairs: Points) -> tuple[_Part, tuple[float, ...]]:
 
 def _require_room(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
     if len(pairs) > MAXIMUM_NODES:
-        raise BadData(
+        raise BadDataError(
             f"A table of {len(pairs)} nodes is too large for a TEDS, which holds {MAXIMUM_NODES} at most.",
             hint="Thin it with a tolerance (# tolerance: 0.05), or fit a polynomial.",
         )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
 from teds_provision.teds.calibration.samples import Range, SampleForm, SampleReader
@@ -57,12 +57,12 @@ class ChannelInterpreter:
     """
 
     def __init__(self, sheet: Sheet, number: int) -> None:
-        """Prepare channel ``number``; raises BadData where it is not there or its samples cannot be read."""
+        """Prepare channel ``number``; raises BadDataError where it is not there or its samples cannot be read."""
         channel = sheet.channel(number)
         if channel is None:
-            raise BadData(f"The datasheet describes no channel {number}.")
+            raise BadDataError(f"The datasheet describes no channel {number}.")
         if channel.sample is None:
-            raise BadData(f"The datasheet does not say how a sample of channel {number} is coded.")
+            raise BadDataError(f"The datasheet does not say how a sample of channel {number} is coded.")
         self.channel: Channel = channel
         self.reader = SampleReader(channel.sample)
         self.unit: WrittenUnit = channel.unit
@@ -104,7 +104,7 @@ class ChannelInterpreter:
         return self.values(raw, rows)
 
     def values(self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None) -> Values:
-        """Values of raw values (of :meth:`SampleReader.raw`); raises BadData where an input is missing."""
+        """Values of raw values (of :meth:`SampleReader.raw`); raises BadDataError where an input is missing."""
         shown, valid, extrapolated = self._computed(raw, others or {})
         valid &= (shown >= self._floor) & (shown <= self._ceiling) & np.isfinite(shown)
         return Values(raw, np.where(valid, shown, math.nan), valid, extrapolated)
@@ -114,11 +114,11 @@ class ChannelInterpreter:
     ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
         """What the calibration of a sensor gives, in its own unit, neither wrapped nor held against any limit.
 
-        Beside it: which raw values are possible, and which lie beyond the calibrated range. Raises BadData where there
-        is no calibration that can be computed, or an input is missing.
+        Beside it: which raw values are possible, and which lie beyond the calibrated range. Raises BadDataError where
+        there is no calibration that can be computed, or an input is missing.
         """
         if self.problem or self._curve is None or self.channel.actuator:
-            raise BadData(self.problem or f"Channel {self.channel.number} has no calibration of a sensor.")
+            raise BadDataError(self.problem or f"Channel {self.channel.number} has no calibration of a sensor.")
         inputs, possible = self._inputs(*self.reader.numbers(raw), others or {})
         return self._curve(*inputs), possible, self._curve.outside(*inputs)
 
@@ -169,18 +169,21 @@ class ChannelInterpreter:
     def encode(self, values: Floats | float, others: Mapping[int, NDArray[np.generic]] | None = None) -> bytes:
         """Octets of values in :attr:`unit`: kept within the limits, converted, rounded to what the sample can hold.
 
-        For an actuator the set point to send, for a virtual sensor the sample that it would give. Raises BadData where
-        there is no way back (no calibration, a curve that turns, a value that is not finite).
+        For an actuator the set point to send, for a virtual sensor the sample that it would give. Raises BadDataError
+        where there is no way back (no calibration, a curve that turns, a value that is not finite).
         """
         values = np.clip(self.within_turn(np.atleast_1d(np.asarray(values, dtype=np.float64))), *self.limits)
         if not np.isfinite(values).all():
-            raise BadData(f"A value of channel {self.channel.number} is not finite.")
+            raise BadDataError(f"A value of channel {self.channel.number} is not finite.")
         return self.reader.write(self.raw_numbers(values, others))
 
     def raw_numbers(self, values: Floats, others: Mapping[int, NDArray[np.generic]] | None = None) -> Floats:
-        """Raw values (not yet rounded) that stand for values in :attr:`unit`; raises BadData as :meth:`encode` does."""
+        """Raw values (not yet rounded) that stand for values in :attr:`unit`.
+
+        Raises BadDataError as :meth:`encode` does.
+        """
         if self.problem:
-            raise BadData(self.problem)
+            raise BadDataError(self.problem)
         if self._curve is None:
             return self._stated(values)
         if self.channel.actuator:
@@ -188,7 +191,9 @@ class ChannelInterpreter:
         given = others or {}
         for number in self.others:
             if number not in given:
-                raise BadData(f"Channel {self.channel.number} is compensated by channel {number}, which is not given.")
+                raise BadDataError(
+                    f"Channel {self.channel.number} is compensated by channel {number}, which is not given."
+                )
         more = [self._readers[n].numbers(given[n])[0] for n in self.inputs if n != self.channel.number]
         stated = self._stated(values)
         return self._inverse(self._nearest_turn(stated, more) if math.isfinite(self.turn) else stated, more)
@@ -267,7 +272,7 @@ class ChannelInterpreter:
         """For an actuator: from its raw set point to values; None where its curve turns, so that none can be told."""
         try:
             return self._inverse if self._curve is not None else None
-        except BadData:
+        except BadDataError:
             return None
 
     def _inputs(
@@ -280,7 +285,9 @@ class ChannelInterpreter:
                 continue
             raw = others.get(number)
             if raw is None or len(raw) != len(numbers):
-                raise BadData(f"Channel {self.channel.number} is compensated by channel {number}, which is not given.")
+                raise BadDataError(
+                    f"Channel {self.channel.number} is compensated by channel {number}, which is not given."
+                )
             more, possible = self._readers[number].numbers(raw)
             inputs.append(more)
             valid = valid & possible

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.model import Decoded, Edition, Field, TimeInstance, Units
 from teds_provision.teds.units import WrittenUnit, parse_unit, recognize
 
@@ -33,11 +33,11 @@ PLAIN: Final = parse_unit("1")
 
 
 def float32(values: tuple[float, ...], name: str) -> tuple[float, ...]:
-    """Round to what a Float32 holds; raises BadData where one does not fit."""
+    """Round to what a Float32 holds; raises BadDataError where one does not fit."""
     try:
         return struct.unpack(f">{len(values)}f", struct.pack(f">{len(values)}f", *values))
     except (OverflowError, struct.error) as error:
-        raise BadData(f"{name} of the calibration hold a number that does not fit a Float32.") from error
+        raise BadDataError(f"{name} of the calibration hold a number that does not fit a Float32.") from error
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class CalibrationInput:
 
     def __post_init__(self) -> None:
         if not 0 <= self.degree <= 255:
-            raise BadData(f"The degree of a calibration input goes from 0 to 255, not {self.degree}.")
+            raise BadDataError(f"The degree of a calibration input goes from 0 to 255, not {self.degree}.")
         if not self.offsets or len(self.boundaries) != len(self.offsets) + 1:
-            raise BadData(
+            raise BadDataError(
                 f"A calibration input has {len(self.boundaries)} boundaries and {len(self.offsets)} offsets; "
                 "there is one boundary more than segments, and one offset for each."
             )
@@ -104,11 +104,11 @@ class Calibration:
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.inputs) <= MAXIMUM_INPUTS:
-            raise BadData(f"A calibration has 1 to {MAXIMUM_INPUTS} inputs, not {len(self.inputs)}.")
+            raise BadDataError(f"A calibration has 1 to {MAXIMUM_INPUTS} inputs, not {len(self.inputs)}.")
         cells = math.prod(part.segments for part in self.inputs)
         each = math.prod(part.degree + 1 for part in self.inputs)
         if len(self.coefficients) != cells * each:
-            raise BadData(
+            raise BadDataError(
                 f"The calibration of channel {self.channel} has {len(self.coefficients)} coefficients; "
                 f"{cells} cells of {each} need {cells * each}."
             )
@@ -201,13 +201,13 @@ def from_decoded(
 
     Without ``channel`` it is that of the first input.
 
-    Raises BadData where the TEDS has no coefficients of the general form, or they do not fit together.
+    Raises BadDataError where the TEDS has no coefficients of the general form, or they do not fit together.
     """
     number = channel or 0
     inputs = tuple(_input(field, number) for field in decoded.fields if field.name == "CalInput")
     coefficients = _top(decoded, "Coefs")
     if not inputs or not isinstance(coefficients, tuple):
-        raise BadData(
+        raise BadDataError(
             f"The Calibration TEDS of channel {number} has no inputs and coefficients that are understood here.",
             hint="Its field numbers are not those of docs/teds.md; the octets are kept as they are.",
         )
@@ -255,7 +255,9 @@ def _input(field: Field, channel: int) -> CalibrationInput:
     values = {child.name: child.value for child in field.children}
     degree, boundaries, offsets = (values.get(name) for name in ("Degree", "Boundaries", "Offsets"))
     if not isinstance(degree, int) or not isinstance(boundaries, tuple) or not isinstance(offsets, tuple):
-        raise BadData(f"An input of the Calibration TEDS of channel {channel} lacks its degree, boundaries or offsets.")
+        raise BadDataError(
+            f"An input of the Calibration TEDS of channel {channel} lacks its degree, boundaries or offsets."
+        )
     number, key = values.get("ChanNum"), values.get("ChanKey")
     return CalibrationInput(
         number if isinstance(number, int) else channel,

@@ -8,7 +8,7 @@ from datetime import UTC, date, datetime
 from difflib import get_close_matches
 from itertools import pairwise
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.formula import fit, residuals
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
 from teds_provision.teds.profile.model import ChannelProfile
@@ -29,10 +29,10 @@ class CalibrationOrder:
     line: int
     values: dict[str, tuple[object, int]] = field(default_factory=dict)
 
-    def wrong(self, key: str, message: str) -> BadData:
+    def wrong(self, key: str, message: str) -> BadDataError:
         """Error at a key."""
         line = self.values[key][1] if key in self.values else self.line
-        return BadData(f"{self.file}:{line}: {key}: {message}" if key else f"{self.file}:{line}: {message}")
+        return BadDataError(f"{self.file}:{line}: {key}: {message}" if key else f"{self.file}:{line}: {message}")
 
     def get(self, key: str) -> object:
         """Value of a key, None where it is absent."""
@@ -62,11 +62,11 @@ class CalibrationOrder:
 
 
 def calibration_of(order: CalibrationOrder, channel: ChannelProfile) -> Calibration:
-    """Fit or take over what the file says for a channel; raises BadData with file, line and field."""
+    """Fit or take over what the file says for a channel; raises BadDataError with file, line and field."""
     unit = _unit(order, channel)
     try:
         curve = _curve(order, channel)
-    except BadData as error:
+    except BadDataError as error:
         if error.message.startswith(f"{order.file}:"):
             raise
         raise order.wrong("", error.message) from error
@@ -164,7 +164,7 @@ def _connected(order: CalibrationOrder) -> list[tuple[float, ...]]:
     rows = value if isinstance(value, list) else []
     for number, (above, below) in enumerate(pairwise(rows)):
         if above[1] != below[0]:
-            raise BadData(
+            raise BadDataError(
                 f"{order.file}:{line + number + 1}: from: the segment does not begin where the last one ends."
             )
     return rows
@@ -200,7 +200,7 @@ def _input(order: CalibrationOrder, table: TomlTable, channel: ChannelProfile) -
     inner = CalibrationOrder(order.file, table.where.line)
     for key, entry in table.entries.items():
         if isinstance(entry, TomlTable) or key not in ("channel", "key", "degree", "boundaries", "offsets"):
-            raise BadData(f"{entry.where}: inputs.{key}: there is no such key.")
+            raise BadDataError(f"{entry.where}: inputs.{key}: there is no such key.")
         inner.values[key] = (entry.value, entry.where.line)
     number, degree = inner.number("channel"), _degree(inner)
     part = CalibrationInput(
@@ -237,7 +237,7 @@ def _unit(order: CalibrationOrder, channel: ChannelProfile) -> WrittenUnit:
         return channel.unit
     try:
         unit = parse_unit(str(text))
-    except BadData as error:
+    except BadDataError as error:
         raise order.wrong("unit", f"{error.message} {error.hint}") from error
     if unit.units != channel.unit.units:
         raise order.wrong("unit", f'"{text}" is not of the same kind as "{channel.unit.text}" of the channel.')
@@ -251,7 +251,7 @@ def _uncertainty(order: CalibrationOrder, unit: WrittenUnit) -> float | None:
         order.values["uncertainty"] = (number, order.values["uncertainty"][1])
         try:
             written = parse_unit(text)
-        except BadData as error:
+        except BadDataError as error:
             raise order.wrong("uncertainty", f"{error.message} {error.hint}") from error
         if written.units != unit.units:
             raise order.wrong("uncertainty", f'"{text}" is not of the same kind as "{unit.text}".')
@@ -310,7 +310,7 @@ def _interval(order: CalibrationOrder, channel: ChannelProfile) -> float | None:
         return channel.calibration.interval
     try:
         seconds = parse_seconds(value)
-    except BadData as error:
+    except BadDataError as error:
         raise order.wrong("interval", f"{error.message} {error.hint}") from error
     if not 0 < seconds < 2**32:
         raise order.wrong("interval", f"{value!r} is not a time that a TEDS can hold.")

@@ -6,7 +6,7 @@ import math
 from datetime import datetime
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.units import recognize
@@ -46,9 +46,9 @@ def calibration_as_json(calibration: Calibration) -> dict[str, Any]:
 
 
 def calibration_from_json(data: object, channel: int, units: Units) -> Calibration:
-    """The calibration of a channel with these exponents; raises BadData where the data are none."""
+    """The calibration of a channel with these exponents; raises BadDataError where the data are none."""
     if not isinstance(data, dict) or data.get("method") not in METHODS:
-        raise BadData("The calibration is not that of a recording.")
+        raise BadDataError("The calibration is not that of a recording.")
     try:
         scale, offset = _numbers(data["si"])
         inputs = tuple(
@@ -72,7 +72,7 @@ def calibration_from_json(data: object, channel: int, units: Units) -> Calibrati
             actuator=data.get("actuator") is True,
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise BadData("The calibration is not that of a recording.") from error
+        raise BadDataError("The calibration is not that of a recording.") from error
 
 
 def _u16(value: object) -> int:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import date
 from typing import Final
 
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.teds.calibration.files import CSV_KEYS, read_csv
 from teds_provision.teds.units import WrittenUnit, parse_unit
 
@@ -32,25 +32,25 @@ class Point:
 def with_point(text: str, file: str, point: Point, *, node: str, unit: WrittenUnit, today: date) -> str:
     """The text of a file with one point more; an empty text becomes a new file in ``unit``.
 
-    Values stand in the unit of the file. Raises PolicyRefused where the file is of another node, BadData where it is no
-    calibration CSV with these columns, or its unit is of another kind.
+    Values stand in the unit of the file. Raises PolicyError where the file is of another node, BadDataError where it is
+    no calibration CSV with these columns, or its unit is of another kind.
     """
     if not text:
         head = f"# node: {node}\n# date: {today}\nchannel, raw, value [{unit.text}], # spread, # count\n"
         return head + _row(point, unit)
     heads = [found for line in text.splitlines() if (found := _HEAD.fullmatch(line.strip()))]
     if len(heads) != 1:
-        raise BadData(
+        raise BadDataError(
             f"{file} is no file that capture wrote: its columns are others.",
             hint="Name a new file; the columns are: channel, raw, value [unit], # spread, # count.",
         )
     read_csv(text, file, CSV_KEYS)
     owner = _NODE.search(text)
     if owner is not None and owner[1] != node:
-        raise PolicyRefused(f"{file} holds points of node {owner[1]}, not of {node}.", hint="Name another file.")
+        raise PolicyError(f"{file} holds points of node {owner[1]}, not of {node}.", hint="Name another file.")
     own = parse_unit(heads[0][1])
     if own.units != unit.units:
-        raise BadData(
+        raise BadDataError(
             f"{file} holds values in {own.text}; this channel's are in {unit.text}.", hint="Name another file."
         )
     dated = _DATE.sub(f"# date: {today}", text)

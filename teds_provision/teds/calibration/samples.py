@@ -13,7 +13,7 @@ from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
@@ -130,13 +130,13 @@ _FRACTIONS: Final = (DataModel.FRACTION, DataModel.LONG_FRACTION)
 
 @dataclass(frozen=True)
 class SampleReader:
-    """Reads and writes samples of one form, prepared once. Raises BadData for a form that cannot be read."""
+    """Reads and writes samples of one form, prepared once. Raises BadDataError for a form that cannot be read."""
 
     form: SampleForm
 
     def __post_init__(self) -> None:
         if self.form.problem:
-            raise BadData(f"The samples cannot be read: {self.form.problem}.")
+            raise BadDataError(f"The samples cannot be read: {self.form.problem}.")
 
     @property
     def octets(self) -> int:
@@ -151,7 +151,7 @@ class SampleReader:
         """Raw values as the data model says: unsigned 64-bit integers, Float64 for floats, fractions and times.
 
         Integers and bits of more than 8 octets come as Python integers in an object array. Takes octets one sample
-        after the other, or an array of shape (samples, ModLenth). Raises BadData where they do not divide evenly.
+        after the other, or an array of shape (samples, ModLenth). Raises BadDataError where they do not divide evenly.
         """
         rows = self._rows(octets)
         model = self.form.model
@@ -187,13 +187,13 @@ class SampleReader:
     def write(self, numbers: NDArray[np.float64]) -> bytes:
         """Octets of raw numbers, rounded to the nearest that the form can hold and kept within what it can give.
 
-        Raises BadData for a number that is not finite, and for bit sequences and times, which are not quantities.
+        Raises BadDataError for a number that is not finite, and for bit sequences and times, which are not quantities.
         """
         if self.form.model in (DataModel.BITS, DataModel.TIME_OF_DAY):
-            raise BadData(f"A number cannot be written as {self.form.name}.")
+            raise BadDataError(f"A number cannot be written as {self.form.name}.")
         numbers = np.atleast_1d(np.asarray(numbers, dtype=np.float64))
         if not np.isfinite(numbers).all():
-            raise BadData("A value that is not finite cannot be written as a sample.")
+            raise BadDataError("A value that is not finite cannot be written as a sample.")
         if self.form.model in _FLOATS:
             most = float(np.finfo(_FLOATS[DataModel(self.form.model)]).max)
             return np.clip(numbers, -most, most).astype(_FLOATS[DataModel(self.form.model)]).tobytes()
@@ -214,10 +214,10 @@ class SampleReader:
         size = self.form.octets
         if rows.ndim == 1:
             if len(rows) % size:
-                raise BadData(f"{len(rows)} octets are no whole number of samples of {size} octets.")
+                raise BadDataError(f"{len(rows)} octets are no whole number of samples of {size} octets.")
             rows = rows.reshape(-1, size)
         elif rows.shape[1] != size:
-            raise BadData(f"A sample of {rows.shape[1]} octets was given; the data model has {size}.")
+            raise BadDataError(f"A sample of {rows.shape[1]} octets was given; the data model has {size}.")
         return rows
 
 

@@ -90,7 +90,7 @@ def offset_for(calibration: Calibration, reading: float, wanted: float, turn: fl
 def with_zero_offset(teds: bytes, offset: float, at: datetime) -> bytes:
     """A Calibration TEDS (Length to Checksum) with another zero offset and its date; all else octet for octet.
 
-    Raises BadData for a TEDS that is damaged.
+    Raises BadDataError for a TEDS that is damaged.
     """
     decoded = decode(teds)
     width = tuple_width(decoded)

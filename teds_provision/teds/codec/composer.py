@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec import values
 from teds_provision.teds.codec.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.codec.model import AccessCode, Decoded, Edition, Field, Finding, Severity, TimeInstance, Units
@@ -19,7 +19,7 @@ _VERSION: Final = {2007: 1, 2024: 2}
 _NOT_CONTENT: Final = frozenset({"TEDSID"})
 
 
-class Wider(Exception):
+class LengthOverflowError(Exception):
     """A value needs more length octets than tried."""
 
 
@@ -36,21 +36,21 @@ def compose(
     that is a number is a field that the table does not know, its value octets. Units are spelled as nested tuples in
     the 2007 edition and packed in that of 2024. ``width`` is the number of length octets of every tuple (1 to 4);
     without it 1 is taken, or 2 where a field needs it. Text-based TEDS take ``("Text", {"LangCode", "Text",
-    "Compress"})`` once per language. Raises BadData naming the field.
+    "Compress"})`` once per language. Raises BadDataError naming the field.
     """
     if not 1 <= access_code <= 255:
-        raise BadData(f"An access code goes from 1 to 255, not {access_code}.")
+        raise BadDataError(f"An access code goes from 1 to 255, not {access_code}.")
     if edition not in _VERSION:
-        raise BadData(f"There is no edition {edition}; 2007 and 2024 are known.")
+        raise BadDataError(f"There is no edition {edition}; 2007 and 2024 are known.")
     if width is not None and width not in (1, 2, 3, 4):
-        raise BadData(f"Tuples have 1 to 4 length octets, not {width}.")
+        raise BadDataError(f"Tuples have 1 to 4 length octets, not {width}.")
     pairs = pairs_of(f"The TEDS {access_code}", fields)
     for tried in (width,) if width is not None else (1, 2):
         try:
             return frame(Composer(table(access_code), edition, tried).block(pairs))
-        except Wider as error:
+        except LengthOverflowError as error:
             reason = str(error)
-    raise BadData(f"{reason} does not fit tuples of {tried} length octets.", hint="Give a greater width, up to 4.")
+    raise BadDataError(f"{reason} does not fit tuples of {tried} length octets.", hint="Give a greater width, up to 4.")
 
 
 class Composer:
@@ -75,7 +75,7 @@ class Composer:
         if isinstance(given, Mapping):
             family, version = _octet(given, "family", family), _octet(given, "version", version)
         elif given is not None:
-            raise BadData("TEDSID is a mapping with family and version; the rest follows from the access code.")
+            raise BadDataError("TEDSID is a mapping with family and version; the rest follows from the access code.")
         parts = [family, NO_SUBFAMILY] if self.edition == 2024 else [family]
         if isinstance(given, Mapping) and self.edition == 2024:
             parts[1] = _octet(given, "subfamily", NO_SUBFAMILY)
@@ -89,7 +89,7 @@ class Composer:
         for name, value in _spread(pairs, known):
             number, octets, repeats = self.one(name, value, known)
             if number in seen and not repeats:
-                raise BadData(f"{name} is given twice.")
+                raise BadDataError(f"{name} is given twice.")
             seen.add(number)
             done.append((number, octets))
         done.sort(key=lambda entry: entry[0])
@@ -105,9 +105,11 @@ class Composer:
             or not 0 <= int(name) <= 255
             or (int(name) == TEDSID and self.table.access_code != AccessCode.SECURITY)
         ):
-            raise BadData(f"{self.table.name} has no field {name!r}.", hint=f"It has {', '.join(known) or 'no names'}.")
+            raise BadDataError(
+                f"{self.table.name} has no field {name!r}.", hint=f"It has {', '.join(known) or 'no names'}."
+            )
         if not isinstance(value, bytes | bytearray):
-            raise BadData(f"Field {name} of {self.table.name} is raw octets, not {values.shown(value)}.")
+            raise BadDataError(f"Field {name} of {self.table.name} is raw octets, not {values.shown(value)}.")
         return int(name), bytes(value), True
 
     def value(self, spec: FieldSpec, value: object) -> bytes:
@@ -131,7 +133,7 @@ class Composer:
     def tuple(self, number: int, octets: bytes) -> bytes:
         """One tuple in this width."""
         if len(octets) >= 1 << 8 * self.width:
-            raise Wider(f"Field {number} of {self.table.name} has {len(octets)} octets and")
+            raise LengthOverflowError(f"Field {number} of {self.table.name} has {len(octets)} octets and")
         return raw_tuple(number, octets, width=self.width)
 
 
@@ -151,7 +153,7 @@ def _spread(pairs: list[tuple[str, object]], known: Mapping[str, FieldSpec]) -> 
 def _octet(given: Mapping[str, object], key: str, default: int) -> int:
     value = given.get(key, default)
     if not isinstance(value, int) or not 0 <= value <= 255:
-        raise BadData(f"The {key} of the TEDSID is an octet, not {values.shown(value)}.")
+        raise BadDataError(f"The {key} of the TEDSID is an octet, not {values.shown(value)}.")
     return value
 
 
@@ -164,11 +166,11 @@ def recompose(decoded: Decoded) -> bytes:
     """Encode the fields of a decoded TEDS anew: TEDSID, width, order, spelling of units and Length as they should be.
 
     The result is equal to the original for a clean TEDS. Unknown fields keep their octets. A framed TEDS gives a framed
-    one with right Length and checksum, a bare data block gives a bare one. Raises BadData where there is nothing to
-    encode from (malformed octets, a message).
+    one with right Length and checksum, a bare data block gives a bare one. Raises BadDataError where there is nothing
+    to encode from (malformed octets, a message).
     """
     if decoded.verdict in {"malformed", "message"}:
-        raise BadData(f"This cannot be encoded anew: its verdict is {decoded.verdict}.")
+        raise BadDataError(f"This cannot be encoded anew: its verdict is {decoded.verdict}.")
     width = tuple_width(decoded)
     edition: Edition = decoded.edition or 2007
     fields = table(decoded.access_code) if decoded.access_code is not None else None
@@ -246,11 +248,11 @@ def convert(decoded: Decoded, edition: Edition, *, uuid: bytes | None = None) ->
     """Convert a decoded TEDS to an edition, framed or bare as it came; findings say what was changed or lost.
 
     A UUID of one edition cannot be said in the other: ``uuid`` gives the new one, else the field is left out (an error
-    finding). The profile's Security TEDS (access code 128) has one form only and is returned as it is. Raises BadData
-    for octets that have no fields to convert, or no TEDSID.
+    finding). The profile's Security TEDS (access code 128) has one form only and is returned as it is. Raises
+    BadDataError for octets that have no fields to convert, or no TEDSID.
     """
     if decoded.edition is None or decoded.access_code is None or decoded.verdict in {"malformed", "message"}:
-        raise BadData(f"This cannot be converted: it is no TEDS of known edition (verdict {decoded.verdict}).")
+        raise BadDataError(f"This cannot be converted: it is no TEDS of known edition (verdict {decoded.verdict}).")
     if decoded.edition == edition:
         return decoded.octets, []
     conversion = _Conversion(decoded, table(decoded.access_code), edition, uuid)
@@ -322,7 +324,7 @@ class _Conversion:
         wanted = _UUID_OCTETS[self.edition]
         if self.uuid is not None:
             if len(self.uuid) != wanted:
-                raise BadData(f"The UUID has {wanted} octets in the {self.edition} edition, not {len(self.uuid)}.")
+                raise BadDataError(f"The UUID has {wanted} octets in the {self.edition} edition, not {len(self.uuid)}.")
             return composer.tuple(part.type, self.uuid)
         message = f"A UUID of {len(part.raw)} octets cannot be said in {wanted}; it is left out."
         self.say("error", "lost", message, part, f"{wanted} octets")
@@ -340,7 +342,7 @@ class _Conversion:
         if isinstance(part.value, TimeInstance):
             try:
                 return composer.tuple(part.type, composer.value(spec, part.value))
-            except BadData as error:
+            except BadDataError as error:
                 self.say("error", "lost", f"{error.message} It is left out.", part)
                 return b""
         return composer.tuple(part.type, part.raw)
@@ -357,7 +359,7 @@ class _Conversion:
             return self.framed(block)
         first = self.decoded.fields[0]
         if first.name != "TEDSID":
-            raise BadData("A text-based TEDS whose TEDSID is not first cannot be converted.")
+            raise BadDataError("A text-based TEDS whose TEDSID is not first cannot be converted.")
         self.say("warning", "kept", "The directory does not describe the texts; it is kept, Offset and all.", None)
         old = recompose(self.decoded)
         block = old[4:-2] if self.decoded.framed else old

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, TEDSID, checksum, shape_of
 from teds_provision.teds.codec.model import (
     MALFORMED_CODES,
@@ -168,7 +168,7 @@ _made: Final[Callable[[tuple[object, ...]], Field]] = partial(tuple.__new__, Fie
 def decode(octets: bytes, *, strict: bool = False) -> Decoded:
     """Decode a framed TEDS or a bare data block, 2007 or 2024 edition (told by the length of the TEDSID).
 
-    Never raises, whatever the octets, unless ``strict``: then BadData with the first finding of severity error. A
+    Never raises, whatever the octets, unless ``strict``: then BadDataError with the first finding of severity error. A
     message is recognised and not taken apart here. Offsets in findings and fields count from the first octet given.
     """
     octets = bytes(octets)
@@ -181,7 +181,7 @@ def decode(octets: bytes, *, strict: bool = False) -> Decoded:
         for finding in decoded.findings:
             if finding.severity == "error":
                 where = "" if finding.offset is None else f" (octet {finding.offset})"
-                raise BadData(f"{finding.message}{where}", hint=f"The verdict of this TEDS is {decoded.verdict}.")
+                raise BadDataError(f"{finding.message}{where}", hint=f"The verdict of this TEDS is {decoded.verdict}.")
     return decoded
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Final, Literal, NamedTuple
 from zlib import adler32
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 
 TEDSID = 3
 _SUMMED = 256
@@ -46,22 +46,22 @@ def frame(block: bytes) -> bytes:
 
 
 def unframe(teds: bytes) -> bytes:
-    """Return the data block of a framed TEDS; raises BadData when Length or Checksum are wrong."""
+    """Return the data block of a framed TEDS; raises BadDataError when Length or Checksum are wrong."""
     if len(teds) < 6:
-        raise BadData(f"A TEDS has at least {MINIMUM_OCTETS} octets, this one {len(teds)}.")
+        raise BadDataError(f"A TEDS has at least {MINIMUM_OCTETS} octets, this one {len(teds)}.")
     length = int.from_bytes(teds[:4], "big")
     if length != len(teds) - 4:
-        raise BadData(f"The Length of this TEDS says {length} octets follow; {len(teds) - 4} do.")
+        raise BadDataError(f"The Length of this TEDS says {length} octets follow; {len(teds) - 4} do.")
     stated, right = int.from_bytes(teds[-2:], "big"), checksum(teds[:-2])
     if stated != right:
-        raise BadData(f"The checksum of this TEDS is {stated:04X}; its octets give {right:04X}.")
+        raise BadDataError(f"The checksum of this TEDS is {stated:04X}; its octets give {right:04X}.")
     return teds[4:-2]
 
 
 def tuples(block: bytes, *, width: int = 1) -> Iterator[RawTuple]:
     """Walk the tuples of a data block whose tuple lengths have ``width`` octets (TEDSID: always one).
 
-    Raises BadData at the first tuple that runs past the end.
+    Raises BadDataError at the first tuple that runs past the end.
     """
     at = 0
     while at < len(block):
@@ -70,15 +70,15 @@ def tuples(block: bytes, *, width: int = 1) -> Iterator[RawTuple]:
         start = at + 1 + octets
         end = start + int.from_bytes(block[at + 1 : start], "big")
         if start > len(block) or end > len(block):
-            raise BadData(f"The tuple of type {kind} at octet {at} runs past the end of the data block.")
+            raise BadDataError(f"The tuple of type {kind} at octet {at} runs past the end of the data block.")
         yield RawTuple(kind, block[start:end], at)
         at = end
 
 
 def raw_tuple(kind: int, value: bytes, *, width: int = 1) -> bytes:
-    """Write one tuple; raises BadData when the value does not fit the length octets."""
+    """Write one tuple; raises BadDataError when the value does not fit the length octets."""
     if len(value) >= 1 << 8 * width:
-        raise BadData(f"Field {kind} has {len(value)} octets; {width} length octets allow {(1 << 8 * width) - 1}.")
+        raise BadDataError(f"Field {kind} has {len(value)} octets; {width} length octets allow {(1 << 8 * width) - 1}.")
     return bytes([kind]) + len(value).to_bytes(width, "big") + value
 
 

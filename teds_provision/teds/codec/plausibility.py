@@ -182,5 +182,5 @@ def _security(fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool
 
     try:
         security.decode_block(octets[4:-2] if framed else octets)
-    except security.NotCanonical as error:
+    except security.NotCanonicalError as error:
         find("error", "not-canonical", error.message, None, "", "the canonical form", "")

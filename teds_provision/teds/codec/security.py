@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
 from teds_provision.teds.image import BlockId, Image
 
@@ -34,7 +34,7 @@ CA_OCTETS = 64
 CA_NAME_OCTETS = 47
 
 
-class NotCanonical(BadData):
+class NotCanonicalError(BadDataError):
     """The octets are not a canonical Security TEDS of profile version 1."""
 
     code = "not-canonical"
@@ -109,17 +109,19 @@ def other_wire(shown: SecurityTeds) -> str:
 
 
 def require_our_wire(image: Image) -> Image:
-    """Give an image back; raises BadData, by name, for one whose Security TEDS is of a wire that is not spoken here.
+    """Give an image back.
+
+    Raises BadDataError, by name, for one whose Security TEDS is of a wire that is not spoken here.
 
     One without, or with another owner's kind of Security TEDS, is left to whoever judges it.
     """
     octets = image.security
     try:
         other = other_wire(decode(octets)) if octets is not None else ""
-    except NotCanonical:
+    except NotCanonicalError:
         other = ""
     if other:
-        raise BadData(
+        raise BadDataError(
             f"The image names {other}.",
             hint="It is of a time before this wire; nothing of it was released. Read or build the datasheet anew.",
         )
@@ -134,23 +136,23 @@ def ca_hint(name: str, ca_fingerprint: str) -> str:
 
 @lru_cache(maxsize=16)
 def decode(teds: bytes) -> SecurityTeds:
-    """Read a framed Security TEDS in canonical form; raises NotCanonical with the rule that it breaks.
+    """Read a framed Security TEDS in canonical form; raises NotCanonicalError with the rule that it breaks.
 
     Every step of a provisioning asks what the same octets say, so the last ones are remembered: nobody changes them.
     """
     try:
         block = unframe(teds)
-    except BadData as error:
-        raise NotCanonical(error.message) from error
+    except BadDataError as error:
+        raise NotCanonicalError(error.message) from error
     return decode_block(block)
 
 
 def decode_block(block: bytes) -> SecurityTeds:
-    """Read the data block of a Security TEDS; raises NotCanonical."""
+    """Read the data block of a Security TEDS; raises NotCanonicalError."""
     try:
         parts = _places(block)
-    except BadData as error:
-        raise NotCanonical(error.message) from error
+    except BadDataError as error:
+        raise NotCanonicalError(error.message) from error
     return _read(block, parts)
 
 
@@ -163,11 +165,11 @@ def decode_with_tbs(uuid: bytes, teds: bytes) -> tuple[SecurityTeds, bytes]:
 
 def _read(block: bytes, parts: list[tuple[int, int, int]]) -> SecurityTeds:
     if block[:6] != TEDSID_TUPLE:
-        raise NotCanonical("The first tuple of the Security TEDS is not exactly 03 04 00 80 01 01.")
+        raise NotCanonicalError("The first tuple of the Security TEDS is not exactly 03 04 00 80 01 01.")
     values, blocks = _ascending(block, parts[1:])
     missing = INITIAL_FIELDS - values.keys()
     if missing:
-        raise NotCanonical(f"The Security TEDS lacks field {min(missing)}.")
+        raise NotCanonicalError(f"The Security TEDS lacks field {min(missing)}.")
     raw = {number: _base64(number, values[number]) for number in _BASE64 if number in values}
     return SecurityTeds(
         node_key=raw[NODE_KEY],
@@ -204,12 +206,12 @@ def has_profile_version(teds: bytes) -> bool:
     """Say whether the tuples close and field 105 is there: such a TEDS is canonical or refused."""
     try:
         return any(number == PROFILE_VERSION for number, _, _ in _places(unframe(teds)))
-    except BadData:
+    except BadDataError:
         return False
 
 
 def _places(block: bytes) -> list[tuple[int, int, int]]:
-    """Type, start and end of the value of every tuple (one length octet each); raises BadData where one runs out.
+    """Type, start and end of the value of every tuple (one length octet each); raises BadDataError where one runs out.
 
     Walked twice for each datasheet (what does it say, what is signed), so this loop does no more.
     """
@@ -224,33 +226,36 @@ def _places(block: bytes) -> list[tuple[int, int, int]]:
         at = size + 1
     if at > size:
         number = places[-1][0] if places else block[0]
-        raise BadData(f"The tuple of type {number} runs past the end of the data block.")
+        raise BadDataError(f"The tuple of type {number} runs past the end of the data block.")
     return places
 
 
 def _ascending(block: bytes, parts: list[tuple[int, int, int]]) -> tuple[dict[int, bytes], list[bytes]]:
-    """Values by field, and those of every SignedBlock; raises NotCanonical for an order, field or length of its own."""
+    """Values by field, and those of every SignedBlock.
+
+    Raises NotCanonicalError for an order, field or length of its own.
+    """
     values: dict[int, bytes] = {}
     blocks: list[bytes] = []
     last = 0
     for number, start, end in parts:
         if number == SIGNED_BLOCK:
             if number < last:
-                raise NotCanonical(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
+                raise NotCanonicalError(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
             blocks.append(block[start:end])
         elif number <= last:
-            raise NotCanonical(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
+            raise NotCanonicalError(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
         else:
             values[number] = block[start:end]
             wanted = _OCTETS.get(number)
             if wanted is not None and end - start != wanted:
-                raise NotCanonical(f"Field {number} of the Security TEDS has {end - start} octets, not {wanted}.")
+                raise NotCanonicalError(f"Field {number} of the Security TEDS has {end - start} octets, not {wanted}.")
         last = number
     unknown = values.keys() - _KNOWN
     if unknown and min(unknown) < 111:
-        raise NotCanonical(f"The Security TEDS holds a field {min(unknown)} that the profile does not know.")
+        raise NotCanonicalError(f"The Security TEDS holds a field {min(unknown)} that the profile does not know.")
     if len(values.get(5, b"")) > CA_OCTETS:
-        raise NotCanonical(f"Field 5 (CA) has {len(values[5])} octets; at most {CA_OCTETS} are allowed.")
+        raise NotCanonicalError(f"Field 5 (CA) has {len(values[5])} octets; at most {CA_OCTETS} are allowed.")
     return values, blocks
 
 
@@ -259,12 +264,12 @@ def _signed_blocks(values: list[bytes]) -> dict[BlockId, bytes]:
     last = b""
     for value in values:
         if len(value) != 35:
-            raise NotCanonical(f"A SignedBlock has {len(value)} octets, not 35.")
+            raise NotCanonicalError(f"A SignedBlock has {len(value)} octets, not 35.")
         if value[:3] <= last:
-            raise NotCanonical("The SignedBlocks do not ascend by channel and access code.")
+            raise NotCanonicalError("The SignedBlocks do not ascend by channel and access code.")
         last = value[:3]
         if value[:3] == b"\x00\x00\x80":
-            raise NotCanonical("The Security TEDS lists itself as a SignedBlock.")
+            raise NotCanonicalError("The Security TEDS lists itself as a SignedBlock.")
         blocks[int.from_bytes(value[:2], "big"), value[2]] = value[3:]
     return blocks
 
@@ -273,9 +278,11 @@ def _base64(number: int, value: bytes) -> bytes:
     try:
         raw = binascii.a2b_base64(value, strict_mode=True)
     except binascii.Error as error:
-        raise NotCanonical(f"Field {number} of the Security TEDS is not base64.") from error
+        raise NotCanonicalError(f"Field {number} of the Security TEDS is not base64.") from error
     if len(raw) != _BASE64[number] or binascii.b2a_base64(raw, newline=False) != value:
-        raise NotCanonical(f"Field {number} of the Security TEDS is not canonical base64 of {_BASE64[number]} octets.")
+        raise NotCanonicalError(
+            f"Field {number} of the Security TEDS is not canonical base64 of {_BASE64[number]} octets."
+        )
     return raw
 
 
@@ -283,4 +290,4 @@ def _text(value: bytes) -> str:
     try:
         return value.decode()
     except UnicodeDecodeError as error:
-        raise NotCanonical("Field 5 (CA) of the Security TEDS is not UTF-8.") from error
+        raise NotCanonicalError("Field 5 (CA) of the Security TEDS is not UTF-8.") from error

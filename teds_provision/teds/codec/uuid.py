@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.model import Edition
 
 _ARC_SECONDS: Final = 3600
@@ -96,7 +96,7 @@ def unpack_uuid(octets: bytes) -> UuidParts | None:
 
 
 def pack_uuid(parts: UuidParts) -> bytes:
-    """Put a UUID together, 10 or 16 octets after its edition; raises BadData naming a part that does not fit."""
+    """Put a UUID together, 10 or 16 octets after its edition; raises BadDataError naming a part that does not fit."""
     lat, lon, maker, year, time = _FORMS[parts.edition]
     packed = 0
     for name, value, bits in (
@@ -109,6 +109,6 @@ def pack_uuid(parts: UuidParts) -> bytes:
         ("time", parts.time, time),
     ):
         if not 0 <= value < 1 << bits:
-            raise BadData(f"The {name} of a {parts.edition} UUID has {bits} bits, {value} does not fit.")
+            raise BadDataError(f"The {name} of a {parts.edition} UUID has {bits} bits, {value} does not fit.")
         packed = packed << bits | value
     return packed.to_bytes(10 if parts.edition == 2007 else 16, "big")

@@ -10,7 +10,7 @@ from math import isnan
 from numbers import Integral, Rational, Real
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.frame import RawTuple, checksum, raw_tuple, tuples
 from teds_provision.teds.codec.model import UNIT_PARTS, Edition, Field, TimeInstance, Units, Value
 from teds_provision.teds.codec.tables import TEXT, FieldSpec
@@ -121,8 +121,8 @@ def shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _refuse(name: str, why: str) -> BadData:
-    return BadData(f"{name} {why}.")
+def _refuse(name: str, why: str) -> BadDataError:
+    return BadDataError(f"{name} {why}.")
 
 
 def write_int(spec: FieldSpec, value: object, octets: int) -> bytes:
@@ -265,7 +265,7 @@ def write_fixed(spec: FieldSpec, value: object) -> bytes:
 
 
 def write(spec: FieldSpec, value: object, edition: Edition) -> bytes:
-    """Value octets of one field that holds no tuples; raises BadData naming the field."""
+    """Value octets of one field that holds no tuples; raises BadDataError naming the field."""
     kind = spec.kind
     if kind in _INTEGERS:
         return write_int(spec, value, _INTEGERS[kind])
@@ -317,9 +317,11 @@ def compose_text(head: bytes, pairs: list[tuple[str, object]], encode: Tuples, w
     texts = [_text(value) for name, value in pairs if name == "Text"]
     others = [pair for pair in pairs if pair[0] != "Text"]
     if not texts:
-        raise BadData("A text-based TEDS has at least one Text.")
+        raise BadDataError("A text-based TEDS has at least one Text.")
     if others:
-        raise BadData(f"A text-based TEDS takes Text entries, not {others[0][0]}: its directory follows from them.")
+        raise BadDataError(
+            f"A text-based TEDS takes Text entries, not {others[0][0]}: its directory follows from them."
+        )
     wholes = [text + checksum(text).to_bytes(2, "big") for _, text, _ in texts]
 
     def directory(start: int) -> bytes:
@@ -336,10 +338,10 @@ def compose_text(head: bytes, pairs: list[tuple[str, object]], encode: Tuples, w
 
 def _text(value: object) -> tuple[str, bytes, int]:
     if not isinstance(value, Mapping) or set(value) - {"LangCode", "Text", "Compress"}:
-        raise BadData("Text is a mapping with LangCode, Text and Compress.")
+        raise BadDataError("Text is a mapping with LangCode, Text and Compress.")
     text, compress = value.get("Text", ""), value.get("Compress", 0)
     if not isinstance(text, str | bytes) or not isinstance(compress, int):
-        raise BadData("Text holds text or octets, Compress a number.")
+        raise BadDataError("Text holds text or octets, Compress a number.")
     return str(value.get("LangCode", "en")), text.encode() if isinstance(text, str) else text, compress
 
 
@@ -382,7 +384,7 @@ def _tagged(area: bytes) -> tuple[bytes, ...] | None:
     for width in (1, 2):
         try:
             parts: list[RawTuple] = list(tuples(area, width=width))
-        except BadData:
+        except BadDataError:
             continue
         if parts and parts[0].type == 128:
             return tuple(part.value for part in parts if part.type == 128)

@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, Literal, get_args
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_count, check_size, load_json
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
@@ -56,9 +56,9 @@ _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 
 
 def detect(octets: bytes) -> Kind:
-    """What a file holds, by its content alone; whatever is no text is binary. Raises BadData for an empty file."""
+    """What a file holds, by its content alone; whatever is no text is binary. Raises BadDataError for an empty file."""
     if not octets:
-        raise BadData("The file is empty.")
+        raise BadDataError("The file is empty.")
     text = _text(octets)
     if text is None:
         return "binary"
@@ -87,7 +87,7 @@ def _text(octets: bytes) -> str | None:
 def _json_kind(text: str) -> Kind:
     try:
         data = load_json(text, "the file")
-    except BadData:
+    except BadDataError:
         return "json"
     if isinstance(data, dict) and data.get("format") == "teds-image/1":
         return "image"
@@ -97,9 +97,9 @@ def _json_kind(text: str) -> Kind:
 def read_blocks(octets: bytes, kind: Kind | None = None, *, path: Path | None = None) -> list[TedsBlock]:
     """TEDS of a file as (channel or None, access code or None, octets).
 
-    ``path`` is where a profile lies, so that what it extends is found beside it. Raises BadData for a file that does
-    not hold what its kind says, with the place of the fault. Octets that make no TEDS are no fault here: decoding them
-    gives the findings.
+    ``path`` is where a profile lies, so that what it extends is found beside it. Raises BadDataError for a file that
+    does not hold what its kind says, with the place of the fault. Octets that make no TEDS are no fault here: decoding
+    them gives the findings.
     """
     check_size(len(octets), LIMITS.teds_file, "the file")
     blocks = _read(octets, kind or detect(octets), path)
@@ -115,7 +115,7 @@ def _read(octets: bytes, kind: Kind, path: Path | None) -> list[TedsBlock]:
     try:
         text = octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise BadData(f"Octet {error.start} of the file is not UTF-8 text.") from error
+        raise BadDataError(f"Octet {error.start} of the file is not UTF-8 text.") from error
     return _read_text(text, kind, path)
 
 
@@ -131,18 +131,18 @@ def _read_text(text: str, kind: Kind, path: Path | None) -> list[TedsBlock]:
         return [TedsBlock(channel, code, image.blocks[channel, code]) for channel, code in image]
     if kind == "toml":
         return read_profile(text, path)
-    raise BadData("A sealed bundle holds keys for other stations, no TEDS that can be read here.")
+    raise BadDataError("A sealed bundle holds keys for other stations, no TEDS that can be read here.")
 
 
 def write_blocks(blocks: Sequence[TedsBlock], format: Format) -> bytes | str:
     """Write TEDS: octets for binary, text for every other format; :func:`lost` says what the format cannot hold.
 
-    Raises BadData where nothing sensible can be written: several TEDS that would run into each other in a binary file,
-    an image of a node without UUID.
+    Raises BadDataError where nothing sensible can be written: several TEDS that would run into each other in a binary
+    file, an image of a node without UUID.
     """
     if format == "binary":
         if len(blocks) > 1 and not is_run(blocks):
-            raise BadData(
+            raise BadDataError(
                 "Several TEDS stand in one binary file only if each has a right Length and checksum.",
                 hint="Use hex, json or xml.",
             )
@@ -174,13 +174,15 @@ def _image(blocks: Sequence[TedsBlock]) -> str:
     placed: dict[tuple[int, int], bytes] = {}
     for channel, code, octets in blocks:
         if channel is None or code is None:
-            raise BadData("An image holds TEDS with channel and access code.", hint="Use hex, json or xml.")
+            raise BadDataError("An image holds TEDS with channel and access code.", hint="Use hex, json or xml.")
         if (channel, code) in placed:
-            raise BadData(f"Two TEDS stand at channel {channel}, access code {code}; an image holds one of each.")
+            raise BadDataError(f"Two TEDS stand at channel {channel}, access code {code}; an image holds one of each.")
         placed[channel, code] = octets
     uuid = decode(placed[0, 1]).get("UUID") if (0, 1) in placed else None
     if not isinstance(uuid, bytes) or len(uuid) != 10:
-        raise BadData("An image needs a Meta-TEDS on channel 0 with a UUID of 10 octets.", hint="Use hex, json or xml.")
+        raise BadDataError(
+            "An image needs a Meta-TEDS on channel 0 with a UUID of 10 octets.", hint="Use hex, json or xml."
+        )
     return Image(uuid, placed).to_json()
 
 
@@ -195,22 +197,23 @@ _OF_A_CHANNEL: Final = frozenset({AccessCode.CHANNEL, AccessCode.CALIBRATION})
 def placed(octets: bytes, kind: Kind | None = None, *, path: Path | None = None) -> dict[BlockId, bytes]:
     """TEDS of a document by channel and access code, without the Security TEDS; channel TEDS alone are of channel 1.
 
-    ``path`` is where a profile lies, for what it extends. Raises BadData for what holds no TEDS, or two of one place.
+    ``path`` is where a profile lies, for what it extends. Raises BadDataError for what holds no TEDS, or two of one
+    place.
     """
     found: dict[BlockId, bytes] = {}
     for channel, code, teds in read_blocks(octets, kind or detect(octets), path=path):
         if code is None:
-            raise BadData(
+            raise BadDataError(
                 "There are octets in it that are no TEDS.", hint="See what it holds: teds-provision show FILE"
             )
         usual = 1 if code in _OF_A_CHANNEL else 0
         key = (usual if channel is None else channel, int(code))
         if key in found:
-            raise BadData(f"It holds two TEDS of access code {code} for channel {key[0]}.")
+            raise BadDataError(f"It holds two TEDS of access code {code} for channel {key[0]}.")
         found[key] = teds
     found = {key: teds for key, teds in found.items() if key[1] != AccessCode.SECURITY}
     if not found:
-        raise BadData("It holds no TEDS.")
+        raise BadDataError("It holds no TEDS.")
     return found
 
 

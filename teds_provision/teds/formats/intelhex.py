@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_count
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import TedsBlock, class_of, split_run, with_class
@@ -38,7 +38,7 @@ def looks_like_hex(text: str) -> bool:
 
 
 def read_hex(text: str) -> list[TedsBlock]:
-    """Read a hex text; raises BadData naming line and character."""
+    """Read a hex text; raises BadDataError naming line and character."""
     blocks: list[TedsBlock] = []
     place: tuple[int | None, int | None] | None = None
     digits: list[str] = []
@@ -49,13 +49,15 @@ def read_hex(text: str) -> list[TedsBlock]:
             check_count(len(blocks), LIMITS.teds_of_a_file, "TEDS")
             channel, code = (None if part == "-" else int(part) for part in found.groups())
             if (channel or 0) > 0xFFFF or (code or 0) > 0xFF:
-                raise BadData(f"Line {number} names channel {channel} and access code {code}; they are u16 and u8.")
+                raise BadDataError(
+                    f"Line {number} names channel {channel} and access code {code}; they are u16 and u8."
+                )
             place, digits = (channel, code), []
             continue
         part = _digits(line)
         wrong = _OTHER.search(part)
         if wrong:
-            raise BadData(f"Line {number} holds {wrong.group()!r}, which is no hex digit.")
+            raise BadDataError(f"Line {number} holds {wrong.group()!r}, which is no hex digit.")
         digits.append(part)
     return blocks + _finish(place, digits)
 
@@ -67,7 +69,7 @@ def _digits(line: str) -> str:
 def _finish(place: tuple[int | None, int | None] | None, parts: list[str]) -> list[TedsBlock]:
     digits = "".join(parts)
     if len(digits) % 2:
-        raise BadData(f"There are {len(digits)} hex digits; whole octets need an even number.")
+        raise BadDataError(f"There are {len(digits)} hex digits; whole octets need an even number.")
     octets = bytes.fromhex(digits)
     if place is not None:
         channel, code = place
@@ -95,12 +97,12 @@ _LENGTHS: Final = {END: 0, SEGMENT_BASE: 2, SEGMENT_START: 4, LINEAR_BASE: 2, LI
 
 
 def read_intel_hex(text: str) -> list[TedsBlock]:
-    """Read the TEDS of an Intel HEX text, by address; raises BadData naming the line."""
+    """Read the TEDS of an Intel HEX text, by address; raises BadDataError naming the line."""
     return [with_class(piece) for _, octets in stretches(text) for piece in split_run(octets)]
 
 
 def stretches(text: str) -> list[tuple[int, bytes]]:
-    """Runs of octets without a gap as (address, octets), ascending; raises BadData where records overlap."""
+    """Runs of octets without a gap as (address, octets), ascending; raises BadDataError where records overlap."""
     pieces: list[tuple[int, bytes]] = []
     check_count(text.count(":"), LIMITS.hex_records, "records in the Intel HEX text")
     base = 0
@@ -109,7 +111,7 @@ def stretches(text: str) -> list[tuple[int, bytes]]:
         if not line.strip():
             continue
         if ended:
-            raise BadData(f"Line {number} stands behind the end record.")
+            raise BadDataError(f"Line {number} stands behind the end record.")
         kind, address, data = _record(line.strip(), number)
         if kind == DATA:
             pieces += _place(base, address, data)
@@ -117,7 +119,7 @@ def stretches(text: str) -> list[tuple[int, bytes]]:
             base = int.from_bytes(data, "big") << (4 if kind == SEGMENT_BASE else 16)
         ended = kind == END
     if not ended:
-        raise BadData("The Intel HEX text has no end record (:00000001FF): it was cut off.")
+        raise BadDataError("The Intel HEX text has no end record (:00000001FF): it was cut off.")
     runs = _joined(sorted(pieces))
     check_count(len(runs), LIMITS.hex_stretches, "stretches of octets in the Intel HEX text")
     return runs
@@ -133,18 +135,18 @@ def _place(base: int, address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _record(line: str, number: int) -> tuple[int, int, bytes]:
     if not line.startswith(":"):
-        raise BadData(f"Line {number} does not begin with a colon.")
+        raise BadDataError(f"Line {number} does not begin with a colon.")
     try:
         octets = bytes.fromhex(line[1:])
     except ValueError as error:
-        raise BadData(f"Line {number} holds something that is no hex digit.") from error
+        raise BadDataError(f"Line {number} holds something that is no hex digit.") from error
     if len(octets) < 5 or octets[0] != len(octets) - 5:
-        raise BadData(f"Line {number} has a wrong length.")
+        raise BadDataError(f"Line {number} has a wrong length.")
     if sum(octets) & 0xFF:
-        raise BadData(f"The checksum of line {number} is wrong.")
+        raise BadDataError(f"The checksum of line {number} is wrong.")
     kind, data = octets[3], octets[4:-1]
     if kind > LINEAR_START or _LENGTHS.get(kind, len(data)) != len(data):
-        raise BadData(f"Line {number} holds a record of type {kind} with {len(data)} octets, which is none.")
+        raise BadDataError(f"Line {number} holds a record of type {kind} with {len(data)} octets, which is none.")
     return kind, int.from_bytes(octets[1:3], "big"), data
 
 
@@ -155,7 +157,7 @@ def _joined(pieces: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
         if not data:
             continue
         if address < end:
-            raise BadData(f"Two records of the Intel HEX text overlap at address {address:08X}.")
+            raise BadDataError(f"Two records of the Intel HEX text overlap at address {address:08X}.")
         if address != end:
             runs.append((address, []))
         runs[-1][1].append(data)
@@ -170,7 +172,7 @@ def write_intel_hex(blocks: Sequence[TedsBlock], *, address: int = 0) -> str:
     for block in blocks:
         octets = block.octets
         if at + len(octets) > 1 << 32:
-            raise BadData("Intel HEX ends at address FFFFFFFF; these TEDS do not fit.")
+            raise BadDataError("Intel HEX ends at address FFFFFFFF; these TEDS do not fit.")
         done = 0
         while done < len(octets):
             if at >> 16 != high:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_count, load_json
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats.tree import (
@@ -41,10 +41,10 @@ def write_json(blocks: Sequence[TedsBlock]) -> str:
 
 
 def read_json(text: str | bytes) -> list[TedsBlock]:
-    """Read a JSON document of this format; raises BadData naming what is wrong."""
+    """Read a JSON document of this format; raises BadDataError naming what is wrong."""
     data = load_json(text, "the JSON document")
     if not isinstance(data, dict) or data.get("format") != FORMAT or not isinstance(data.get("teds"), list):
-        raise BadData(f'This JSON is no list of TEDS: "format" is not "{FORMAT}" or "teds" is not a list.')
+        raise BadDataError(f'This JSON is no list of TEDS: "format" is not "{FORMAT}" or "teds" is not a list.')
     check_count(len(data["teds"]), LIMITS.teds_of_a_file, "TEDS")
     return [_block(entry, number) for number, entry in enumerate(data["teds"], 1)]
 
@@ -88,15 +88,15 @@ def value_to_json(value: object) -> Any:
 def _block(entry: object, number: int) -> TedsBlock:
     where = f"TEDS {number}"
     if not isinstance(entry, Mapping):
-        raise BadData(f"{where} is not an object.")
+        raise BadDataError(f"{where} is not an object.")
     head = {name: _number(entry.get(name), limit, f"{name} of {where}") for name, limit in _HEAD.items()}
     octets = entry.get("octets")
     fields = entry.get("fields", [])
     if not isinstance(fields, list):
-        raise BadData(f'"fields" of {where} is not a list.')
+        raise BadDataError(f'"fields" of {where} is not a list.')
     edition = entry.get("edition", 2007)
     if edition not in (2007, 2024, None):
-        raise BadData(f"{where} names the edition {edition!r}; 2007 and 2024 are known.")
+        raise BadDataError(f"{where} names the edition {edition!r}; 2007 and 2024 are known.")
     return from_tree(
         Tree(
             **head,
@@ -112,7 +112,7 @@ def _number(value: object, limit: int, what: str) -> int | None:
     if value is None:
         return None
     if type(value) is not int or not 0 <= value <= limit:
-        raise BadData(f"The {what} is not a number from 0 to {limit}.")
+        raise BadDataError(f"The {what} is not a number from 0 to {limit}.")
     return value
 
 
@@ -120,18 +120,18 @@ def _hex(value: object, what: str) -> bytes:
     try:
         return bytes.fromhex(value if isinstance(value, str) else "?")
     except ValueError as error:
-        raise BadData(f"The {what} are not hex digits.") from error
+        raise BadDataError(f"The {what} are not hex digits.") from error
 
 
 def _entry(data: object, where: str, depth: int) -> TreeEntry:
     if not isinstance(data, Mapping) or not isinstance(data.get("name", ""), str) or depth > MAX_DEPTH:
-        raise BadData(f"A field of {where} is not an object with a name, or nests too deep.")
+        raise BadDataError(f"A field of {where} is not an object with a name, or nests too deep.")
     number, name = _number(data.get("type"), 0xFF, f"type of a field of {where}"), data.get("name", "")
     where = f"{where}, {name or f'type {number}'}"
     if "fields" in data:
         inner = data["fields"] if isinstance(data["fields"], list) else None
         if inner is None:
-            raise BadData(f'"fields" of {where} is not a list.')
+            raise BadDataError(f'"fields" of {where} is not a list.')
         return TreeEntry(number, name, "fields", children=tuple(_entry(field, where, depth + 1) for field in inner))
     kind, value = _value(data.get("kind"), data.get("value"), where)
     return TreeEntry(number, name, kind, value)
@@ -159,15 +159,15 @@ def _value(kind: object, value: object, where: str) -> tuple[Kind, EntryValue]:
             return "integer", value
         case "text" | None, str():
             return "text", value
-    raise BadData(f"The value of {where} is no {str(kind or 'value')[:40]}: {str(value)[:60]!r}.")
+    raise BadDataError(f"The value of {where} is no {str(kind or 'value')[:40]}: {str(value)[:60]!r}.")
 
 
 def _float(value: object, where: str) -> float:
     if isinstance(value, str) and value in _WORDS:
         return _WORDS[value]
     if type(value) not in {int, float} or not isinstance(value, int | float):
-        raise BadData(f"{where} holds {value!r} where a number is asked.")
+        raise BadDataError(f"{where} holds {value!r} where a number is asked.")
     try:
         return float(value)
     except OverflowError as error:
-        raise BadData(f"{where} holds a number that is too large.") from error
+        raise BadDataError(f"{where} holds a number that is too large.") from error

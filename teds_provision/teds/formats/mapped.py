@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_size, check_xml, load_toml
 
 if TYPE_CHECKING:
@@ -30,19 +30,22 @@ _MOST_CHANNELS: Final = 255
 
 
 def profile_from_xml(octets: bytes, mapping: str, *, name: str, file: str = "the XML", by: str = "the mapping") -> str:
-    """The text of a profile that says what the XML says; raises BadData for a file, or a place that is not there."""
+    """The text of a profile that says what the XML says.
+
+    Raises BadDataError for a file, or a place that is not there.
+    """
     rules = load_toml(mapping, by)
     if unknown := sorted(set(rules) - _TABLES):
-        raise BadData(f"{by}: unknown key {unknown[0]!r}.", hint=f"Known are {', '.join(sorted(_TABLES))}.")
+        raise BadDataError(f"{by}: unknown key {unknown[0]!r}.", hint=f"Known are {', '.join(sorted(_TABLES))}.")
     root = _root(octets, file)
     path = rules.get("channel")
     if not isinstance(path, str):
-        raise BadData(f"{by}: channel is missing.", hint='Name the elements of channels: channel = "Channel"')
+        raise BadDataError(f"{by}: channel is missing.", hint='Name the elements of channels: channel = "Channel"')
     channels = _find(root, path, by)
     if not channels:
-        raise BadData(f"{file} has no element {path!r}, which {by} names for its channels.")
+        raise BadDataError(f"{file} has no element {path!r}, which {by} names for its channels.")
     if len(channels) > _MOST_CHANNELS:
-        raise BadData(f"{file} has {len(channels)} channels; a node has at most {_MOST_CHANNELS}.")
+        raise BadDataError(f"{file} has {len(channels)} channels; a node has at most {_MOST_CHANNELS}.")
     lines = [f"# Made from {file.rpartition('/')[2]}."]
     told = {**_table(rules, "values", by), **dict(_keys(root, _table(rules, "keys", by), file, by))}
     lines += _lines({"title": name, **told})
@@ -51,7 +54,7 @@ def profile_from_xml(octets: bytes, mapping: str, *, name: str, file: str = "the
         said = {**fixed, **dict(_keys(element, own, f"{file}, channel {count}", by))}
         number = str(said.pop("number", count))
         if not (number.isascii() and number.isdecimal()):
-            raise BadData(f"{file}, channel {count}: {number!r} is no channel number.")
+            raise BadDataError(f"{file}, channel {count}: {number!r} is no channel number.")
         lines += ["", f"[channel.{int(number)}]", *_lines(said)]
     return "\n".join([*lines, ""])
 
@@ -67,9 +70,9 @@ def _root(octets: bytes, file: str) -> Element:
     try:
         root: Element = fromstring(octets, forbid_dtd=True)
     except DefusedXmlException as error:
-        raise BadData(f"{file} has a DTD or entities, which are not read.", hint="Remove the DOCTYPE.") from error
+        raise BadDataError(f"{file} has a DTD or entities, which are not read.", hint="Remove the DOCTYPE.") from error
     except (ParseError, ValueError, LookupError) as error:  # no XML, or in an encoding that nobody knows
-        raise BadData(f"{file} is not XML: {error}.") from error
+        raise BadDataError(f"{file} is not XML: {error}.") from error
     for element in root.iter():  # a lab's namespace is not a part of its names
         if isinstance(element.tag, str):
             element.tag = element.tag.rpartition("}")[2]
@@ -79,7 +82,7 @@ def _root(octets: bytes, file: str) -> Element:
 def _table(rules: Mapping[str, Any], name: str, by: str) -> dict[str, Any]:
     found = rules.get(name, {})
     if not isinstance(found, dict):
-        raise BadData(f"{by}: {name} is not a table.", hint=f"Write [{name}].")
+        raise BadDataError(f"{by}: {name} is not a table.", hint=f"Write [{name}].")
     return found
 
 
@@ -87,17 +90,19 @@ def _keys(element: Element, places: Mapping[str, Any], where: str, by: str) -> I
     for key, place in places.items():
         rule = {"at": place} if isinstance(place, str) else place
         if not isinstance(rule, dict) or set(rule) - _PLACE or not isinstance(rule.get("at"), str):
-            raise BadData(f"{by}: {key} is no place.", hint='Write key = "Path", or { at = "Path", unit = "degree" }.')
+            raise BadDataError(
+                f"{by}: {key} is no place.", hint='Write key = "Path", or { at = "Path", unit = "degree" }.'
+            )
         text = _text(element, rule["at"], by)
         if text is None:
-            raise BadData(f"{where} has nothing at {rule['at']!r}, where {by} looks for {key}.")
+            raise BadDataError(f"{where} has nothing at {rule['at']!r}, where {by} looks for {key}.")
         words = rule.get("words", {})
         text = str(words.get(text, text)) if isinstance(words, dict) else text
         unit = _text(element, rule["unit-at"], by) if isinstance(rule.get("unit-at"), str) else rule.get("unit")
         if unit is not None:
             unit = str(words.get(unit, unit)) if isinstance(words, dict) else unit
             if _NUMBER.fullmatch(text) is None:
-                raise BadData(f"{where}: {text!r} at {rule['at']!r} is not a number.")
+                raise BadDataError(f"{where}: {text!r} at {rule['at']!r} is not a number.")
             yield key, f"{text} {unit}"
         else:
             yield key, _plain(text)
@@ -105,7 +110,9 @@ def _keys(element: Element, places: Mapping[str, Any], where: str, by: str) -> I
 
 def _find(element: Element, path: str, by: str) -> list[Element]:
     if _PATH.fullmatch(path) is None:
-        raise BadData(f"{by}: {path!r} is no path.", hint='Write names of elements: "Range/Low", or "Range/@unit".')
+        raise BadDataError(
+            f"{by}: {path!r} is no path.", hint='Write names of elements: "Range/Low", or "Range/@unit".'
+        )
     return element.findall(path)
 
 
@@ -118,7 +125,7 @@ def _text(element: Element, place: str, by: str) -> str | None:
     text = found[0].get(attribute) if at else "".join(found[0].itertext())
     text = None if text is None else " ".join(text.split())
     if text is not None and len(text) > _LONGEST:
-        raise BadData(f"The text at {place!r} has more than {_LONGEST} characters.")
+        raise BadDataError(f"The text at {place!r} has more than {_LONGEST} characters.")
     return text or None
 
 

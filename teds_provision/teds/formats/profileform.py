@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.channel import channel_from
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, AccessCode, Decoded, Edition, Field, Units
@@ -45,7 +45,10 @@ Placed = dict[tuple[int, int], bytes]
 
 
 def read_profile(text: str, path: Path | None = None) -> list[TedsBlock]:
-    """TEDS that a profile gives for a node with UUID 0; raises BadData and NotFound as the profile loader does."""
+    """TEDS that a profile gives for a node with UUID 0.
+
+    Raises BadDataError and NotFoundError as the profile loader does.
+    """
     return profile_blocks(parse_profile(text) if path is None else load_profile(path))
 
 
@@ -201,7 +204,7 @@ def spell(units: Units) -> str:
     for text in (format_units(units), "*".join(factors), "count"):
         try:
             found = parse_unit(text)
-        except BadData:
+        except BadDataError:
             continue
         if (found.units, found.scale, found.offset) == (units, 1.0, 0.0):
             return text
@@ -248,7 +251,7 @@ def _built(body: str, decoded: Mapping[tuple[int, int], Decoded]) -> tuple[Place
         edition: Edition = next((teds.edition for teds in decoded.values() if teds.edition), 2007)
         zero = bytes(10 if edition == 2007 else 16)
         built = profile.build(uuid if isinstance(uuid, bytes) else zero, edition=edition)
-    except BadData as error:
+    except BadDataError as error:
         return {}, error.message
     return built.blocks, ""
 

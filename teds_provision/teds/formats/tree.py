@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Final, Literal
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.composer import compose
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
@@ -69,17 +69,17 @@ def to_tree(block: TedsBlock) -> Tree:
     tree = _described(block, decoded)
     try:
         again = from_tree(tree)
-    except BadData:
+    except BadDataError:
         return replace(tree, octets=block.octets)
     return tree if again == block else replace(tree, octets=block.octets)
 
 
 def from_tree(tree: Tree) -> TedsBlock:
-    """Turn a tree back into a block: its octets where it has them, else composed from its entries; raises BadData."""
+    """Turn a tree back into a block: its octets if it has them, else composed from its entries; raises BadDataError."""
     if tree.octets is not None:
         return TedsBlock(tree.channel, tree.access_code, tree.octets)
     if tree.access_code is None or not tree.entries:
-        raise BadData("A TEDS without octets needs an access code and fields.")
+        raise BadDataError("A TEDS without octets needs an access code and fields.")
     parts = {"family": tree.family, "version": tree.version, "subfamily": tree.subfamily}
     given = {key: value for key, value in parts.items() if value is not None}
     pairs = [*([("TEDSID", given)] if given else []), *(_pair(entry, tree.access_code, 0) for entry in tree.entries)]
@@ -182,7 +182,7 @@ def _kind(value: object) -> Kind:
 
 def _pair(entry: TreeEntry, access_code: int, depth: int) -> tuple[str, object]:
     if depth > MAX_DEPTH:
-        raise BadData(f"The field {entry.name} nests deeper than {MAX_DEPTH} levels.")
+        raise BadDataError(f"The field {entry.name} nests deeper than {MAX_DEPTH} levels.")
     key = entry.name or str(entry.type)
     if entry.kind == "fields":
         return key, tuple(_pair(child, access_code, depth + 1) for child in entry.children)
@@ -205,15 +205,15 @@ def _short(value: object) -> str:
 
 
 def units_from_parts(parts: Mapping[str, object]) -> Units:
-    """Units from those parts, texts or numbers; raises BadData."""
+    """Units from those parts, texts or numbers; raises BadDataError."""
     unknown = set(parts) - {"interpretation", "extension", *UNIT_PARTS}
     if unknown:
-        raise BadData(f"Units have no part {min(unknown)!r}.")
+        raise BadDataError(f"Units have no part {min(unknown)!r}.")
     try:
         exponents = {name: Fraction(_short(parts.get(name, 0))) for name in UNIT_PARTS}
         interpretation, extension = (int(_short(parts.get(name, 0))) for name in ("interpretation", "extension"))
     except (ValueError, ZeroDivisionError) as error:
-        raise BadData("The units hold an exponent that is not a number.") from error
+        raise BadDataError("The units hold an exponent that is not a number.") from error
     if not all(abs(exponent) <= 64 and (2 * exponent).denominator == 1 for exponent in exponents.values()):
-        raise BadData("Exponents of units are multiples of 1/2 from -64 to 63.5.")
+        raise BadDataError("Exponents of units are multiples of 1/2 from -64 to 63.5.")
     return Units(interpretation, **exponents, extension=extension)

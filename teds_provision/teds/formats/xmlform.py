@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.limits import LIMITS, check_count, check_size, check_xml, whole_number
 from teds_provision.teds.codec.model import Edition, TimeInstance, Units
 from teds_provision.teds.formats.tree import (
@@ -90,18 +90,18 @@ def _text(value: object) -> str:
 
 
 def read_xml(octets: bytes) -> list[TedsBlock]:
-    """Read an XML document of this format; raises BadData naming what is wrong."""
+    """Read an XML document of this format; raises BadDataError naming what is wrong."""
     root = parse(octets)
     if root.tag != f"{{{NAMESPACE}}}teds-set":
-        raise BadData(f"This XML is no set of TEDS: its root is {root.tag!r}, not teds-set of {NAMESPACE}.")
+        raise BadDataError(f"This XML is no set of TEDS: its root is {root.tag!r}, not teds-set of {NAMESPACE}.")
     if root.attrib:
-        raise BadData(f"teds-set has no attribute {min(root.attrib)!r}.")
+        raise BadDataError(f"teds-set has no attribute {min(root.attrib)!r}.")
     check_count(len(root), LIMITS.teds_of_a_file, "TEDS")
     return [from_tree(_tree(element, number)) for number, element in enumerate(root, 1)]
 
 
 def parse(octets: bytes) -> ET.Element:
-    """Parse XML that a stranger wrote: no DTD, no entities, at most what ``limits`` says. Raises BadData."""
+    """Parse XML that a stranger wrote: no DTD, no entities, at most what ``limits`` says. Raises BadDataError."""
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 
@@ -110,23 +110,23 @@ def parse(octets: bytes) -> ET.Element:
     try:
         root: ET.Element = fromstring(octets, forbid_dtd=True)
     except DefusedXmlException as error:
-        raise BadData("The XML holds a DTD or an entity, which is refused.") from error
+        raise BadDataError("The XML holds a DTD or an entity, which is refused.") from error
     except (ET.ParseError, ValueError, LookupError) as error:
-        raise BadData(f"This is not XML: {error}.") from error
+        raise BadDataError(f"This is not XML: {error}.") from error
     return root
 
 
 def _local(element: ET.Element, where: str) -> str:
     prefix = f"{{{NAMESPACE}}}"
     if not str(element.tag).startswith(prefix):  # a comment's tag is a function
-        raise BadData(f"{where} holds the foreign element {element.tag!r}.")
+        raise BadDataError(f"{where} holds the foreign element {element.tag!r}.")
     return element.tag.removeprefix(prefix)
 
 
 def _attributes(element: ET.Element, allowed: set[str], where: str) -> None:
     unknown = set(element.attrib) - allowed
     if unknown:
-        raise BadData(f"{where} has no attribute {min(unknown)!r}.")
+        raise BadDataError(f"{where} has no attribute {min(unknown)!r}.")
 
 
 def _integer(element: ET.Element, name: str, limit: int, where: str) -> int | None:
@@ -135,7 +135,7 @@ def _integer(element: ET.Element, name: str, limit: int, where: str) -> int | No
         return None
     stripped = text.strip()
     if not (stripped.isascii() and stripped.isdecimal()) or len(stripped) > 20 or int(stripped) > limit:
-        raise BadData(f"{name} of {where} is not a number from 0 to {limit}: {text!r}.")
+        raise BadDataError(f"{name} of {where} is not a number from 0 to {limit}: {text!r}.")
     return int(stripped)
 
 
@@ -144,25 +144,25 @@ def _flag(element: ET.Element, name: str, default: bool, where: str) -> bool:
     if text is None:
         return default
     if text.strip() not in {"true", "false", "0", "1"}:
-        raise BadData(f"{name} of {where} is true or false, not {text!r}.")
+        raise BadDataError(f"{name} of {where} is true or false, not {text!r}.")
     return text.strip() in {"true", "1"}
 
 
 def _tree(element: ET.Element, number: int) -> Tree:
     where = f"TEDS {number}"
     if _local(element, where) != "teds":
-        raise BadData(f"teds-set holds {_local(element, where)!r} where teds is asked.")
+        raise BadDataError(f"teds-set holds {_local(element, where)!r} where teds is asked.")
     _attributes(element, {*_HEAD, "name", "framed"}, where)
     head = {key: _integer(element, name, limit, where) for name, (key, limit) in _HEAD.items()}
     given = head.pop("edition")
     if given not in (2007, 2024, None):
-        raise BadData(f"{where} names the edition {given}; 2007 and 2024 are known.")
+        raise BadDataError(f"{where} names the edition {given}; 2007 and 2024 are known.")
     edition: Edition | None = given  # type: ignore[assignment]
     entries: list[TreeEntry] = []
     octets: bytes | None = None
     for child in element:
         if octets is not None:
-            raise BadData(f"In {where}, octets come last and once.")
+            raise BadDataError(f"In {where}, octets come last and once.")
         if _local(child, where) == "octets":
             octets = _hex(child, where)
         else:
@@ -175,12 +175,12 @@ def _hex(element: ET.Element, where: str) -> bytes:
     try:
         return bytes.fromhex(element.text or "")
     except ValueError as error:
-        raise BadData(f"The octets of {where} are not hex digits.") from error
+        raise BadDataError(f"The octets of {where} are not hex digits.") from error
 
 
 def _entry(element: ET.Element, where: str, depth: int) -> TreeEntry:
     if _local(element, where) != "field" or depth > MAX_DEPTH:
-        raise BadData(f"{where} holds {_local(element, where)!r} where field is asked, or nests too deep.")
+        raise BadDataError(f"{where} holds {_local(element, where)!r} where field is asked, or nests too deep.")
     _attributes(element, {"type", "name"}, where)
     number, name = _integer(element, "type", 0xFF, where), element.get("name", "")
     where = f"{where}, {name or f'type {number}'}"
@@ -188,7 +188,7 @@ def _entry(element: ET.Element, where: str, depth: int) -> TreeEntry:
     if not children or _local(children[0], where) == "field":
         return TreeEntry(number, name, "fields", children=tuple(_entry(child, where, depth + 1) for child in children))
     if len(children) > 1:
-        raise BadData(f"{where} holds more than one value.")
+        raise BadDataError(f"{where} holds more than one value.")
     kind, value = _value(children[0], where)
     return TreeEntry(number, name, kind, value)
 
@@ -196,7 +196,7 @@ def _entry(element: ET.Element, where: str, depth: int) -> TreeEntry:
 def _value(element: ET.Element, where: str) -> tuple[Kind, EntryValue]:
     kind = _local(element, where)
     if len(element):
-        raise BadData(f"The {kind} of {where} holds further elements.")
+        raise BadDataError(f"The {kind} of {where} holds further elements.")
     if kind == "units":
         return "units", units_from_parts(element.attrib)
     if kind == "time":
@@ -207,11 +207,11 @@ def _value(element: ET.Element, where: str) -> tuple[Kind, EntryValue]:
     _attributes(element, set(), where)
     reader = _READERS.get(kind)
     if reader is None:
-        raise BadData(f"{where} holds {kind!r}, which is no kind of value.")
+        raise BadDataError(f"{where} holds {kind!r}, which is no kind of value.")
     try:
         return reader[0], reader[1](element.text or "")
     except (ValueError, OverflowError) as error:
-        raise BadData(f"The {kind} of {where} does not read as one: {(element.text or '')[:40]!r}.") from error
+        raise BadDataError(f"The {kind} of {where} does not read as one: {(element.text or '')[:40]!r}.") from error
 
 
 def _whole_value(text: str) -> int:

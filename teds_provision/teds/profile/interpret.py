@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final, cast
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import METHODS, Monotone
 from teds_provision.teds.codec.model import AccessCode, Units
 from teds_provision.teds.profile.keys import (
@@ -119,7 +119,7 @@ def _unit(section: Section, key: str, *, required: bool = False) -> WrittenUnit 
         return None
     try:
         return parse_unit(text)
-    except BadData as error:
+    except BadDataError as error:
         section.error(key, f"{error.message} {error.hint}")
         return None
 
@@ -128,7 +128,7 @@ def parse_unit_or_report(section: Section, key: str, text: str, like: WrittenUni
     """Read a unit that must be of the same kind as another; reports and gives None where it is not."""
     try:
         unit = parse_unit(text)
-    except BadData as error:
+    except BadDataError as error:
         section.error(key, f"{error.message} {error.hint}")
         return None
     if unit.units != like.units:
@@ -238,7 +238,7 @@ def _interval(part: Section) -> float | None:
         return None
     try:
         seconds = parse_seconds(interval)
-    except BadData as error:
+    except BadDataError as error:
         part.error("interval", f"{error.message} {error.hint}")
         return None
     if 0 < seconds < 2**32:

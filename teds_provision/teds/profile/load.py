@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadDataError, NotFoundError
 from teds_provision.teds.calibration.model import METHODS
 from teds_provision.teds.profile.interpret import TEXT_CLASSES, interpret
 from teds_provision.teds.profile.keys import (
@@ -67,21 +67,21 @@ def default_folders(home: Path | None = None) -> tuple[Path, ...]:
 def load_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> Profile:
     """Read and check a profile by name (looked for in the folders) or by the path of its file.
 
-    Raises NotFound (unknown name; lists the known ones), BadData (file, line, field and what is wrong there).
+    Raises NotFoundError (unknown name; lists the known ones), BadDataError (file, line, field and what is wrong there).
     """
     profile, problems = check(name_or_path, folders)
     name = profile.name if profile else str(name_or_path)
     found = Problems(list(problems))
     found.raise_errors(name)
     if profile is None:  # no error and no profile cannot be
-        raise BadData(f"The profile {name} cannot be read.")
+        raise BadDataError(f"The profile {name} cannot be read.")
     return profile
 
 
 def parse_profile(text: str, name: str = "profile") -> Profile:
     """A profile from text that stands in no file; what it extends is looked for in the default folders.
 
-    Raises NotFound and BadData as ``load_profile`` does; ``name`` is the file that messages show.
+    Raises NotFoundError and BadDataError as ``load_profile`` does; ``name`` is the file that messages show.
     """
     path = Path(f"{name}.toml")
     table, lineage = _laid_over(parse(text, path.name), path, default_folders(), ())
@@ -89,7 +89,7 @@ def parse_profile(text: str, name: str = "profile") -> Profile:
     profile = interpret(table, name, path.name, lineage, problems)
     problems.raise_errors(name)
     if profile is None:  # no error and no profile cannot be
-        raise BadData(f"The profile {name} cannot be read.")
+        raise BadDataError(f"The profile {name} cannot be read.")
     return profile
 
 
@@ -111,7 +111,7 @@ def check(
 ) -> tuple[Profile | None, list[ProfileProblem]]:
     """All problems of a profile, errors and warnings; the profile itself where there is no error.
 
-    Raises NotFound and, for a file that is not TOML or inherits in a circle, BadData.
+    Raises NotFoundError and, for a file that is not TOML or inherits in a circle, BadDataError.
     """
     path = find_profile(name_or_path, folders)
     places = default_folders() if folders is None else tuple(folders)
@@ -122,12 +122,12 @@ def check(
 
 
 def find_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> Path:
-    """File of a profile; raises NotFound."""
+    """File of a profile; raises NotFoundError."""
     text = str(name_or_path)
     path = Path(text)
     if isinstance(name_or_path, Path) or path.suffix == ".toml" or path.parent != Path():
         if not path.is_file():
-            raise NotFound(f"There is no profile file {path}.")
+            raise NotFoundError(f"There is no profile file {path}.")
         return path
     return _by_name(text, default_folders() if folders is None else folders)
 
@@ -141,7 +141,7 @@ def _by_name(name: str, folders: Sequence[Path], besides: Sequence[Path] = ()) -
     known = sorted({path.stem for path in _files(folders)})
     near = get_close_matches(name[:64], known, n=1, cutoff=0.5)
     guess = f'Did you mean "{near[0]}"? ' if near else ""
-    raise NotFound(
+    raise NotFoundError(
         f'There is no profile "{name}".',
         hint=f"{guess}Known are: {', '.join(known) or 'none'}. Make one with: teds-provision profile new NAME",
     )
@@ -162,7 +162,7 @@ def list_profiles(folders: Sequence[Path] | None = None) -> list[ListedProfile]:
             continue
         try:
             profile, error = load_profile(path, places), ""
-        except (BadData, NotFound) as failure:
+        except (BadDataError, NotFoundError) as failure:
             profile, error = None, failure.message
         found[path.stem] = ListedProfile(path.stem, path, profile, error)
     return [found[name] for name in sorted(found)]
@@ -182,10 +182,10 @@ def _laid_over(
         return table, (path.stem,)
     where = entry.where
     if isinstance(entry, TomlTable) or not isinstance(entry.value, str):
-        raise BadData(f'{where}: extends: the name of one profile is expected, like extends = "smart-sensor".')
+        raise BadDataError(f'{where}: extends: the name of one profile is expected, like extends = "smart-sensor".')
     base = _base(entry.value, where, path, folders, chain)
     if len(chain) > MAXIMUM_DEPTH:
-        raise BadData(f"{where}: extends: more than {MAXIMUM_DEPTH} profiles extend each other.")
+        raise BadDataError(f"{where}: extends: more than {MAXIMUM_DEPTH} profiles extend each other.")
     below, lineage = _merged(base, folders, chain)
     inherited = {key: value for key, value in below.entries.items() if key not in ("abstract", "extends")}
     return TomlTable(inherited, below.where).merged(table), (path.stem, *lineage)
@@ -195,11 +195,11 @@ def _base(name: str, where: Where, path: Path, folders: Sequence[Path], chain: S
     places = list(dict.fromkeys((path.parent, *folders)))
     try:
         return _by_name(name, places, chain)
-    except NotFound as error:
+    except NotFoundError as error:
         if any((folder / f"{name}.toml").resolve() in chain for folder in places):
             circle = " -> ".join([*(one.stem for one in chain), name])
-            raise BadData(f"{where}: extends: the profiles extend each other in a circle: {circle}.") from error
-        raise BadData(f"{where}: extends: {error.message}", hint=error.hint) from error
+            raise BadDataError(f"{where}: extends: the profiles extend each other in a circle: {circle}.") from error
+        raise BadDataError(f"{where}: extends: {error.message}", hint=error.hint) from error
 
 
 # A profile as plain data, in the units that its author wrote: for ``profile show`` and JSON.

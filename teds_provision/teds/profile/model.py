@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Final
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadDataError
 from teds_provision.teds.calibration.model import Calibration, Monotone
 from teds_provision.teds.calibration.samples import raw_range
 from teds_provision.teds.codec.composer import compose
@@ -156,8 +156,9 @@ class Profile:
     ) -> BuiltDatasheet:
         """TEDS of this type for one node: Meta, TransducerChannel, names, calibrations (by channel), PHY and texts.
 
-        ``uuid`` has 10 octets (16 in the 2024 form; 10 are put at the end of 16 there, with a warning). Raises BadData
-        for an abstract profile, a UUID of another length, or a calibration that does not belong to a channel.
+        ``uuid`` has 10 octets (16 in the 2024 form; 10 are put at the end of 16 there, with a warning). Raises
+        BadDataError for an abstract profile, a UUID of another length, or a calibration that does not belong to a
+        channel.
         """
         return _build(self, uuid, calibration=calibration or {}, name=name, edition=edition, now=now)
 
@@ -198,13 +199,13 @@ def _build(
 
 def _require_buildable(profile: Profile, calibration: Mapping[int, Calibration]) -> None:
     if profile.abstract:
-        raise BadData(
+        raise BadDataError(
             f"The profile {profile.name} is only a base for others.",
             hint="Use a profile that extends it; see profile list.",
         )
     for number in calibration:
         if profile.channel(number) is None:
-            raise BadData(
+            raise BadDataError(
                 f"The calibration is for channel {number}; {profile.name} has channels 1 to {len(profile.channels)}.",
                 hint="Give the calibration of this type, or --no-calibration to drop the one that the node has.",
             )
@@ -216,7 +217,7 @@ def _uuid(uuid: bytes, edition: Edition, warnings: list[str]) -> bytes:
         warnings.append("The node's UUID has 10 octets, the 2024 form 16: it was put behind six zero octets.")
         return bytes(6) + uuid
     if len(uuid) != asked:
-        raise BadData(f"A UUID of the {edition} edition has {asked} octets, this one {len(uuid)}.")
+        raise BadDataError(f"A UUID of the {edition} edition has {asked} octets, this one {len(uuid)}.")
     return uuid
 
 

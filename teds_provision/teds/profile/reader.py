@@ -13,7 +13,7 @@ from shlex import quote
 from typing import Final
 
 from teds_provision import files
-from teds_provision.errors import BadData, StoreFailure
+from teds_provision.errors import BadDataError, StoreError
 from teds_provision.limits import LIMITS, check_depth, check_toml
 from teds_provision.teds.profile.keys import Key, Kind, Need
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
@@ -125,7 +125,7 @@ def key_lines(text: str) -> dict[KeyPath, int]:
 
 
 def parse(text: str, file: str) -> TomlTable:
-    """Read TOML text; ``file`` is the name shown in errors. Raises BadData with file and line."""
+    """Read TOML text; ``file`` is the name shown in errors. Raises BadDataError with file and line."""
     check_toml(text, file)
     try:
         data = tomllib.loads(text)
@@ -133,7 +133,7 @@ def parse(text: str, file: str) -> TomlTable:
         message = str(error)
         at = _AT.search(message)
         line = int(at[1]) if at else max(1, text.count("\n"))
-        raise BadData(f"{file}:{line}: this is not TOML: {_AT.sub('', message).strip()}.") from error
+        raise BadDataError(f"{file}:{line}: this is not TOML: {_AT.sub('', message).strip()}.") from error
     check_depth(data, LIMITS.toml_depth, file)
     lines = key_lines(text)
 
@@ -159,8 +159,8 @@ def parse(text: str, file: str) -> TomlTable:
 
 
 def read_text(path: Path) -> str:
-    """Text of a small UTF-8 file; raises NotFound, BadData or StoreFailure naming it."""
-    return files.read_text(path, LIMITS.text_file, "profile or calibration", failure=StoreFailure)
+    """Text of a small UTF-8 file; raises NotFoundError, BadDataError or StoreError naming it."""
+    return files.read_text(path, LIMITS.text_file, "profile or calibration", failure=StoreError)
 
 
 def walk(table: TomlTable) -> Iterator[tuple[str, Item]]:
@@ -202,7 +202,7 @@ def _shown(value: object) -> str:
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
 
 
-class _Wrong(Exception):
+class _BadValueError(Exception):
     """A value cannot be read; the text says why."""
 
 
@@ -226,11 +226,11 @@ class Problems:
         return [problem for problem in self.found if problem.severity == "error"]
 
     def raise_errors(self, name: str) -> None:
-        """Raise BadData with the first error and the number of the others."""
+        """Raise BadDataError with the first error and the number of the others."""
         errors = self.errors
         if errors:
             more = f" ({len(errors) - 1} more)" if len(errors) > 1 else ""
-            raise BadData(
+            raise BadDataError(
                 f"{errors[0]}{more}", hint=f"See all of them with: teds-provision profile check {quote(name)}"
             )
 
@@ -331,9 +331,9 @@ class Section:
             return None
         try:
             return self._convert(key, value)
-        except _Wrong as error:
+        except _BadValueError as error:
             self.error(key.key, str(error))
-        except BadData as error:
+        except BadDataError as error:
             self.error(key.key, f"{error.message} {error.hint}".strip())
         return None
 
@@ -380,7 +380,7 @@ class Section:
                 return finite(_number(value))
             case Kind.FLAG:
                 if not isinstance(value, bool):
-                    raise _Wrong(f"true or false is expected, not {_shown(value)}.")
+                    raise _BadValueError(f"true or false is expected, not {_shown(value)}.")
                 return int(value)
             case Kind.CHOICE:
                 return _choice(key, value)
@@ -395,7 +395,7 @@ class Section:
             number, _, text = value.strip().partition(" ")
             written = parse_unit(text.strip() or "1")
             if written.units != unit.units:
-                raise _Wrong(f'"{value}" is not in a unit of this channel ({unit.text}).')
+                raise _BadValueError(f'"{value}" is not in a unit of this channel ({unit.text}).')
             unit, value = written, _number_text(number)
         number_value = _number(value)
         return unit.difference_to_si(number_value) if difference else unit.to_si(number_value)
@@ -404,21 +404,21 @@ class Section:
 def finite(value: float) -> float:
     """Return the value if a Float32 can hold it."""
     if not math.isfinite(value) or abs(value) > FLOAT32_MAXIMUM:
-        raise _Wrong(f"{value} does not fit a Float32.")
+        raise _BadValueError(f"{value} does not fit a Float32.")
     return value
 
 
 def _not_negative(value: float) -> float:
     if value < 0:
-        raise _Wrong("it must not be negative.")
+        raise _BadValueError("it must not be negative.")
     return value
 
 
 def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _Wrong(f"a number is expected, not {_shown(value)}.")
+        raise _BadValueError(f"a number is expected, not {_shown(value)}.")
     if isinstance(value, int) and abs(value) > FLOAT32_MAXIMUM:
-        raise _Wrong("the number does not fit a Float32.")
+        raise _BadValueError("the number does not fit a Float32.")
     return float(value)
 
 
@@ -426,7 +426,7 @@ def _number_text(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise _Wrong(f'a number and a unit are expected, like "10 mm"; "{text}" is not a number.') from None
+        raise _BadValueError(f'a number and a unit are expected, like "10 mm"; "{text}" is not a number.') from None
 
 
 def _angle(value: object) -> float:
@@ -434,14 +434,14 @@ def _angle(value: object) -> float:
         number, _, text = value.strip().partition(" ")
         unit = parse_unit(text.strip() or "rad")
         if unit.units != parse_unit("rad").units:
-            raise _Wrong(f'"{value}" is not an angle.')
+            raise _BadValueError(f'"{value}" is not an angle.')
         return unit.to_si(_number_text(number))
     return _number(value)
 
 
 def _integer(value: object, limit: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= limit:
-        raise _Wrong(f"a whole number from 0 to {limit} is expected, not {_shown(value)}.")
+        raise _BadValueError(f"a whole number from 0 to {limit} is expected, not {_shown(value)}.")
     return value
 
 
@@ -452,14 +452,14 @@ def _choice(key: Key, value: object) -> int:
         return _integer(value, 0xFF)
     near = get_close_matches(str(value)[:64], key.choices, n=1, cutoff=0.6)
     guess = f'Did you mean "{near[0]}"?' if near else f"One of {', '.join(key.choices)} is expected."
-    raise _Wrong(f"{value!r} is not known here. {guess}")
+    raise _BadValueError(f"{value!r} is not known here. {guess}")
 
 
 def _list(key: Key, value: object) -> tuple[object, ...]:
     if not isinstance(value, list) or not value:
-        raise _Wrong(f"a list is expected, like {key.example}, not {_shown(value)}.")
+        raise _BadValueError(f"a list is expected, like {key.example}, not {_shown(value)}.")
     if key.field == "DAngles":
         if len(value) != 2:
-            raise _Wrong(f"two angles are expected, not {len(value)}.")
+            raise _BadValueError(f"two angles are expected, not {len(value)}.")
         return tuple(finite(_angle(part)) for part in value)
     return tuple(_integer(part, 0xFFFF) for part in value)

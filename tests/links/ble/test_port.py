@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import LinkFailure, NoNode, NoReader, UsageFailure
+from teds_provision.errors import LinkError, NoNodeError, NoReaderError, UsageError
 from teds_provision.links.ble.port import BlePort, cache_file
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import LISTEN_SECONDS, Contact, Notice, Prompt
@@ -78,7 +78,7 @@ def test_an_order_whose_connection_is_cut_is_given_up(air: Air, port: Ports) -> 
     assert isinstance(link, Prompt)
     assert link.exchange_within(IDENTIFY, 10.0)
     radio.do("cut", 0, 0)
-    with pytest.raises(LinkFailure):
+    with pytest.raises(LinkError):
         link.exchange_within(IDENTIFY, 10.0)
     assert radio.do("counts")["connects"] == 1
 
@@ -178,7 +178,7 @@ def test_a_stale_cache_of_services_is_removed_once(air: Air, port: Ports) -> Non
 def test_a_device_that_never_has_the_service_is_told(air: Air, port: Ports) -> None:
     radio = air(manners={"always_stale": True})
     notices: list[Notice] = []
-    with pytest.raises(NoNode):
+    with pytest.raises(NoNodeError):
         port().find(anyone, seconds=2, notice=notices.append)
     assert any("does not offer it" in notice.text for notice in notices)
     assert radio.do("counts")["removed"] <= 2
@@ -206,7 +206,7 @@ def test_a_full_adapter_is_named_where_every_connection_is_needed(air: Air, port
     for contact in contacts[:2]:
         contact.link.exchange(IDENTIFY)
         contact.link.connection.streaming = True  # type: ignore[attr-defined]
-    with pytest.raises(LinkFailure, match="holds 2 connections and takes no more") as failure:
+    with pytest.raises(LinkError, match="holds 2 connections and takes no more") as failure:
         contacts[2].link.exchange(IDENTIFY)
     assert "add an adapter" in failure.value.hint
 
@@ -256,7 +256,7 @@ def test_watching_gives_each_node_once(air: Air, port: Ports) -> None:
 
 def test_without_a_system_bus(port: Ports, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", f"unix:path={tmp_path}/nothing")
-    with pytest.raises(NoReader, match="no D-Bus system bus"):
+    with pytest.raises(NoReaderError, match="no D-Bus system bus"):
         find(port(), seconds=2)
 
 
@@ -266,19 +266,19 @@ def test_without_a_system_bus(port: Ports, monkeypatch: pytest.MonkeyPatch, tmp_
 )
 def test_an_adapter_that_cannot_be_used(air: Air, port: Ports, manners: dict[str, bool], said: str) -> None:
     air(manners=manners)
-    with pytest.raises(NoReader, match=said):
+    with pytest.raises(NoReaderError, match=said):
         find(port(), seconds=2)
 
 
 def test_an_adapter_that_is_not_there(air: Air, port: Ports) -> None:
     air()
-    with pytest.raises(NoReader, match="no Bluetooth adapter hci7"):
+    with pytest.raises(NoReaderError, match="no Bluetooth adapter hci7"):
         find(port("hci7"), seconds=2)
 
 
 @pytest.mark.parametrize("text", ["hci0?address=11:22", "hci0?speed=9", "a b"])
 def test_what_ble_may_not_say(text: str) -> None:
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         parse_spec(text)
 
 
@@ -306,7 +306,7 @@ def test_who_has_a_session_stays(air: Air, port: Ports) -> None:
 def test_a_new_node_advertises_only_after_a_tap(air: Air, port: Ports, tmp_path: Path) -> None:
     described.create(tmp_path / "new", profile=ANGLE)
     radio = air([tmp_path / "new"])
-    with pytest.raises(NoNode, match="The node did not answer"):
+    with pytest.raises(NoNodeError, match="The node did not answer"):
         find(port(), seconds=1.5)
     radio.do("tap", 0)
     assert find(port()).identity
@@ -317,7 +317,7 @@ def test_a_reset_gives_another_address_and_ends_the_advertising(air: Air, port: 
     assert find(port()).identity
     radio.do("reset", 0)
     until(lambda: radio.do("address", 0) != radio.addresses[0])
-    with pytest.raises(NoNode):
+    with pytest.raises(NoNodeError):
         find(port(), seconds=1.5)
     radio.do("tap", 0)
     assert find(port(f"?address={radio.do('address', 0)}")).identity

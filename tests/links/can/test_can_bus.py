@@ -7,7 +7,7 @@ import socket
 import can
 import pytest
 
-from teds_provision.errors import LinkFailure, UsageFailure
+from teds_provision.errors import LinkError, UsageError
 from teds_provision.links.can.bus import Bus, Frame, known_keys
 from teds_provision.links.can.spec import parse_spec
 from tests.pace import PATIENCE
@@ -17,7 +17,7 @@ def test_bus_off_is_a_link_failure_that_names_the_cure() -> None:
     bus = Bus(parse_spec("virtual:bus-off"))
     with can.Bus(interface="virtual", channel="bus-off") as controller:
         controller.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
-        with pytest.raises(LinkFailure, match="bus-off") as failure:
+        with pytest.raises(LinkError, match="bus-off") as failure:
             bus.receive(1)
     bus.close()
     assert "restart" in failure.value.hint
@@ -79,7 +79,7 @@ def test_frames_that_may_leave_this_machine_are_recognised_too(group: str) -> No
 
 
 def test_socketcand_has_no_fd() -> None:
-    with pytest.raises(UsageFailure, match="classic"):
+    with pytest.raises(UsageError, match="classic"):
         Bus(parse_spec("socketcand:can0?fd=1"))
 
 
@@ -130,7 +130,7 @@ def test_on_socketcan_programs_of_one_machine_hear_each_other(
 )
 def test_a_key_that_no_interface_has_is_refused_with_those_that_it_has(place: str, key: str, known: str) -> None:
     """python-can takes any and says nothing: a bit rate with a slip was the default one."""
-    with pytest.raises(UsageFailure) as refusal:
+    with pytest.raises(UsageError) as refusal:
         Bus(parse_spec(place))
     assert repr(key) in refusal.value.message
     assert known in refusal.value.hint.split(": ")[1].rstrip(".").split(", ")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from teds_provision.errors import AddressConflict, LinkFailure, NodeSilent, NoNode, NoReader
+from teds_provision.errors import AddressConflictError, LinkError, NodeSilentError, NoNodeError, NoReaderError
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.arrivals import Arrivals
 from teds_provision.links.can.isotp import FUNCTIONAL, Frame
@@ -290,7 +290,7 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
             """Whether it noticed that two are there; of two answers one may come too late on a busy machine."""
             try:
                 what()
-            except AddressConflict as conflict:
+            except AddressConflictError as conflict:
                 return "0x21" in str(conflict)
             return False
 
@@ -323,7 +323,7 @@ def test_an_address_is_good_again_as_soon_as_one_node_alone_answers_there(hub: H
     first, second = EchoNode(0x21, uuid=b"A" * 10), EchoNode(0x21, uuid=b"B" * 10)
     first.pinned = second.pinned = True
     with serving(hub.spec, first), opened(hub.spec) as port:
-        with serving(hub.spec, second), pytest.raises(AddressConflict, match="0x21"):
+        with serving(hub.spec, second), pytest.raises(AddressConflictError, match="0x21"):
             port.everyone(seconds=3, notice=quiet)
         assert port.bus().clash(0x21)
         [contact] = port.everyone(seconds=3, notice=quiet)
@@ -371,7 +371,7 @@ def test_nobody_is_there(hub: Hub) -> None:
 
         def looked() -> float:
             began = time.monotonic()
-            with pytest.raises(NoNode, match=r"within 1\.2 s"):
+            with pytest.raises(NoNodeError, match=r"within 1\.2 s"):
                 find(port, seconds=1.2)
             took = time.monotonic() - began
             assert took > 1.0
@@ -387,7 +387,7 @@ def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
         def others() -> list[str]:
             """What was told instead: a node that had no processor in time is told as none."""
             told: list[Notice] = []
-            with pytest.raises(NoNode) as error:
+            with pytest.raises(NoNodeError) as error:
                 port.find(lambda _: False, seconds=1.2, notice=told.append)
             kinds = [notice.kind for notice in told]
             return [] if "2121" in str(error.value) and kinds == ["waiting", "foreign-tag"] else [str(error.value)]
@@ -400,7 +400,7 @@ def test_a_node_that_falls_silent(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> 
     with opened(hub.spec) as port:
         with serving(hub.spec, EchoNode(0x21)):
             link = find(port).link
-        with pytest.raises(NodeSilent, match="0x21"):
+        with pytest.raises(NodeSilentError, match="0x21"):
             link.exchange(COUNT)
     requests = {data for identifier, data in hub.frames if identifier == 0x18DA21F1 and data[0] >> 4 == 0}
     repeated = [data for identifier, data in hub.frames if identifier == 0x18DA21F1 and data[2:] == COUNT]
@@ -496,7 +496,7 @@ def test_the_reply_to_set_can_address_leaves_from_the_old_one(hub: Hub) -> None:
 
 
 def test_no_bus_is_named_with_its_cure() -> None:
-    with pytest.raises(NoReader) as missing:
+    with pytest.raises(NoReaderError) as missing:
         CanPort("socketcan:nosuch0?bitrate=250000")
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
@@ -507,11 +507,11 @@ def test_no_bus_is_named_with_its_cure() -> None:
         assert "ip link set nosuch0 up type can bitrate 250000" in missing.value.hint
     else:
         assert "modprobe can_raw" in missing.value.hint
-    with pytest.raises(NoReader, match="socketcand"):
+    with pytest.raises(NoReaderError, match="socketcand"):
         CanPort("socketcand:can0?port=1")
-    with pytest.raises(NoReader):
+    with pytest.raises(NoReaderError):
         CanPort("nonsense:can0")
-    with pytest.raises(NoReader):
+    with pytest.raises(NoReaderError):
         CanPort("udp_multicast:127.0.0.1")
 
 
@@ -520,6 +520,6 @@ def test_a_bus_that_closes_is_a_link_failure() -> None:
     with opened(hub.spec) as port:
         time.sleep(0.1)
         hub.close()
-        with pytest.raises(LinkFailure) as failure:
+        with pytest.raises(LinkError) as failure:
             find(port, seconds=3)
-        assert not isinstance(failure.value, NoNode)
+        assert not isinstance(failure.value, NoNodeError)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from teds_provision.errors import LinkFailure, NodeSilent
+from teds_provision.errors import LinkError, NodeSilentError
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.port import CanPort
 from tests.links.can.hub import Hub
@@ -53,7 +53,7 @@ def test_a_node_that_says_wait_for_ever_is_given_up(hub: Hub, monkeypatch: pytes
     stop = answering(hub, lambda sent: hub.send(TO_US, WAIT) if sent else None)
     began = time.monotonic()
     try:
-        with pytest.raises(NodeSilent):
+        with pytest.raises(NodeSilentError):
             port.link(0x21).exchange(LONG)
     finally:
         stop.set()
@@ -69,7 +69,7 @@ def test_a_node_that_takes_a_frame_and_waits_again_is_given_up(hub: Hub, monkeyp
     turns = itertools.count()
     stop = answering(hub, lambda sent: hub.send(TO_US, WAIT if next(turns) % 15 else CONTINUE) if sent else None)
     try:
-        with pytest.raises(LinkFailure):
+        with pytest.raises(LinkError):
             port.link(0x21).exchange(LONG)
     finally:
         stop.set()

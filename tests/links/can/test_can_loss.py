@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links import Notice
 from teds_provision.links.can.port import CanPort
 from tests.links.can import lossy
@@ -36,7 +36,7 @@ def tally(port: CanPort, octets: int, count: int) -> int:
         try:
             assert port.link(0x21).exchange(write(body)) == body[::-1]
             good += 1
-        except LinkFailure:
+        except LinkError:
             continue
     return good
 
@@ -113,7 +113,7 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
     def with_every_reply_lost() -> float:
         hub.frames.clear()
         began = time.monotonic()
-        with pytest.raises(LinkFailure):
+        with pytest.raises(LinkError):
             link.exchange_within(write(b""), 0.8)  # one frame
         took = time.monotonic() - began
         assert took >= 0.8
@@ -122,7 +122,7 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
 
     best_of(5, 1.2, with_every_reply_lost)
     hub.frames.clear()
-    with pytest.raises(LinkFailure):
+    with pytest.raises(LinkError):
         link.exchange_within(write(bytes(20)), 0.8)  # whose flow control is lost: it is begun anew until then
 
     def sent() -> int:

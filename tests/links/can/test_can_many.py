@@ -13,7 +13,7 @@ import pytest
 
 from teds_provision.doctor import links as doctor
 from teds_provision.doctor.checks import System
-from teds_provision.errors import LinkFailure, NodeSilent, UsageFailure
+from teds_provision.errors import LinkError, NodeSilentError, UsageError
 from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.port import CanPort
@@ -123,14 +123,14 @@ def test_an_exchange_is_given_up_when_nobody_hopes_for_its_reply(hub: Hub) -> No
         def ask() -> None:
             try:
                 link.ask(write(b"x"), tries=3, seconds=5 * PATIENCE)
-            except LinkFailure as failure:
+            except LinkError as failure:
                 ended.append(type(failure))
 
         asking = threading.Thread(target=ask)
         asking.start()
         over.set()
         asking.join(PATIENCE)
-        assert ended == [NodeSilent]
+        assert ended == [NodeSilentError]
 
 
 def test_a_listener_hears_what_it_wants_beside_an_exchange(hub: Hub, nodes: Start) -> None:
@@ -166,7 +166,7 @@ def test_a_bus_that_goes_away_wakes_whoever_waits() -> None:
     ear = port.listen(lambda frame: True)
     threading.Timer(0.2, hub.close).start()
     results = in_threads(lambda number: ear.get(PATIENCE) if number else port.link(0x21).exchange(write(b"x")), 2)
-    assert [isinstance(result, LinkFailure) for result in results] == [True, True], results
+    assert [isinstance(result, LinkError) for result in results] == [True, True], results
     port.close()
 
 
@@ -180,7 +180,7 @@ def test_two_stations_of_one_address_are_noticed_and_named(hub: Hub, nodes: Star
     told: list[Notice] = []
     ours.everyone(seconds=2, notice=told.append)
     assert any(notice.kind == "conflict" and "0xF1" in notice.text and "source=0xF2" in notice.text for notice in told)
-    with pytest.raises(LinkFailure, match="Another base station") as failure:
+    with pytest.raises(LinkError, match="Another base station") as failure:
         ours.link(0x55).ask(write(b"nobody"), tries=1, seconds=0.2)
     assert "source=0xF2" in failure.value.hint
     for port in (ours, theirs, other):
@@ -206,11 +206,11 @@ def test_the_registry_opens_a_place_and_names_what_it_does_not_know(hub: Hub) ->
     assert port.place == f"can:{hub.spec}"
     assert port.capabilities == LINKS["can"].capabilities
     port.close()
-    with pytest.raises(UsageFailure, match="radio"):
+    with pytest.raises(UsageError, match="radio"):
         open_place("radio:0")
-    with pytest.raises(UsageFailure, match="requires --can"):
+    with pytest.raises(UsageError, match="requires --can"):
         open_port(LinkSettings("can"))
-    with pytest.raises(UsageFailure, match="2 readers"):
+    with pytest.raises(UsageError, match="2 readers"):
         open_port(LinkSettings(nfc=("udp:localhost:7", "udp:localhost:8")))
     assert LinkSettings(nfc=("usb", "udp:localhost:8")).places == ("nfc:usb", "nfc:udp:localhost:8")
 

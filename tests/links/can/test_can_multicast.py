@@ -13,7 +13,7 @@ from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.can import multicast
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.spec import parse_spec
@@ -169,6 +169,6 @@ def test_an_error_frame_that_says_bus_off_is_a_link_failure(group: str) -> None:
     port = int(group.rpartition("=")[2])
     with can.Bus(interface="udp_multicast", channel=spec.channel, port=port, hop_limit=0) as one:
         one.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
-        with pytest.raises(LinkFailure, match="bus-off"):
+        with pytest.raises(LinkError, match="bus-off"):
             bus.receive(PATIENCE)
     bus.close()

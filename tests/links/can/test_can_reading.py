@@ -9,7 +9,7 @@ from queue import Empty, SimpleQueue
 
 import pytest
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.shared import SharedBus
 from teds_provision.links.can.spec import parse_spec
@@ -99,6 +99,6 @@ def test_waiting_ends_with_its_time_and_with_the_bus(group: str) -> None:
     line = bus.line(0x21)
     threading.Timer(0.1, bus.close).start()
     assert bus.next_of(line.events, 120.0).kind == "failed"
-    with pytest.raises(LinkFailure, match="closed"):
+    with pytest.raises(LinkError, match="closed"):
         bus.check()
     assert time.monotonic() - began < 110

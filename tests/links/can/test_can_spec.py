@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.links.can.spec import CanSpec, parse_spec
 
 
@@ -54,7 +54,7 @@ def test_an_ipv6_group_keeps_its_colons() -> None:
     ],
 )
 def test_names_what_is_wrong(text: str, named: str) -> None:
-    with pytest.raises(UsageFailure, match=named):
+    with pytest.raises(UsageError, match=named):
         parse_spec(text)
 
 
@@ -62,7 +62,7 @@ def test_names_what_is_wrong(text: str, named: str) -> None:
 def test_any_text_is_read_or_refused_as_usage(text: str) -> None:
     try:
         spec = parse_spec(text)
-    except UsageFailure:
+    except UsageError:
         return
     assert 0xF1 <= spec.source <= 0xF7
     assert spec.node is None or 1 <= spec.node <= 239

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from teds_provision.errors import Garbled, NodeSilent, NoNode, NoReader, UsageFailure
+from teds_provision.errors import GarbledError, NodeSilentError, NoNodeError, NoReaderError, UsageError
 from teds_provision.links import Contact, LinkSettings, Notice, Port, open_port
 from teds_provision.links.nfc import message
 from teds_provision.links.nfc import port as port_module
@@ -45,7 +45,7 @@ def waited_past(port: Port, notices: list[Notice], uuid: str = UUID, kind: str =
     """What is told of what lies there instead, within the first of some times in which anything is told of it."""
     for seconds in (1.5, 6, 24):
         notices.clear()
-        with pytest.raises(NoNode):
+        with pytest.raises(NoNodeError):
             find(port, notices, uuid, seconds=seconds)
         if told := [notice for notice in notices if notice.kind == kind]:
             break
@@ -138,7 +138,7 @@ def test_a_torn_answer_is_read_again_and_the_frame_repeated(start_node: StartNod
 def test_answers_that_stay_torn_are_garbled_at_last(start_node: StartNode, port: Port, notices: list) -> None:
     start_node(torn=1000)
     contact = find(port, notices)
-    with pytest.raises(Garbled, match="CRC-32"):
+    with pytest.raises(GarbledError, match="CRC-32"):
         contact.link.exchange(b"\0\0\x80\x0b\0\0")
 
 
@@ -216,7 +216,7 @@ def test_an_empty_reader_gives_no_node_in_time(port: Port, notices: list) -> Non
     def looked() -> float:
         notices.clear()
         began = time.monotonic()
-        with pytest.raises(NoNode) as caught:
+        with pytest.raises(NoNodeError) as caught:
             find(port, notices, seconds=0.6)
         assert caught.value.exit_code == 5
         assert [notice.kind for notice in notices] == ["waiting"]
@@ -233,7 +233,7 @@ def test_a_node_taken_away_in_the_middle_of_a_transfer_is_silent(
     contact = find(port, notices)
     timer = threading.Timer(0.4, node.kill)
     timer.start()
-    with pytest.raises(NodeSilent, match="removed from the reader"):
+    with pytest.raises(NodeSilentError, match="removed from the reader"):
         contact.link.exchange(bytes(900))
     timer.join()
     contact.link.close()
@@ -248,7 +248,7 @@ def test_a_node_swapped_for_another_gets_nothing_of_the_transfer(
     contact = find(port, notices)
     timer = threading.Timer(0.4, first.kill)
     timer.start()
-    with pytest.raises(NodeSilent, match=OTHER.lower()):
+    with pytest.raises(NodeSilentError, match=OTHER.lower()):
         contact.link.exchange(bytes(900))
     timer.join()
     assert find(port, notices, OTHER).identity.epoch == 0  # it ran no frame
@@ -280,7 +280,7 @@ def test_a_node_forgets_with_the_field(start_node: StartNode, port: Port, notice
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "example.org", "127.0.0.2"])
 def test_a_simulated_reader_is_refused_outside_loopback(host: str) -> None:
-    with pytest.raises(UsageFailure, match="loopback"):
+    with pytest.raises(UsageError, match="loopback"):
         open_port(LinkSettings(nfc=f"udp:{host}:5000"))
 
 
@@ -290,12 +290,12 @@ def test_a_simulated_reader_is_refused_outside_loopback(host: str) -> None:
 def test_what_is_no_reader_path_is_a_usage_error(bad: str) -> None:
     from teds_provision.links.nfc.port import NfcPort
 
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         NfcPort(bad)
 
 
 def test_no_serial_reader_says_so() -> None:
-    with pytest.raises(NoReader) as caught:
+    with pytest.raises(NoReaderError) as caught:
         open_port(LinkSettings(nfc="tty:NOSUCH9:pn532"))
     assert caught.value.hint
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from teds_provision.errors import Garbled, NodeSilent
+from teds_provision.errors import GarbledError, NodeSilentError
 from teds_provision.links.nfc import message, tag, tnep
 from teds_provision.links.nfc.nfcpy import Type4TagCommandError
 from teds_provision.links.nfc.pieces import LONGEST_FRAME, Piece, Requester
@@ -45,7 +45,7 @@ class Dripping:
 
 def test_a_reply_in_drops_ends_after_two_minutes() -> None:
     node = Dripping(8, 4.0)
-    with pytest.raises(NodeSilent, match="120 s"):
+    with pytest.raises(NodeSilentError, match="120 s"):
         Poller(node, SERVICE, clock=lambda: node.now, sleep=node.sleep).transact(1, bytes(10))
     assert node.now < LONGEST + 15
 
@@ -58,7 +58,7 @@ def test_a_slow_node_has_the_time_that_it_needs() -> None:
 
 def test_no_reply_is_longer_than_the_longest_frame() -> None:
     requester = Requester(1, bytes(10), 100)
-    with pytest.raises(Garbled, match="at most 4094 are allowed"):
+    with pytest.raises(GarbledError, match="at most 4094 are allowed"):
         requester.take(Piece(1, LONGEST_FRAME + 1, 0, bytes(8), answer=True))
     assert requester.take(Piece(1, LONGEST_FRAME, 0, bytes(8), answer=True))
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.links.nfc import pcsc
 from teds_provision.links.nfc.reader import open_reader
 from tests.bench import PASSPHRASE, make_station
@@ -143,10 +143,10 @@ class Scard:
 @pytest.mark.parametrize(
     ("readers", "path", "error", "says"),
     [
-        (None, "pcsc", NoReader, "does not answer: Service not available"),
-        ([], "pcsc", NoReader, "No PC/SC reader is plugged in"),
-        (["ACS ACR1252 PICC 00", "HID Omnikey 5022 00"], "pcsc", UsageFailure, "2 PC/SC readers fit"),
-        (["ACS ACR1252 PICC 00", "HID Omnikey 5022 00"], "pcsc:identiv", NoReader, "Omnikey"),
+        (None, "pcsc", NoReaderError, "does not answer: Service not available"),
+        ([], "pcsc", NoReaderError, "No PC/SC reader is plugged in"),
+        (["ACS ACR1252 PICC 00", "HID Omnikey 5022 00"], "pcsc", UsageError, "2 PC/SC readers fit"),
+        (["ACS ACR1252 PICC 00", "HID Omnikey 5022 00"], "pcsc:identiv", NoReaderError, "Omnikey"),
     ],
 )
 def test_what_is_wrong_with_pc_sc_is_named(
@@ -164,6 +164,6 @@ def test_the_slot_of_a_security_module_is_no_reader_for_nodes(monkeypatch: pytes
 
 def test_without_pyscard_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "smartcard", None)
-    with pytest.raises(NoReader) as caught:
+    with pytest.raises(NoReaderError) as caught:
         open_reader("pcsc")
     assert "teds-provision[pcsc]" in caught.value.hint

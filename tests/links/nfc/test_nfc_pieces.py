@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import Garbled
+from teds_provision.errors import GarbledError
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, Requester, Responder, room
@@ -35,7 +35,7 @@ def test_ndef_messages_come_back_as_they_were(given_records: tuple[NdefRecord, .
 
 @given(st.binary(max_size=300))
 def test_ndef_framing_never_raises_anything_but_garbled(octets: bytes) -> None:
-    with contextlib.suppress(Garbled):
+    with contextlib.suppress(GarbledError):
         message.decode(octets)
 
 
@@ -45,7 +45,7 @@ def test_a_mutated_ndef_message_never_raises_anything_but_garbled(
 ) -> None:
     octets = bytearray(message.encode(given) or b"\xd0\x00\x00")
     octets[data.draw(st.integers(0, len(octets) - 1))] ^= data.draw(st.integers(1, 255))
-    with contextlib.suppress(Garbled):
+    with contextlib.suppress(GarbledError):
         message.decode(bytes(octets))
 
 
@@ -71,7 +71,7 @@ def test_chunks_are_put_together() -> None:
     "octets", ["51010054", "91010054", "D101", "D10105540000", "D10100540000", "B1010054", "F601005400"]
 )
 def test_broken_framing_is_named(octets: str) -> None:
-    with pytest.raises(Garbled):
+    with pytest.raises(GarbledError):
         message.decode(bytes.fromhex(octets))
 
 
@@ -92,7 +92,7 @@ def test_tnep_records_never_raise_anything_but_garbled(payload: bytes) -> None:
         found = [NdefRecord(WELL_KNOWN, kind, payload), NdefRecord(EXTERNAL, tnep.TIM_TYPE, payload)]
         tnep.our_service(found)
         tnep.status_of(found)
-        with contextlib.suppress(Garbled):
+        with contextlib.suppress(GarbledError):
             tnep.selection(found)
 
 
@@ -116,7 +116,7 @@ def test_a_payload_record_comes_back_as_it_was(piece: Piece) -> None:
 def test_every_flipped_octet_of_a_payload_record_is_noticed(body: bytes, data: st.DataObject) -> None:
     octets = bytearray(Piece(7, len(body), 0, body).encode())
     octets[data.draw(st.integers(0, len(octets) - 1))] ^= data.draw(st.integers(1, 255))
-    with pytest.raises(Garbled):
+    with pytest.raises(GarbledError):
         Piece.decode(bytes(octets))
 
 
@@ -206,14 +206,14 @@ def test_the_answer_to_a_piece_of_a_request_says_what_is_held() -> None:
     ],
 )
 def test_pieces_that_do_not_fit_are_garbled(piece: Piece) -> None:
-    with pytest.raises(Garbled):
+    with pytest.raises(GarbledError):
         Requester(5, b"abcd", 30).take(piece)
 
 
 def test_a_reply_that_changes_its_length_is_garbled() -> None:
     requester = Requester(5, b"abcd", 30)
     requester.take(Piece(5, 9, 0, b"x", answer=True, more=True))
-    with pytest.raises(Garbled):
+    with pytest.raises(GarbledError):
         requester.take(Piece(5, 8, 1, b"y", answer=True))
 
 
@@ -233,6 +233,6 @@ def test_no_sequence_of_pieces_upsets_either_side(sequence: list[Piece]) -> None
     requester, responder = Requester(1, bytes(25), 10), Responder(lambda transaction, whole: whole)
     for piece in sequence:
         for take in (lambda p=piece: responder.answer(p, 10), lambda p=piece: requester.take(p)):
-            with contextlib.suppress(Garbled):
+            with contextlib.suppress(GarbledError):
                 take()
         assert requester.next().total <= 0xFFFF

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import Garbled, NodeSilent
+from teds_provision.errors import GarbledError, NodeSilentError
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece
 from teds_provision.links.nfc.poller import Poller
@@ -69,7 +69,7 @@ def test_a_station_waits_before_its_first_read_too(wt_int: int) -> None:
 @pytest.mark.parametrize("wt_int", [0, 4, 20, 36, 44])
 def test_a_station_gives_up_after_its_own_5_s(wt_int: int) -> None:
     script = Script(b"")
-    with pytest.raises(NodeSilent):
+    with pytest.raises(NodeSilentError):
         script.transact(wt_int=wt_int, n_wait=0)
     assert 5.0 <= script.now < 5.1
 
@@ -77,7 +77,7 @@ def test_a_station_gives_up_after_its_own_5_s(wt_int: int) -> None:
 def test_a_node_that_announces_more_time_than_5_s_gets_it_up_to_15_s() -> None:
     for wt_int, n_wait, seconds in ((40, 15, 8.2), (60, 15, 15.0)):
         script = Script(b"")
-        with pytest.raises(NodeSilent):
+        with pytest.raises(NodeSilentError):
             script.transact(wt_int=wt_int, n_wait=n_wait)
         assert script.now == pytest.approx(seconds, abs=0.1)
 
@@ -94,10 +94,10 @@ def test_a_node_that_announces_more_time_than_5_s_gets_it_up_to_15_s() -> None:
     ],
 )
 def test_what_breaks_the_wire_format_is_garbled(reads: list[bytes]) -> None:
-    with pytest.raises(Garbled):
+    with pytest.raises(GarbledError):
         Script(*reads).transact()
 
 
 def test_a_node_that_takes_too_little_is_named() -> None:
-    with pytest.raises(Garbled, match="at most 30 octets"):
+    with pytest.raises(GarbledError, match="at most 30 octets"):
         Script(OK).transact(max_ndef=30)

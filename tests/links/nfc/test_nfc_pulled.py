@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkError
 from teds_provision.links import Contact, LinkSettings, Notice, open_port
 from teds_provision.links.nfc import port as port_module
 from tests.pace import until
@@ -50,7 +50,7 @@ class Watch:
         try:
             for _ in range(2):
                 assert contact.link.exchange(FRAME) == b"\x01" + FRAME[::-1]
-        except LinkFailure:
+        except LinkError:
             return "pulled"
         finally:
             self._using = False

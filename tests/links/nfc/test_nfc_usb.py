@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from teds_provision.errors import NoNode, NoReader, UsageFailure
+from teds_provision.errors import NoNodeError, NoReaderError, UsageError
 from teds_provision.links import LinkSettings, Notice, open_port
 from teds_provision.links.nfc import reader
 from teds_provision.links.nfc.port import NfcPort
@@ -90,7 +90,7 @@ def test_frames_go_over_a_usb_reader(make_node: Callable[[str], Node], chip: Chi
 def test_an_empty_field_is_no_busy_loop(chip: Chip) -> None:
     port = open_port(LinkSettings(nfc="usb"))
     chip.commands = 0
-    with pytest.raises(NoNode):
+    with pytest.raises(NoNodeError):
         port.find(lambda identity: True, seconds=1, notice=lambda notice: None)
     assert chip.commands < 400
     port.close()
@@ -146,11 +146,11 @@ def test_unplugging_in_the_middle_of_a_transfer_is_a_reader_error(make_node: Cal
         return answer(command) if answer else None
 
     chip.answer = unplug_after_a_while
-    with pytest.raises(NoReader) as caught:
+    with pytest.raises(NoReaderError) as caught:
         contact.link.exchange(bytes(400))
     assert caught.value.exit_code == 5
     contact.link.close()
-    with pytest.raises(NoReader, match="was unplugged"):
+    with pytest.raises(NoReaderError, match="was unplugged"):
         port.find(lambda identity: True, seconds=0.5, notice=lambda notice: None)
     chip.plugged = True
     node.put_down()
@@ -170,7 +170,7 @@ def test_unplugging_in_the_middle_of_a_transfer_is_a_reader_error(make_node: Cal
 def test_a_reader_that_cannot_be_opened_says_why(chip: Chip, refuse: int, message: str, hint: str) -> None:
     chip.refuse = refuse
     for path in ("usb", "usb:04e6", "usb:04e6:5591"):
-        with pytest.raises(NoReader) as caught:
+        with pytest.raises(NoReaderError) as caught:
             NfcPort(path)
         assert message in caught.value.message
         assert hint in caught.value.hint
@@ -178,7 +178,7 @@ def test_a_reader_that_cannot_be_opened_says_why(chip: Chip, refuse: int, messag
 
 def test_without_a_reader_the_known_ones_are_listed(chip: Chip) -> None:
     chip.plugged = False
-    with pytest.raises(NoReader) as caught:
+    with pytest.raises(NoReaderError) as caught:
         NfcPort("usb")
     assert "054c:06c3" in caught.value.hint
 
@@ -190,7 +190,7 @@ def test_without_libusb_its_package_is_named(chip: Chip, monkeypatch: pytest.Mon
         raise FileNotFoundError("cannot find a suitable libusb-1.0")
 
     monkeypatch.setattr(nfc.clf.device.transport.USB, "find", missing)
-    with pytest.raises(NoReader) as caught:
+    with pytest.raises(NoReaderError) as caught:
         NfcPort("usb")
     assert "libusb-1.0-0" in caught.value.hint
 
@@ -199,7 +199,7 @@ def test_auto_takes_the_only_reader_and_names_it(make_node: Callable[[str], Node
     make_node("4")
     port = open_port(LinkSettings())
     told: list[Notice] = []
-    with pytest.raises(NoNode):
+    with pytest.raises(NoNodeError):
         port.find(lambda identity: True, seconds=0.3, notice=told.append)
     assert "usb:04e6:5591" in told[0].text
     assert port.place == "nfc:usb:04e6:5591"
@@ -208,6 +208,6 @@ def test_auto_takes_the_only_reader_and_names_it(make_node: Callable[[str], Node
 
 def test_auto_lists_several_readers(chip: Chip, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "_usb_readers", lambda path: [(0x04E6, 0x5591, 1, 5), (0x054C, 0x06C3, 1, 6)])
-    with pytest.raises(UsageFailure, match=r"2 readers are plugged in: usb:001:005, usb:001:006") as caught:
+    with pytest.raises(UsageError, match=r"2 readers are plugged in: usb:001:005, usb:001:006") as caught:
         open_port(LinkSettings(nfc="auto"))
     assert caught.value.exit_code == 2

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from teds_provision.errors import NoNode
+from teds_provision.errors import NoNodeError
 from teds_provision.links import Contact, LinkSettings, Notice, Port, open_port
 from teds_provision.links.nfc import port as port_module
 from tests.pace import best_of, until
@@ -195,7 +195,7 @@ def test_nonsense_from_the_other_side_is_no_node(path: str, port: Port) -> None:
         thread = threading.Thread(target=babble)
         thread.start()
         try:
-            with pytest.raises(NoNode):
+            with pytest.raises(NoNodeError):
                 port.find(lambda identity: True, seconds=4, notice=lambda notice: None)
         finally:
             stop.set()

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from mcap.reader import make_reader
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import Block, GroupRows, NodeReport, Note
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
@@ -153,7 +153,7 @@ def test_a_grid_has_one_row_a_time_and_units_in_its_columns(tmp_path: Path) -> N
     assert row["hand/oil [K]"].tolist() == [0.25]
     [again] = convert(wide, tmp_path / "wide.parquet").files
     pd.testing.assert_frame_equal(pd.read_parquet(again), table)
-    with pytest.raises(UsageFailure, match="written with --wide"):
+    with pytest.raises(UsageError, match="written with --wide"):
         convert(wide, tmp_path / "no.mcap")
 
 

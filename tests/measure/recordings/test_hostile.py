@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import BadData, TedsProvisionError
+from teds_provision.errors import BadDataError, TedsProvisionError
 from teds_provision.measure.recordings.converting import convert
 from teds_provision.measure.recordings.opening import open_recording
 from teds_provision.measure.sinks.mcap.writer import CHUNK, CHUNK_HEAD, HEADER, MAGIC, record, text
@@ -25,7 +25,7 @@ def read(path: Path) -> int:
 
 
 def refused(path: Path, *words: str) -> None:
-    with pytest.raises(BadData) as caught:
+    with pytest.raises(BadDataError) as caught:
         read(path)
     for word in words:
         assert word in caught.value.message
@@ -67,12 +67,12 @@ def test_a_chunk_that_unpacks_to_gigabytes_is_refused_unopened(tmp_path: Path) -
         code = (
             "import resource, sys\n"
             "from pathlib import Path\n"
-            "from teds_provision.errors import BadData\n"
+            "from teds_provision.errors import BadDataError\n"
             "from teds_provision.measure.recordings.opening import open_recording\n"
             "resource.setrlimit(resource.RLIMIT_DATA, (400 << 20, 400 << 20))\n"
             "try:\n"
             "    list(open_recording(Path(sys.argv[1])).entries())\n"
-            "except BadData as error:\n"
+            "except BadDataError as error:\n"
             "    print(error.message)\n"
         )
         done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=False)
@@ -120,7 +120,7 @@ def test_a_damaged_mcap_is_refused_with_the_command_that_saves_the_rest(tmp_path
     octets = bytearray(path.read_bytes())
     octets[octets.find(b"zstd") + 200] ^= 0xFF
     path.write_bytes(octets)
-    with pytest.raises(BadData, match="chunk at octet") as caught:
+    with pytest.raises(BadDataError, match="chunk at octet") as caught:
         convert(path, tmp_path / "run.csv")
     assert "measure recover" in caught.value.hint
     assert [one.name for one in tmp_path.iterdir()] == ["run.mcap"], "nothing half done is left"

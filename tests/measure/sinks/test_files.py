@@ -25,7 +25,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from teds_provision.errors import BadData, NotFound, StoreLocked, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, StoreLockedError, TedsProvisionError, UsageError
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
@@ -291,10 +291,10 @@ def test_an_mcap_that_was_cut_anywhere_is_made_whole(tmp_path: Path, octets: int
 
 
 def test_what_is_no_recording_is_refused_by_recover(tmp_path: Path) -> None:
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         recover(tmp_path / "nothing.mcap")
     (tmp_path / "words.mcap").write_text("these are words, not records")
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         recover(tmp_path / "words.mcap")
 
 
@@ -365,7 +365,7 @@ def test_damage_inside_costs_the_damaged_chunk_alone(long: Finished, tmp_path: P
     if shape != "no end either":
         assert left[-1] == before[-1], "everything behind it stays"
     assert recover(done.output).was_whole
-    with pytest.raises(UsageFailure, match="already exists"):
+    with pytest.raises(UsageError, match="already exists"):
         recover(path)
     assert recover(path, tmp_path / "other.mcap").output == tmp_path / "other.mcap"
 
@@ -411,7 +411,7 @@ def test_a_file_whose_recorder_writes_is_refused(tmp_path: Path, name: str) -> N
     try:
         sink.write(block())
         until(lambda: (tmp_path / name).stat().st_size > 8, "nothing is written")
-        with pytest.raises(StoreLocked, match="is being recorded right now"):
+        with pytest.raises(StoreLockedError, match="is being recorded right now"):
             recover(tmp_path / name)
     finally:
         sink.close()
@@ -420,7 +420,7 @@ def test_a_file_whose_recorder_writes_is_refused(tmp_path: Path, name: str) -> N
 def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(tmp_path: Path) -> None:
     with pytest.raises(TedsProvisionError, match="folder"):
         open_sink(str(tmp_path / "no" / "run.csv")).open([ANGLE], STATION)
-    with pytest.raises(UsageFailure, match="Unsupported format"):
+    with pytest.raises(UsageError, match="Unsupported format"):
         open_sink("run.xlsx")
 
 

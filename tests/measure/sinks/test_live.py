@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, SetPointCommand, StationFacts
 from teds_provision.measure.sinks.joints import joints_of
 from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, DiagnosticEntry, TopicSink
@@ -63,7 +63,7 @@ def test_a_chosen_name_goes_before_a_made_one_and_must_be_one() -> None:
     assert topics.channel(ARM, 1) == "/crane/boom"
     assert topics.channel(HAND, 2) == "/bench/gripper/force"
     for wrong in ("two words", "a__b", "9lives", "end_", ""):
-        with pytest.raises(UsageFailure):
+        with pytest.raises(UsageError):
             Topics(replace(STATION, names={(ARM, 1): wrong}))
 
 
@@ -102,7 +102,7 @@ def test_no_two_topics_are_equal_whatever_was_chosen_and_made(
             continue  # as store and command refuse it
         now = Topics(station)
         now.learn(facts)
-        with suppress(UsageFailure):
+        with suppress(UsageError):
             now.require_free(uuid, number, name)
             station = replace(station, names={**station.names, (uuid, number): name})
     topics = Topics(station)

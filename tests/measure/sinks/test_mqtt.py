@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.measure.blocks import ChannelFacts, NodeReport
 from teds_provision.measure.sinks import mqtt, open_sink
 from teds_provision.teds.units import parse_units
@@ -321,7 +321,7 @@ def test_two_brokers_of_one_host_have_two_names() -> None:
 
 @pytest.mark.parametrize("spec", ["mqtt://", "mqtt:host", "mqtt://user:secret@host"])
 def test_what_is_no_url_or_holds_a_password_is_refused(spec: str) -> None:
-    with pytest.raises(UsageFailure) as caught:
+    with pytest.raises(UsageError) as caught:
         open_sink(spec)
     assert "secret" not in str(caught.value)
 

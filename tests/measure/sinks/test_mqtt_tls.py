@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import NameOID
 
-from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError, UsageError
 from teds_provision.measure.blocks import SinkStats
 from teds_provision.measure.sinks import Sink, open_sink
 from tests.measure.sinks.parts import ANGLE, HAND, STATION, block
@@ -187,7 +187,7 @@ def test_each_failure_is_told_in_words(ports: dict[str, int], authority: Authori
     ],
 )
 def test_what_a_url_does_not_know_is_refused_with_what_it_does(url: str, word: str) -> None:
-    with pytest.raises(UsageFailure) as refusal:
+    with pytest.raises(UsageError) as refusal:
         open_sink(url)
     assert word in f"{refusal.value.message} {refusal.value.hint}"
 
@@ -200,15 +200,15 @@ def test_files_are_regular_small_and_what_they_should_be(tmp_path: Path, authori
     text.write_text("not a certificate")
     locked = authority.issue("locked", passphrase=b"secret words")
     for query, error in (
-        (f"password-file={pipe}", BadData),
-        (f"password-file={huge}", BadData),
-        (f"password-file={tmp_path / 'none'}", NotFound),
-        ("password-file=/dev/zero", BadData),
-        (f"ca={pipe}", BadData),
-        (f"ca={text}", BadData),
-        (f"ca={authority.file}&cert={pipe}", BadData),
-        (f"ca={authority.file}&cert={text}&key={text}", BadData),
-        (f"ca={authority.file}&cert={locked[0]}&key={locked[1]}", BadData),
+        (f"password-file={pipe}", BadDataError),
+        (f"password-file={huge}", BadDataError),
+        (f"password-file={tmp_path / 'none'}", NotFoundError),
+        ("password-file=/dev/zero", BadDataError),
+        (f"ca={pipe}", BadDataError),
+        (f"ca={text}", BadDataError),
+        (f"ca={authority.file}&cert={pipe}", BadDataError),
+        (f"ca={authority.file}&cert={text}&key={text}", BadDataError),
+        (f"ca={authority.file}&cert={locked[0]}&key={locked[1]}", BadDataError),
     ):
         found: list[TedsProvisionError] = []
         thread = threading.Thread(target=_open_into, args=(f"mqtts://arm@127.0.0.1?{query}", found), daemon=True)

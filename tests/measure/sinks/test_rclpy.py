@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import NodeReport, SetPointCommand
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import sourced
@@ -44,7 +44,7 @@ def test_a_sourced_ros_without_rclpy_is_left_alone(tmp_path: Path, monkeypatch: 
 def test_a_python_that_was_named_and_has_no_rclpy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     monkeypatch.setenv(sourced.CHOSEN, sys.executable)
-    with pytest.raises(UsageFailure, match="cannot import rclpy"):
+    with pytest.raises(UsageError, match="cannot import rclpy"):
         open_sink("ros2")
 
 
@@ -212,6 +212,6 @@ class TestSeenByRclpy:
         monkeypatch.setenv(sourced.CHOSEN, str(PYTHON))
         monkeypatch.setattr(sourced, "NEEDS", "rclpy, no_such_msgs.msg")
         sourced._require_rclpy.cache_clear()
-        with pytest.raises(UsageFailure, match="its messages"):
+        with pytest.raises(UsageError, match="its messages"):
             open_sink("ros2")
         sourced._require_rclpy.cache_clear()

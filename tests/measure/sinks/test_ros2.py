@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros.ros2_types import HUMBLE_HASHES, TYPE_HASHES
@@ -48,7 +48,7 @@ def test_type_hashes_are_those_of_every_release() -> None:
 
 @pytest.mark.parametrize("spec", ["ros2:x", "ros2:233", "ros2:-1"])
 def test_a_domain_is_a_number(spec: str) -> None:
-    with pytest.raises(UsageFailure):
+    with pytest.raises(UsageError):
         open_sink(spec)
 
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import Garbled
-from teds_provision.protocol.messages.frames import Refused
+from teds_provision.errors import GarbledError
+from teds_provision.protocol.messages.frames import CommandRefusedError
 from teds_provision.protocol.operation import budget
 from teds_provision.protocol.operation.can_frames import (
     DataAddress,
@@ -194,21 +194,21 @@ def test_samples_and_drive_values(tick: int, flags: int, data: bytes, until: int
 
 @given(st.binary(max_size=60))
 def test_no_octets_of_a_node_do_harm(octets: bytes) -> None:
-    """A reply is read or it is Garbled; nothing else comes out."""
+    """A reply is read or it is GarbledError; nothing else comes out."""
     for decode in (Subscribed.decode, Driven.decode, Clock.decode, OperationReply.decode, Power.decode, decode_stopped):
-        with contextlib.suppress(Garbled):
+        with contextlib.suppress(GarbledError):
             decode(octets)
     for width in (0, 1, 8):
-        with contextlib.suppress(Garbled):
+        with contextlib.suppress(GarbledError):
             Sampled.decode(octets, width)
-        with contextlib.suppress(Garbled):
+        with contextlib.suppress(GarbledError):
             assert len(decode_data_set(octets, width)) == width
 
 
 @given(st.binary(max_size=60))
 def test_no_octets_of_a_station_do_harm(octets: bytes) -> None:
     for decode in (Subscribe.decode, Arm.decode, lambda o: Operate.decode(1, o, actuator=True)):
-        with contextlib.suppress(Refused):
+        with contextlib.suppress(CommandRefusedError):
             decode(octets)
 
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from teds_provision.errors import Garbled, NotAuthentic
+from teds_provision.errors import GarbledError, NotAuthenticError
 from teds_provision.protocol.operation.commands import TEST_PATTERN
 from teds_provision.protocol.operation.datagram import MOST_OCTETS, DatagramSealer, Layout, drive_key, stream_key
 from teds_provision.protocol.operation.driving import Driver
@@ -185,17 +185,17 @@ def test_a_start_that_was_not_asked_is_reported(asked: int, start: int, good: bo
     if good:
         assert made.accept(reply, now).start == start
     else:
-        with pytest.raises(NotAuthentic, match="another time"):
+        with pytest.raises(NotAuthenticError, match="another time"):
             made.accept(reply, now)
 
 
 def test_a_length_that_was_not_computed_is_reported() -> None:
     made = plan()
-    with pytest.raises(NotAuthentic, match="18 octets a message; 17"):
+    with pytest.raises(NotAuthenticError, match="18 octets a message; 17"):
         made.accept(Subscribed(1, 18, START).encode(), LATER)
-    with pytest.raises(NotAuthentic, match="run 0"):
+    with pytest.raises(NotAuthenticError, match="run 0"):
         made.accept(Subscribed(0, 17, START).encode(), TickBounds(START, START))
-    with pytest.raises(Garbled):
+    with pytest.raises(GarbledError):
         made.accept(bytes(11), LATER)
 
 
@@ -204,10 +204,10 @@ def test_a_run_that_was_there_before_is_reported() -> None:
     made, now = plan(), TickBounds(START, START)
     assert made.accept(Subscribed(4, made.length, START).encode(), now, after=3).run == 4
     for run in (3, 2):
-        with pytest.raises(NotAuthentic, match=f"run {run} after run 3"):
+        with pytest.raises(NotAuthenticError, match=f"run {run} after run 3"):
             made.accept(Subscribed(run, made.length, START).encode(), now, after=3)
     layout = Layout((1,), (2,))
-    with pytest.raises(NotAuthentic, match="run 3 after run 3"):
+    with pytest.raises(NotAuthenticError, match="run 3 after run 3"):
         Driver(layout, Driven(3, 18), K_M, dead_man=100, after=3)
     assert Driver(layout, Driven(4, 18), K_M, dead_man=100, after=3).run == 4
 
@@ -233,9 +233,9 @@ def clock(received: int, sent: int) -> Clock:
 
 
 def test_a_clock_that_lies_is_caught() -> None:
-    with pytest.raises(NotAuthentic, match="lies"):
+    with pytest.raises(NotAuthenticError, match="lies"):
         ClockSample(0, 10 * MS, clock(5 * MS, 5 * MS - 1))
-    with pytest.raises(NotAuthentic, match="lies"):
+    with pytest.raises(NotAuthenticError, match="lies"):
         ClockSample(0, 10 * MS, clock(0, 10 * MS + 1))
     ClockSample(0, 10 * MS, clock(0, 10 * MS))
 
@@ -275,12 +275,12 @@ def test_a_drive_message_holds_no_longer_than_the_dead_man() -> None:
         assert plain is not None
         assert int.from_bytes(plain[:4], "big") == (START + until * MS) // 1000
     assert driver.next == 3
-    with pytest.raises(Garbled, match="widths"):
+    with pytest.raises(GarbledError, match="widths"):
         driver.seal((b"abc",), LATER)
     driver.next = 1 << 32
-    with pytest.raises(Garbled, match="used up"):
+    with pytest.raises(GarbledError, match="used up"):
         driver.seal((b"ab",), LATER)
-    with pytest.raises(NotAuthentic, match="19 octets; 18"):
+    with pytest.raises(NotAuthenticError, match="19 octets; 18"):
         Driver(Layout((4,), (2,)), Driven(3, 19), K_M, dead_man=50)
 
 

@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import VaultError
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.vault.pkcs11 import FILE_NAME, Pkcs11Vault
 from tests.vault.softhsm import PIN
@@ -20,7 +20,7 @@ CONTEXT = b"a node"
 def test_a_wrapped_key_opens_under_its_context_alone_and_in_a_new_process(vault, home, store_id, uri, uris):
     wrapped = vault.wrap(b"sixteen octets!!", context=CONTEXT)
     assert vault.unwrap(wrapped, context=CONTEXT) == b"sixteen octets!!"
-    with pytest.raises(VaultFailure, match="does not belong"):
+    with pytest.raises(VaultError, match="does not belong"):
         vault.unwrap(wrapped, context=b"another")
     code = (
         "import sys; from pathlib import Path; from teds_provision.vault.pkcs11 import Pkcs11Vault\n"
@@ -48,7 +48,7 @@ def test_every_changed_digit_of_the_file_is_noticed(vault, home, store_id, uri):
         if text[at] not in "0123456789abcdef":
             continue
         path.write_text(text[:at] + ("0" if text[at] != "0" else "1") + text[at + 1 :])
-        with pytest.raises(VaultFailure):
+        with pytest.raises(VaultError):
             Pkcs11Vault.open(home, store_id, uri, Person())
     path.write_text(text)
     assert Pkcs11Vault.open(home, store_id, uri, Person()).identity().point == vault.identity().point
@@ -64,7 +64,7 @@ def test_masters_that_someone_else_sealed_to_the_station_key_are_refused(vault, 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(type(forger.station), "sign", lambda _, message: outsider.sign(message))
         pkcs11._save(home, store_id, forger, replace=True)
-    with pytest.raises(VaultFailure, match="was changed"):
+    with pytest.raises(VaultError, match="was changed"):
         Pkcs11Vault.open(home, store_id, uri, Person())
 
 
@@ -72,16 +72,16 @@ def test_masters_that_someone_else_sealed_to_the_station_key_are_refused(vault, 
 def test_a_file_that_is_something_else_is_named_before_anyone_is_asked(home, store_id, uri, content):
     (home / FILE_NAME).write_text(content)
     person = Person()
-    with pytest.raises(VaultFailure, match=FILE_NAME):
+    with pytest.raises(VaultError, match=FILE_NAME):
         Pkcs11Vault.open(home, store_id, uri, person)
     assert not person.prompts
 
 
 def test_a_missing_file_and_one_of_another_store(vault, home, store_id, uri):
-    with pytest.raises(VaultFailure, match="another store"):
+    with pytest.raises(VaultError, match="another store"):
         Pkcs11Vault.open(home, STORE, uri, Person())
     (home / FILE_NAME).unlink()
-    with pytest.raises(VaultFailure, match="missing"):
+    with pytest.raises(VaultError, match="missing"):
         Pkcs11Vault.open(home, store_id, uri, Person())
 
 
@@ -94,7 +94,7 @@ def test_a_change_of_the_master_key(vault, home, store_id, uri):
     again.retire_masters()
     last = Pkcs11Vault.open(home, store_id, uri, Person())
     assert last.unwrap(after, context=CONTEXT) == b"k" * 16
-    with pytest.raises(VaultFailure, match="lacks"):
+    with pytest.raises(VaultError, match="lacks"):
         last.unwrap(before, context=CONTEXT)
 
 
@@ -104,10 +104,10 @@ def test_a_backup_opens_with_the_same_token_alone(vault, tmp_path, store_id, uri
         (tmp_path / name).mkdir()
     again = Pkcs11Vault.create(tmp_path / "again", store_id, uri, Person(), restored=backup)
     assert again.unwrap(wrapped, context=CONTEXT) == b"k" * 16
-    with pytest.raises(VaultFailure, match="does not hold the station key"):
+    with pytest.raises(VaultError, match="does not hold the station key"):
         Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uris["spare"], Person(), restored=backup)
     for damaged in ("", backup.replace('"nonce": "', '"nonce": "00'), backup.replace(store_id, STORE)):
-        with pytest.raises(VaultFailure):
+        with pytest.raises(VaultError):
             Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uri, Person(), restored=damaged)
     assert not (tmp_path / "elsewhere" / FILE_NAME).exists()
 
@@ -120,5 +120,5 @@ def test_a_backup_joins_what_is_there_and_another_stations_does_not(vault, home,
     assert again.unwrap(wrapped, context=CONTEXT) == b"k" * 16
     (tmp_path / "other").mkdir()
     other = Pkcs11Vault.create(tmp_path / "other", store_id, uri.replace("?", ";id=%09?"), Person())
-    with pytest.raises(VaultFailure, match="another station"):
+    with pytest.raises(VaultError, match="another station"):
         Pkcs11Vault.create(home, store_id, uri, Person(), restored=other.secret_material())

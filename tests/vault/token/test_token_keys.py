@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import BadData, VaultFailure
+from teds_provision.errors import BadDataError, VaultError
 from teds_provision.protocol.agreement import Credentials, NodeAgreement, StationAgreement
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, verify
 
@@ -36,7 +36,7 @@ def test_ecdh_gives_the_whole_x_coordinate_as_software_does(vault):
 
 @pytest.mark.parametrize("point", [b"", b"\x04" + bytes(64), b"\x04" + b"\1" * 64, b"\x02" + bytes(32)])
 def test_a_point_off_the_curve_never_reaches_the_token(vault, point):
-    with pytest.raises(BadData):
+    with pytest.raises(BadDataError):
         vault.identity().ecdh(point)
 
 
@@ -54,7 +54,7 @@ def test_the_keys_cannot_leave_the_token(vault, tmp_path):
         assert inside[Attribute.LOCAL]
         with pytest.raises(AttributeSensitive):
             inside[Attribute.VALUE]
-    with pytest.raises(VaultFailure, match="cannot leave"):
+    with pytest.raises(VaultError, match="cannot leave"):
         vault.export_ca(tmp_path / "ca.pem", "a passphrase")
     assert not (tmp_path / "ca.pem").exists()
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import VaultError
 from teds_provision.protocol.keys import verify
 from teds_provision.vault import create_vault, forget_vaults, open_vault
 from teds_provision.vault.pkcs11 import FILE_NAME, Pkcs11Vault
@@ -109,7 +109,7 @@ def test_a_key_that_may_leave_the_token_is_not_used(home, store_id, uri, vault):
     private = {Attribute.SENSITIVE: False, Attribute.EXTRACTABLE: True}
     curve.generate_keypair(label="loose", id=b"loose", private_template=private)
     (home / "b").mkdir()
-    with pytest.raises(VaultFailure, match="can leave the token"):
+    with pytest.raises(VaultError, match="can leave the token"):
         Pkcs11Vault.create(home / "b", store_id, uri.replace("?", ";object=loose?"), Person())
 
 
@@ -122,7 +122,7 @@ def test_a_key_of_another_curve_is_not_used(vault, home, store_id, uri):
     )
     curve.generate_keypair(label="wide", id=b"wide")
     (home / "b").mkdir()
-    with pytest.raises(VaultFailure, match=r"may leave|not a P-256"):
+    with pytest.raises(VaultError, match=r"may leave|not a P-256"):
         Pkcs11Vault.create(home / "b", store_id, uri.replace("?", ";object=wide?"), Person())
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, NotFound, StoreLocked
+from teds_provision.errors import BadDataError, NotFoundError, StoreLockedError
 from teds_provision.files import SHARED, new_file, require_new
 from teds_provision.measure.sinks.base import as_sink_failure
 from teds_provision.measure.sinks.mcap.writer import (
@@ -80,8 +80,9 @@ class Recovered:
 def recover(path: Path, output: Path | None = None) -> Recovered:
     """Make an MCAP whole: a torn end in place, or all but what is damaged inside as ``output`` (``FILE.recovered``).
 
-    With ``output`` the file itself is never changed. Killed at any instant it can be run again. Raises NotFound,
-    StoreLocked (its recorder still writes), UsageFailure (``output`` exists), BadData (no MCAP), StoreFailure (disk).
+    With ``output`` the file itself is never changed. Killed at any instant it can be run again. Raises NotFoundError,
+    StoreLockedError (its recorder still writes), UsageError (``output`` exists), BadDataError (no MCAP), StoreError
+    (disk).
     """
     if output is not None:
         require_new(output)
@@ -91,9 +92,9 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
             scan.walk()
             return _finished(scan, file, path, output)
     except FileNotFoundError:
-        raise NotFound(f"There is no file {path}.", hint="Give the recording that was cut off.") from None
+        raise NotFoundError(f"There is no file {path}.", hint="Give the recording that was cut off.") from None
     except IsADirectoryError:
-        raise NotFound(f"{path} is a folder, not a file.", hint="Give one recording in it.") from None
+        raise NotFoundError(f"{path} is a folder, not a file.", hint="Give one recording in it.") from None
     except OSError as error:
         raise as_sink_failure(error, str(path)) from error
 
@@ -111,7 +112,7 @@ def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise StoreLocked(
+            raise StoreLockedError(
                 f"{path} is being recorded right now.", hint="End that measurement, or wait until it is over."
             ) from None
         except OSError:  # a file system without locks
@@ -122,8 +123,8 @@ def _map_alone(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
         os.close(file)
 
 
-def _no_mcap(path: Path) -> BadData:
-    return BadData(f"{path} is not an MCAP file.", hint="Text and JSON-line recordings need no recovery.")
+def _no_mcap(path: Path) -> BadDataError:
+    return BadDataError(f"{path} is not an MCAP file.", hint="Text and JSON-line recordings need no recovery.")
 
 
 def _finished(scan: _Scan, file: int, path: Path, output: Path | None) -> Recovered:
@@ -146,7 +147,7 @@ def _end_in_place(scan: _Scan, summary: McapSummary, file: int, path: Path) -> N
     """Cut the torn end off and write the one that belongs there; cut off itself, it leaves a torn end again."""
     with path.open("r+b") as same:
         if not os.path.samestat(os.fstat(file), os.fstat(same.fileno())):
-            raise BadData(f"{path} was replaced in the meantime.", hint="Run the same command again.")
+            raise BadDataError(f"{path} was replaced in the meantime.", hint="Run the same command again.")
         same.seek(scan.end)
         same.truncate()
         indexes = scan.end_indexes
@@ -512,7 +513,7 @@ def unpacked(content: bytes, path: Path, most: int = LARGEST_RECORD) -> tuple[by
     elif compression == b"":
         body = packed
     elif compression == b"lz4":
-        raise BadData(f"A chunk of {path} is compressed with lz4, which is not supported.")
+        raise BadDataError(f"A chunk of {path} is compressed with lz4, which is not supported.")
     else:
         return None
     return body, len(body) == size and (not checksum or zlib.crc32(body) == checksum)

@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
@@ -46,10 +46,10 @@ _domains: dict[int, Any] = {}  # a domain is configured once in a process
 
 
 def domain_of(spec: str) -> int:
-    """The domain of ``ros2`` or ``ros2:DOMAIN``, else ROS_DOMAIN_ID's, else 0; raises UsageFailure."""
+    """The domain of ``ros2`` or ``ros2:DOMAIN``, else ROS_DOMAIN_ID's, else 0; raises UsageError."""
     domain = spec.partition(":")[2] or os.environ.get("ROS_DOMAIN_ID", "0")
     if not domain.isdecimal() or int(domain) > 232:
-        raise UsageFailure(f"{domain!r} is no ROS 2 domain.", hint="Name a number from 0 to 232: ros2:7")
+        raise UsageError(f"{domain!r} is no ROS 2 domain.", hint="Name a number from 0 to 232: ros2:7")
     return int(domain)
 
 

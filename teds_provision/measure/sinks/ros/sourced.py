@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import UsageError
 from teds_provision.measure.sinks.base import CommandTaker, Sink
 from teds_provision.measure.sinks.ros import child, rclpy_child
 from teds_provision.measure.sinks.ros.child import ChildSink
@@ -34,7 +34,7 @@ _REACH: Final = frozenset(
 
 
 def ros2_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
-    """The sink of ``ros2`` or ``ros2:DOMAIN``: by an rclpy, else by Cyclone DDS. Raises UsageFailure."""
+    """The sink of ``ros2`` or ``ros2:DOMAIN``: by an rclpy, else by Cyclone DDS. Raises UsageError."""
     domain = domain_of(spec)
     sourced = os.environ.get("AMENT_PREFIX_PATH", "")
     if sourced and (python := _python(sourced, os.environ.get("PYTHONPATH", ""))) is not None:
@@ -57,7 +57,7 @@ def _python(_sourced: str, _paths: str) -> str | None:
 @functools.cache
 def _require_rclpy(python: str) -> None:
     if not child.imports(python, NEEDS, child.environment(sourced=False)):
-        raise UsageFailure(
+        raise UsageError(
             f"{python} cannot import rclpy and its messages.",
             hint="Install what docs/ros.md lists: ros-jazzy-rclpy[fastrtps] and four packages of messages.",
         )
