@@ -26,7 +26,7 @@ from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import call
@@ -67,7 +67,7 @@ def provision_one(station: Station, calls: Counter[str]) -> None:
             try:
                 found = port.find(lambda identity: identity.uuid == uuid, seconds=20, notice=_quiet)
                 with Conversation(found, notice=_quiet) as node:
-                    done = provision(station, node, order, accept=lambda who: None, reporter=Silent())
+                    done = provision(station, node, order, accept=lambda who: None, reporter=SilentReporter())
             finally:
                 port.close()
     assert done.verified.verdict == "authentic"

@@ -24,13 +24,13 @@ from pathlib import Path
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from jwcrypto import jwe, jwk, jws
 
-from teds_provision.handover.incoming import Imported, import_bundle, plan_import
+from teds_provision.handover.incoming import ImportResult, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
-from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, open_bundle, payload_of
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.station.station import Station, initialise
 from teds_provision.store import NodeRecord, TrustRecord, WhitelistEntry
 from teds_provision.vault import passphrase
@@ -161,13 +161,13 @@ def main(count: int = 10_000) -> None:
             order = ExportOrder((south.name,), None, "copy")
             exports.append(timed(partial(_export, north, order, bundle))[0])
 
-            def take(station: Station = south, path: Path = bundle) -> Imported:
+            def take(station: Station = south, path: Path = bundle) -> ImportResult:
                 plan = plan_import(station, path.read_bytes())
-                assert not isinstance(plan, Imported)
+                assert not isinstance(plan, ImportResult)
                 return import_bundle(station, plan)
 
             seconds, done = timed(take)
-            assert isinstance(done, Imported)
+            assert isinstance(done, ImportResult)
             assert len(done.uuids) == count
             imports.append(seconds)
         octets = bundle.read_bytes()

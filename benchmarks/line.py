@@ -32,7 +32,7 @@ from teds_provision.protocol.plant.evidence import EvidenceClaim, seal
 from teds_provision.protocol.plant.signing import SignRequest, challenge, seal_request
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from tests.bench import Board, talk
@@ -145,7 +145,7 @@ def boards(folder: Path, count: int) -> tuple[float, float]:
             used = time.process_time()
             with talk(board) as node:
                 station, order = (plain, alike) if hook is None else (line, hook.order)
-                provision(station, node, order, accept=lambda who: None, reporter=Silent(), line=hook)
+                provision(station, node, order, accept=lambda who: None, reporter=SilentReporter(), line=hook)
             spent[place] += time.process_time() - used
     plain.close()
     line.close()

@@ -68,7 +68,7 @@ def plant_of_two(folder: Path, server: Cluster) -> Iterator[tuple[Path, Path, Pa
         requests[station.name] = request = open_request(plant.membership.request(station))
         server.psql(plant.schema.member_sql(request.fingerprint, request.login), _DATABASE)
     added = plant.owner.add(office, requests["line"], frozenset({"line"}))
-    plant.folding.put_roster(office, plant.owner.signed(office, added))
+    plant.apply_pages.put_roster(office, plant.owner.signed(office, added))
     office.close()
     line.close()
     forget_vaults()

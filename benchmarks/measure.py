@@ -22,12 +22,12 @@ from collections.abc import Callable
 import numpy as np
 
 from teds_provision.measure.blocks import Block
-from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone
-from teds_provision.measure.hearing import HeardStream
+from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps
 from teds_provision.measure.interpreter import StreamInterpreter
+from teds_provision.measure.stream_receiver import ReceivedStream
 from teds_provision.protocol.operation.can_frames import StreamAssembly
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
-from teds_provision.protocol.operation.stream_commands import Subscribed
+from teds_provision.protocol.operation.stream_commands import SubscribeReply
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.image import Image
@@ -62,10 +62,10 @@ class Stream:
         self.base = time.monotonic_ns() - 100 * SECOND
         clock.exchange(Exchange(self.base, self.base + 2000, 500, 1500, 1, 20))
         self.blocks: list[Block] = []
-        interpreter = StreamInterpreter(known, self.plan, 1, clock, HostClock(), Monotone())
-        receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
+        interpreter = StreamInterpreter(known, self.plan, 1, clock, HostClock(), MonotonicStamps())
+        receiver = Receiver(self.plan, SubscribeReply(1, self.plan.length, SECOND), KEY)
         assembly = StreamAssembly(self.plan.length, fd=True)
-        self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
+        self.heard = ReceivedStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
 
     def run(self, together: int) -> float:
         """CPU seconds for all messages, so many at a time."""

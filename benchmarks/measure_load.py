@@ -31,16 +31,16 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.ports import free_port
 from teds_provision.measure.blocks import Block, StationFacts
-from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone
+from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps
 from teds_provision.measure.grid import Grid
-from teds_provision.measure.hearing import CanHearing, HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.runner import BEAT
 from teds_provision.measure.sinks import Sink, open_sink
-from teds_provision.measure.trusting import facts_of
+from teds_provision.measure.stream_receiver import CanStreamReceiver, ReceivedStream
+from teds_provision.measure.verified_session import facts_of
 from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
-from teds_provision.protocol.operation.stream_commands import Subscribed
+from teds_provision.protocol.operation.stream_commands import SubscribeReply
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration.files import read_calibrations
 from teds_provision.teds.image import Image
@@ -181,7 +181,7 @@ class Machine:
 
     def __init__(self, nodes: int, began: int, sinks: list[Sink], load: Load) -> None:
         self.load, self._sinks = load, sinks
-        self.heard: dict[tuple[int, int], HeardStream] = {}
+        self.heard: dict[tuple[int, int], ReceivedStream] = {}
         self._for_grid: deque[Block] = deque()
         self._host = HostClock()
         self._since = {}
@@ -203,11 +203,11 @@ class Machine:
         for sink in sinks:
             sink.open(facts, StationFacts("bench", "all", scalar_rate=0.0))
 
-    def _stream(self, sheet: Sheet, stream: int, clock: ClockMap) -> HeardStream:
+    def _stream(self, sheet: Sheet, stream: int, clock: ClockMap) -> ReceivedStream:
         plan = plan_of(stream)
-        receiver = Receiver(plan, Subscribed(1, plan.length, SECOND), KEY)
-        interpreter = StreamInterpreter(sheet, plan, 1, clock, self._host, Monotone())
-        return HeardStream(
+        receiver = Receiver(plan, SubscribeReply(1, plan.length, SECOND), KEY)
+        interpreter = StreamInterpreter(sheet, plan, 1, clock, self._host, MonotonicStamps())
+        return ReceivedStream(
             receiver, StreamAssembly(plan.length, fd=True), interpreter, clock, threading.Lock(), self._block
         )
 
@@ -239,7 +239,7 @@ def run(nodes: int, seconds: float, folder: Path, targets: Sequence[str] = TARGE
     began, messages = time.monotonic_ns() + 8 * SECOND, int(seconds * RATE / N)
     machine = Machine(nodes, began, sinks, load)
     ports = [CanPort(spec) for spec in specs]
-    hearings = [CanHearing(port) for port in ports]
+    hearings = [CanStreamReceiver(port) for port in ports]
     for (node, stream), heard in machine.heard.items():
         hearings[node % len(hearings)].register(node_address(node), stream, heard)
     words = [sys.executable, "-m", "benchmarks.measure_load", "--feed", *specs, "--began", str(began)]

@@ -31,9 +31,9 @@ from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.measurement_job import MeasurementJob
 from teds_provision.node.can.server import CanServer
-from teds_provision.node.described import create
 from teds_provision.node.hardware.board import Board
-from teds_provision.node.pulse import Pulse
+from teds_provision.node.node_template import create
+from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.station.station import Station, initialise
@@ -41,7 +41,7 @@ from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
 from teds_provision.store import KeptMeasurement
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 from teds_provision.vault import passphrase
@@ -60,13 +60,13 @@ def provisioned(station: Station, folder: Path, name: str) -> bytes:
     (folder / "calibration.csv").write_text(CALIBRATION)
     order = BuildOrder(TYPE, calibration=folder / "calibration.csv", name=name)
     with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
-        provision(station, talk, order, accept=lambda _who: None, reporter=Silent())
+        provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter())
     return node.tim.flash.uuid
 
 
 def serve(can: str, folders: Sequence[str]) -> None:
     """The nodes' process: prints, for each, the host's time at which its clock stood at 0."""
-    pulse, server = Pulse(), CanServer(can)
+    pulse, server = RealtimeLoop(), CanServer(can)
     boards: dict[str, Board] = {}
     for folder in folders:
         node = VirtualNode(

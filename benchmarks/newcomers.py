@@ -36,18 +36,18 @@ from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.pacing import classic_bits, fd_seconds
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.ports import free_port
-from teds_provision.node.can.seat import Seat
+from teds_provision.node.can.endpoint import CanEndpoint
 from teds_provision.node.can.server import CanServer
-from teds_provision.node.described import create
 from teds_provision.node.hardware.board import Board
-from teds_provision.node.pulse import Pulse
+from teds_provision.node.node_template import create
+from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.announce import LAST_ADDRESS, default_can_address, is_announce
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 from teds_provision.vault import forget_vaults, passphrase
@@ -68,7 +68,7 @@ class Announcing(CanServer):
 
     first = math.inf
 
-    def _out(self, seat: Seat, frame: Frame) -> None:
+    def _out(self, seat: CanEndpoint, frame: Frame) -> None:
         if is_announce(frame.identifier):
             self.first = min(self.first, time.monotonic())
         super()._out(seat, frame)
@@ -78,7 +78,7 @@ class Power:
     """The nodes of a folder, each by its name."""
 
     def __init__(self, link: str, folder: Path) -> None:
-        self._link, self._folder, self._pulse = link, folder, Pulse()
+        self._link, self._folder, self._pulse = link, folder, RealtimeLoop()
         self._on: dict[str, tuple[Announcing, VirtualNode]] = {}
         self._missed = 0
         self._pulse.start()
@@ -250,7 +250,7 @@ def made(station: Station, folder: Path, count: int) -> dict[str, bytes]:
         node = VirtualNode(folder / name)
         order = BuildOrder(TYPE, calibration=folder / "calibration.csv", name=name)
         with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
-            provision(station, talk, order, accept=lambda _who: None, reporter=Silent())
+            provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter())
         found[name] = uuid
     return found
 

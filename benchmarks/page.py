@@ -17,7 +17,7 @@ from playwright.sync_api import sync_playwright
 
 from teds_provision import client
 from teds_provision.measure.blocks import Block
-from teds_provision.ncap.past import HOUR, Past
+from teds_provision.ncap.history import HOUR, History
 from tests.page.lab import QUIET, Lab, chromium, opened
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def resident() -> int:
 
 def ring(channels: int) -> int:
     """Octets that the past of so many channels takes, each of a stream of its own, an hour of it filled."""
-    before, past, now = resident(), Past(), float(int(time.time()))
+    before, past, now = resident(), History(), float(int(time.time()))
     at = np.concatenate([now - HOUR + np.arange(HOUR), now + np.arange(6000) / 100])
     ticks = np.arange(len(at), dtype=np.uint64)
     value = np.sin(at)[:, None]

@@ -25,7 +25,7 @@ from typing import Any
 from teds_provision.demo import cluster
 from teds_provision.links.ports import free_port
 from teds_provision.plant import postgres, schema, scram
-from teds_provision.plant.files import FilesPost
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.plant import event
@@ -34,7 +34,7 @@ from teds_provision.protocol.plant.page import PageDraft, seal_page
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, make_station, talk
 from tests.plant.owner import ANGLE, alone
 from tests.plant.stations import Plant, ask
@@ -130,7 +130,7 @@ def _local(boards: int) -> None:
                 board = Board(uuid=(1 + number).to_bytes(10, "big"))
                 wall, used = time.perf_counter(), time.process_time()
                 with talk(board) as node:
-                    provision(stations[place], node, orders[place], accept=lambda who: None, reporter=Silent())
+                    provision(stations[place], node, orders[place], accept=lambda who: None, reporter=SilentReporter())
                 spent.append((time.perf_counter() - wall, time.process_time() - used, place))
         for column, what in enumerate(("by the clock", "of the processor")):
             without, beside = ([each[column] for each in spent if each[2] == place] for place in (0, 1))
@@ -145,7 +145,7 @@ def _history(nodes: int) -> None:
     with tempfile.TemporaryDirectory(prefix="plant-history-") as folder:
         made = Plant(Path(folder))
         west, _ = made.member("west", "line", "sign"), made.member("south", "base")
-        stick, key, place = FilesPost(made.stick), west.vault.identity(), (0, "")
+        stick, key, place = FolderTransport(made.stick), west.vault.identity(), (0, "")
         made.sync(made.north)
         for _ in range(0, nodes, 250):
             told = [one for _ in range(250) for one in _told_of(os.urandom(10))]
@@ -178,7 +178,7 @@ def _take_in(folder: Path) -> None:
     south = Station.open(folder / "south", ask=ask)
     south.unlock()
     before, cpu, began = _peak(), time.process_time(), time.monotonic()
-    done = sync(south, FilesPost(folder / "stick"))
+    done = sync(south, FolderTransport(folder / "stick"))
     spent, took = time.process_time() - cpu, time.monotonic() - began
     store = sum(path.stat().st_size for path in (folder / "south").rglob("*") if path.is_file())
     south.close()

@@ -41,7 +41,7 @@ from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.provision import provision
 from teds_provision.store.database import Database
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.vault.passphrase import THROWAWAY
 
 PROFILE = "magnetic-angular-position-sensor"
@@ -280,7 +280,7 @@ def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
                 timed = Timed(contact.link)
                 known = Contact(contact.identity, timed, contact.tag_uid, contact.address)
                 with Conversation(known, notice=_quiet) as node:
-                    done = provision(station, node, order, accept=lambda who: None, reporter=Silent())
+                    done = provision(station, node, order, accept=lambda who: None, reporter=SilentReporter())
                 ended = time.perf_counter()
                 good = done.verified.verdict == "authentic"
                 limit = _least(line, timed.sizes)

@@ -26,7 +26,7 @@ from typing import Any
 
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise
-from teds_provision.store import Batch, KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.store import BulkRows, KeyRecord, NodeRecord, WhitelistEntry, utc_now
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.vault import forget_vaults, node_key_context, passphrase
@@ -71,7 +71,7 @@ def fill(home: Path, count: int) -> None:
         entries = [WhitelistEntry(_uuid(n), fingerprint(points[n % 97]), name=f"node-{n}") for n in numbers]
         with station.transaction():
             station.handovers.take_in(
-                Batch(
+                BulkRows(
                     nodes=[_node(number, points) for number in numbers],
                     whitelist=entries,
                     keys=[_key(station, number) for number in numbers],

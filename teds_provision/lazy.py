@@ -51,7 +51,7 @@ def lazy(package: str, names: Mapping[str, str] = _NOTHING) -> Callable[[str], o
     return load
 
 
-class _Late:
+class _LateModule:
     """Stands for a module until something of it is asked for; keeps what was asked for."""
 
     def __init__(self, module: str) -> None:
@@ -68,7 +68,7 @@ def late(module: str) -> object:
 
     For type checkers: ``if TYPE_CHECKING: import numpy as np``, ``else: np = late("numpy")``.
     """
-    return _Late(module)
+    return _LateModule(module)
 
 
 if TYPE_CHECKING:

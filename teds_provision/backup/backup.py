@@ -21,7 +21,7 @@ from teds_provision.vault.passphrase import PRODUCT, Costs
 
 
 @dataclass(frozen=True)
-class BackedUp:
+class BackupResult:
     """What was written: size and digest of the file, how much stands in it, and what to know of it."""
 
     octets: int
@@ -40,7 +40,7 @@ def backup(
     recovery: bytes | None = None,
     costs: Costs = PRODUCT,
     notice: Callable[[str], object] | None = None,
-) -> BackedUp:
+) -> BackupResult:
     """Write a sealed copy of the station to ``path`` (mode 0600, whole or not at all; an old file is replaced).
 
     ``recovery`` is the point of a recovery key, else ``ask`` gives a new passphrase. The store may be in use meanwhile;
@@ -70,7 +70,7 @@ def backup(
         raise VaultError(
             f"{path} cannot be written: {error.strerror}.", hint="Fix that and run the same command again."
         ) from error
-    return BackedUp(octets, digest, nodes, keys, to, tuple(warnings))
+    return BackupResult(octets, digest, nodes, keys, to, tuple(warnings))
 
 
 def _write(station: Station, vault: Vault, file: BinaryIO, sealer: Sealer) -> bytes:

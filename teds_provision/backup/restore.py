@@ -33,7 +33,7 @@ from teds_provision.vault.passphrase import PRODUCT, Costs
 
 
 @dataclass(frozen=True)
-class Restored:
+class RestoreResult:
     """What was done (or would be): ``rebuilt``, ``merged`` or ``nothing``; how much came back, and what stayed.
 
     ``rotations_due`` counts the nodes whose key must be rotated by tap, or by a person's word, before anything else.
@@ -80,7 +80,9 @@ def open_present(home: Path, content: Content) -> Store | None:
     return store
 
 
-def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = None, costs: Costs = PRODUCT) -> Restored:
+def rebuild(
+    home: Path, content: Content, ask: Ask, *, keystore: str | None = None, costs: Costs = PRODUCT
+) -> RestoreResult:
     """Make the station of a backup in a home without a usable store; a damaged one is kept under another name.
 
     ``keystore`` as for init; None takes the kind that the station had, or a passphrase file where the keyring does not
@@ -96,7 +98,7 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
     except OSError as error:
         raise StoreError(f"{home} cannot be made: {error.strerror}.", hint="Choose another --home.") from error
 
-    def make(known: Ask) -> Restored:
+    def make(known: Ask) -> RestoreResult:
         with StoreLock(home, command="restore"):
             if (present := open_present(home, content)) is not None:  # the person was told of a home without one
                 present.close()
@@ -123,7 +125,7 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
             place(copy, home)
             if copy.plant() is not None:
                 new_home(home)
-        return Restored("rebuilt", None, totals(copy), (), kind, aside, due)
+        return RestoreResult("rebuilt", None, totals(copy), (), kind, aside, due)
 
     return asked_first(ask, make)
 
@@ -212,7 +214,7 @@ def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | 
     return vault
 
 
-def merge_checked(store: Store, content: Content, vault: Vault, ask: Ask) -> Restored:
+def merge_checked(store: Store, content: Content, vault: Vault, ask: Ask) -> RestoreResult:
     """Merge into a store whose own key and CA are as this station sealed them.
 
     Raises StoreChangedError, and as merge().
@@ -222,7 +224,7 @@ def merge_checked(store: Store, content: Content, vault: Vault, ask: Ask) -> Res
         return merge(store, content, dry_run=False)
 
 
-def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
+def merge(store: Store, content: Content, *, dry_run: bool) -> RestoreResult:
     """Bring back into a living store what it lacks, in one transaction; ``dry_run`` tries it out and changes nothing.
 
     Raises NotAuthenticError, BadDataError, StoreError.
@@ -244,7 +246,7 @@ def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
         pass
     action = "merged" if back else "nothing"
     facts = store.facts()
-    return Restored(action, how, back, tuple(work.told()), facts.keystore if facts is not None else "")
+    return RestoreResult(action, how, back, tuple(work.told()), facts.keystore if facts is not None else "")
 
 
 def _check_inside(copy: Store, content: Content) -> None:

@@ -4,11 +4,11 @@
 ``rule``        what a rule is, when it can be run, the register, and how one ends
 ``probe``       the board as the rules see it: frames out, replies in, a record of both
 ``slips``       what firmware authors do in place of the right thing, tried until one fits
-``plain``       rules for any state, and those about the TEDS of a node
+``plain_rules``       rules for any state, and those about the TEDS of a node
 ``link_rules``  rules of the link's own frames
-``agreement``   rules of factory state, of a node with a key, and of the key agreement; the test agreement
-``sessions``    Open, Sealed, Close; several stations; repetition; the CAN address
-``writing``     Write, Update, the commit, Reset
+``agreement_rules``   rules of factory state, of a node with a key, and of the key agreement; the test agreement
+``session_rules``    Open, Sealed, Close; several stations; repetition; the CAN address
+``write_rules``     Write, Update, the commit, Reset
 ``run``         which rules are run when, and what is made durable
 ==============  =======================================================================================
 """
@@ -18,6 +18,16 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.check import agreement, link_rules, plain, probe, rule, run, sessions, slips, writing
+    from teds_provision.check import (
+        agreement_rules,
+        link_rules,
+        plain_rules,
+        probe,
+        rule,
+        run,
+        session_rules,
+        slips,
+        write_rules,
+    )
 else:
     __getattr__ = lazy(__name__)

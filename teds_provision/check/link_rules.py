@@ -8,7 +8,7 @@ from typing import Final
 from teds_provision.check.probe import HeardFrame, NotApplicableError, Probe, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.links.can.isotp import OVERFLOW, addresses, gap_seconds, read_single
-from teds_provision.links.ports import Announces, OnABus
+from teds_provision.links.ports import AnnouncingLink, MultiStationLink
 from teds_provision.protocol.messages.frames import Reason, refusal, write_teds
 from teds_provision.teds.image import SECURITY
 
@@ -83,7 +83,7 @@ def can_flow_control(probe: Probe) -> str:
 def can_busy(probe: Probe) -> str:
     """Beside another station's long request a first frame gets a flow control, or a single frame with refusal 17."""
     other = probe.beside(1).line
-    assert isinstance(other, OnABus)
+    assert isinstance(other, MultiStationLink)
     first = probe.bus.begin(_HALF_SENT)
     holds(
         first[:1] == b"\x30",
@@ -115,7 +115,7 @@ def can_form(probe: Probe) -> str:
 def nfc_wait_time(probe: Probe) -> str:
     """The service record announces a WT_INT that is a multiple of 4."""
     link = probe.contact.link
-    if not isinstance(link, Announces):
+    if not isinstance(link, AnnouncingLink):
         raise NotApplicableError("A rule of NFC; try it there.")
     wt_int = link.announced["WT_INT"]
     holds(wt_int % 4 == 0, f"WT_INT is {wt_int}: implementations round what is no multiple of 4 differently.")

@@ -11,8 +11,7 @@ from teds_provision.check import slips
 from teds_provision.check.slips import Slip
 from teds_provision.errors import BadDataError, GarbledError, MessageTooLongError, NodeSilentError, NotAuthenticError
 from teds_provision.links import Contact
-from teds_provision.links.ports import Direction, Link, OnABus, Trace
-from teds_provision.protocol.agreement import AgreedKey, Credentials
+from teds_provision.links.ports import Direction, Link, MultiStationLink, Trace
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import (
@@ -29,6 +28,7 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.messages.tables import describe_answer, describe_command, describe_reply
 from teds_provision.protocol.session import StationSession
+from teds_provision.protocol.wire_agreement import AgreedKey, Credentials
 from teds_provision.talk.conversation import BUSY_PAUSE, BUSY_SECONDS
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
@@ -182,10 +182,10 @@ class Probe:
         time.sleep(seconds)
 
     @property
-    def bus(self) -> OnABus:
+    def bus(self) -> MultiStationLink:
         """The node's line where it is one of a bus; raises NotApplicableError elsewhere."""
         link = self.contact.link
-        if not isinstance(link, OnABus):
+        if not isinstance(link, MultiStationLink):
             raise NotApplicableError("Needs a bus, where a second station can ask: try it over CAN.")
         return link
 
@@ -210,7 +210,7 @@ class Probe:
     def move(self, address: int) -> None:
         """Ask the node at another CAN address from now on."""
         self.moved_at = self.now()
-        if isinstance(self.contact.link, OnABus):
+        if isinstance(self.contact.link, MultiStationLink):
             self.contact.link.address = address
             self.contact = replace(self.contact, address=address)
 

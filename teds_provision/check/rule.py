@@ -44,7 +44,7 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class Checked:
+class RuleResult:
     """How one rule ended; ``detail`` is what was sent and seen, or why it was skipped. Never holds a key.
 
     ``slip`` is the name of the known slip that would explain it, None where none does.

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from teds_provision.check import agreement, link_rules, plain, sessions, writing
-from teds_provision.check.agreement import Explained, explain
+from teds_provision.check import agreement_rules, link_rules, plain_rules, session_rules, write_rules
+from teds_provision.check.agreement_rules import ExplainedRequest, explain
 from teds_provision.check.probe import NotApplicableError, Probe, RuleBrokenError, TraceRecorder
-from teds_provision.check.rule import RULES, Checked, Rule, Stage
+from teds_provision.check.rule import RULES, Rule, RuleResult, Stage
 from teds_provision.errors import BadDataError, GarbledError, LinkError, NotAuthenticError, PolicyError
 from teds_provision.links import LinkSettings
-from teds_provision.protocol.agreement import AgreedKey, key_id
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.wire_agreement import AgreedKey, key_id
 from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.agree import open_session, reset_node
 from teds_provision.steps.identify import examine
@@ -21,7 +21,7 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
 
-_REGISTERS = (plain, link_rules, agreement, sessions, writing)
+_REGISTERS = (plain_rules, link_rules, agreement_rules, session_rules, write_rules)
 """The modules whose rules are registered by being imported."""
 _ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset and keyed anew."
 _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
@@ -42,9 +42,9 @@ class CheckReport:
     """
 
     uuid: bytes
-    checks: tuple[Checked, ...]
+    checks: tuple[RuleResult, ...]
     lost: LinkError | None = None
-    explained: Explained | str | None = None
+    explained: ExplainedRequest | str | None = None
 
     def count(self, result: str) -> int:
         """How many rules ended so."""
@@ -88,8 +88,8 @@ class _Run:
     ) -> None:
         self._station, self._node, self._factory = station, node, factory
         self._probe = Probe(node.contact, heard)
-        self._checks: dict[str, Checked] = {}
-        self._explaining, self._explained = explained, None  # type: bool, Explained | str | None
+        self._checks: dict[str, RuleResult] = {}
+        self._explaining, self._explained = explained, None  # type: bool, ExplainedRequest | str | None
         self._lost: LinkError | None = None
 
     def all(self) -> CheckReport:
@@ -152,9 +152,9 @@ class _Run:
     def _skip(self, stage: Stage, why: str) -> None:
         for each in RULES:
             if each.stage == stage and each.name not in self._checks:
-                self._checks[each.name] = Checked(each.name, each.clause, "skipped", why)
+                self._checks[each.name] = RuleResult(each.name, each.clause, "skipped", why)
 
-    def _try(self, each: Rule) -> Checked:
+    def _try(self, each: Rule) -> RuleResult:
         for left in reversed(range(_TORN_TRIES)):
             try:
                 return self._tried(each)
@@ -164,27 +164,27 @@ class _Run:
                     self._probe.listen()  # a node that answers nothing else either is lost, not wrong in this
         also = " Identify was answered meanwhile: it is the node, or a very bad bus." if self._probe.noisy else ""
         text = f"{self._probe.asked}: no reply that can be read, {_TORN_TRIES} times.{also} {why}"
-        return Checked(each.name, each.clause, "failed", text)
+        return RuleResult(each.name, each.clause, "failed", text)
 
-    def _tried(self, each: Rule) -> Checked:
+    def _tried(self, each: Rule) -> RuleResult:
         slip = None
         try:
-            return Checked(each.name, each.clause, "passed", each.run(self._probe))
+            return RuleResult(each.name, each.clause, "passed", each.run(self._probe))
         except NotApplicableError as skip:
             self._probe.session = None
-            return Checked(each.name, each.clause, "skipped", str(skip))
+            return RuleResult(each.name, each.clause, "skipped", str(skip))
         except RuleBrokenError as broken:
             detail, slip = str(broken), broken.slip
         except GarbledError:
             raise
         except LinkError as lost:
             detail = f"{self._probe.asked}: {lost.message}"
-            self._checks[each.name] = Checked(each.name, each.clause, "skipped", detail)
+            self._checks[each.name] = RuleResult(each.name, each.clause, "skipped", detail)
             raise type(lost)(f"The node fell silent in the rule {each.name}: {detail}", hint=lost.hint) from lost
         except (BadDataError, NotAuthenticError, PolicyError) as wrong:
             detail = wrong.message
         self._probe.session = None
-        return Checked(each.name, each.clause, "failed", detail, slip.name if slip is not None else None)
+        return RuleResult(each.name, each.clause, "failed", detail, slip.name if slip is not None else None)
 
     # -- keys ------------------------------------------------------------------------------------------------------
 
@@ -218,7 +218,7 @@ class _Run:
             reset_node(self._station, self._node, examine(self._station, self._node))
         except (BadDataError, NotAuthenticError, PolicyError) as no:
             (rule,) = [each for each in RULES if each.name == "reset"]
-            self._checks["reset"] = Checked("reset", rule.clause, "failed", no.message)
+            self._checks["reset"] = RuleResult("reset", rule.clause, "failed", no.message)
             return f"The node could not be reset. {no.message}"
         self._probe.key = self._probe.session = None
         self._probe.no_session = self._probe.no_agreement = ""

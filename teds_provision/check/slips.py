@@ -21,7 +21,6 @@ from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_ds
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF, HKDFExpand
 
-from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.keys import (
     GROUP_ORDER,
     POINT_OCTETS,
@@ -34,6 +33,7 @@ from teds_provision.protocol.keys import (
     verify,
 )
 from teds_provision.protocol.session import SessionKeys, pad
+from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.teds.codec import security
 
 TAG_OCTETS: Final = 16

@@ -19,7 +19,7 @@ from teds_provision.errors import NotFoundError, UsageError, VaultChangedError, 
 
 if TYPE_CHECKING:
     from teds_provision.backup.content import Content
-    from teds_provision.backup.restore import Restored
+    from teds_provision.backup.restore import RestoreResult
     from teds_provision.store import Store
 
 _KEY_HINT = (
@@ -178,7 +178,7 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     if plan.back:
         app.confirm("Restore this?", yes=yes)
 
-    def work(known: Callable[[str, bool], str]) -> Restored:
+    def work(known: Callable[[str, bool], str]) -> RestoreResult:
         with store_room.StoreLock(app.home, command="restore", notice=app.note):
             if not yes and backup_room.restore.merge(store, content, dry_run=True).back not in (plan.back, {}):
                 raise VaultChangedError(
@@ -194,7 +194,7 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     _emit(app, content, done, "Restored." if done.back else "Nothing to do: the store already has everything in it.")
 
 
-def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = False) -> None:
+def _emit(app: App, content: Content, done: RestoreResult, text: str, *, dry: bool = False) -> None:
     result = {
         "action": done.action,
         "station": content.station,

@@ -30,9 +30,9 @@ from teds_provision.files import SHARED, read_limited, write_whole
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
-    from teds_provision.plant.asking import SignBy
+    from teds_provision.plant.sign_requests import OfficeOrder
     from teds_provision.station.station import Station
-    from teds_provision.steps.write import Written
+    from teds_provision.steps.write import WriteResult
 
 MAX_INPUT_OCTETS = 32 << 20
 
@@ -184,7 +184,7 @@ def sign(
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
     if by is not None:
-        _sign_by(app, station, plant.asking.SignBy(what, by, job, calibration, files, output), links)
+        _sign_by(app, station, plant.sign_requests.OfficeOrder(what, by, job, calibration, files, output), links)
         return
     done = steps.commands.sign_at(
         station,
@@ -214,11 +214,11 @@ def sign(
     app.emit(result, f"{_changes(done.changes)}\nSigned {uuid.hex()}, sequence {done.signed.sequence}{again}.")
 
 
-def _sign_by(app: App, station: Station, order: SignBy, links: LinkSettings) -> None:
+def _sign_by(app: App, station: Station, order: OfficeOrder, links: LinkSettings) -> None:
     """Have an office sign; with an output the request is written, and signed when its answer comes as a file."""
     try:
-        signed = plant.asking.sign_by_office(station, links, order, reporter_for(app))
-    except plant.asking.OfficeSilentError as waits:
+        signed = plant.sign_requests.sign_by_office(station, links, order, reporter_for(app))
+    except plant.sign_requests.OfficeSilentError as waits:
         if order.output is None:
             raise
         app.emit({"request": str(order.output)}, f"Wrote the request to {order.output}. {waits.hint}")
@@ -309,7 +309,7 @@ def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_
     app.emit(result, f"Node {node}: {told}; {_said(done.written)}.{lines}")
 
 
-def _to_json(node: str, written: Written) -> dict[str, Any]:
+def _to_json(node: str, written: WriteResult) -> dict[str, Any]:
     return {
         "uuid": node,
         "octets_written": written.octets,
@@ -318,7 +318,7 @@ def _to_json(node: str, written: Written) -> dict[str, Any]:
     }
 
 
-def _said(written: Written) -> str:
+def _said(written: WriteResult) -> str:
     told = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is already there"
     return f"{told} ({written.seconds:.2f} s)"
 

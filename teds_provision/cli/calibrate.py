@@ -33,7 +33,7 @@ from teds_provision.teds.calibration.model import METHODS
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.measure.zeroing import Zeroed
+    from teds_provision.measure.zero import ZeroResult
     from teds_provision.teds.calibration import Calibration
 
 _NEGATIVE: dict[str, Any] = {"ignore_unknown_options": True}  # -0.5 is a value, and no option
@@ -85,8 +85,8 @@ def zero(
     """
     if value is not None and not math.isfinite(value):
         raise UsageError("--value is not a finite number.")
-    order = measure.zeroing.ZeroOrder(channel, value, unit, app.interactive, accept_calibration)
-    done = measure.zeroing.zero_at(
+    order = measure.zero.ZeroOrder(channel, value, unit, app.interactive, accept_calibration)
+    done = measure.zero.zero_at(
         app.station(),
         over_the_bus(links),
         node,
@@ -100,7 +100,7 @@ def zero(
     app.emit(_zero_json(done, dry_run=dry_run), _zero_lines(done, dry_run=dry_run))
 
 
-def _zero_json(done: Zeroed, *, dry_run: bool) -> dict[str, Any]:
+def _zero_json(done: ZeroResult, *, dry_run: bool) -> dict[str, Any]:
     channel = done.channel
     unit = channel.shown
     differences = {"offset": done.offset, "moved": done.moved, "spread": done.spread}
@@ -125,7 +125,7 @@ def _zero_json(done: Zeroed, *, dry_run: bool) -> dict[str, Any]:
     }
 
 
-def _zero_lines(done: Zeroed, *, dry_run: bool) -> str:
+def _zero_lines(done: ZeroResult, *, dry_run: bool) -> str:
     channel = done.channel
     named = f"Channel {channel.number}" + (f" ({shown(channel.name)})" if channel.name else "")
     read = f"{named} read {channel.show(done.before)}"
@@ -171,7 +171,7 @@ def capture(
     """
     if not math.isfinite(reference):
         raise UsageError("--reference is not a finite number.")
-    done = measure.capturing.capture_at(
+    done = measure.capture.capture_at(
         app.station(),
         over_the_bus(links),
         node,

@@ -16,7 +16,7 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.check.agreement import Explained
+    from teds_provision.check.agreement_rules import ExplainedRequest
     from teds_provision.check.run import CheckReport
 
 
@@ -87,7 +87,7 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
     )
 
 
-def _explained(told: Explained | str) -> dict[str, str | None]:
+def _explained(told: ExplainedRequest | str) -> dict[str, str | None]:
     """The test agreement in hex; where none came about only ``problem``."""
     if isinstance(told, str):
         return {"problem": told}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision.cli import completing
+from teds_provision.cli import shell_completion
 from teds_provision.cli.config_file import (
     anchored,
     config_path,
@@ -328,5 +328,5 @@ def completion(app: App, shell: str) -> None:
     In bash: eval "$(teds-provision completion bash)"
     """
     root = click.get_current_context().find_root().command
-    script = completing.SHELLS[shell](root, {}, "teds-provision", COMPLETE).source()
+    script = shell_completion.SHELLS[shell](root, {}, "teds-provision", COMPLETE).source()
     app.emit({"shell": shell, "script": script}, lambda console: print(script))

@@ -35,9 +35,9 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from teds_provision.handover.incoming import Imported, ImportPlan
-    from teds_provision.handover.outgoing import Exported, ExportPlan, Leaving
-    from teds_provision.handover.pending import Closed
+    from teds_provision.handover.incoming import ImportPlan, ImportResult
+    from teds_provision.handover.outgoing import ExportPlan, ExportResult, LeavingNode
+    from teds_provision.handover.pending import CloseResult
     from teds_provision.station.station import Station
 
 
@@ -112,7 +112,7 @@ def export_keys(
         raise click.UsageError("A parcel is for one station: give --to once.")
     station = app.station()
     if send:
-        plant.folding.require_roster(station)
+        plant.apply_pages.require_roster(station)
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
     order = handover_room.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
@@ -141,7 +141,7 @@ def export_keys(
 
 
 def _tell_export(
-    app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], told: dict[str, Any], done: Sequence[Exported]
+    app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], told: dict[str, Any], done: Sequence[ExportResult]
 ) -> None:
     for bundle, one in zip(told["bundles"], done, strict=True):
         bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
@@ -195,7 +195,7 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     return "\n".join([*lines, _MEANS[plan.mode]])
 
 
-def _node_lines(chosen: Sequence[Leaving], station: Station) -> list[str]:
+def _node_lines(chosen: Sequence[LeavingNode], station: Station) -> list[str]:
     known = station.nodes.of_page([node.uuid for node in chosen])
     return [f"  {node.uuid.hex()}  epoch {node.epoch}  {known[node.uuid].name or ''}".rstrip() for node in chosen]
 
@@ -266,14 +266,14 @@ def import_keys(
         if dry_run:
             app.emit({**_import_plan(shown), "receipt": None, "plan": True}, _import_text(station, shown))
             return
-        if not isinstance(shown, handover_room.incoming.Imported):
+        if not isinstance(shown, handover_room.incoming.ImportResult):
             require_new(receipt)
             app.note(_import_text(station, shown))
             app.confirm(f"Import {count_of(len(shown.taken))}?", yes=yes)
         with station.lock("import-keys", app.note):
             plan = shown if station.version() == state else handover_room.incoming.plan_import(station, bundle)
             _require_as_shown(plan, shown)
-            if isinstance(plan, handover_room.incoming.Imported):  # before, or meanwhile by another command
+            if isinstance(plan, handover_room.incoming.ImportResult):  # before, or meanwhile by another command
                 done = plan
             else:
                 done = handover_room.incoming.import_bundle(station, plan)
@@ -289,7 +289,7 @@ def import_keys(
 
 def _take_received(app: App, station: Station, *, yes: bool, dry_run: bool) -> None:
     """Show each parcel that waits, and why; take in those that a person says yes to."""
-    plant.folding.require_roster(station)
+    plant.apply_pages.require_roster(station)
     station.unlock()
     tables, told = station.plant.parcels, list[dict[str, Any]]()
     for row in tables.parcels("in", "waiting", "later"):
@@ -341,15 +341,15 @@ def _is_sealed(file: BinaryIO) -> bool:
     return _CIPHERTEXT in before
 
 
-def _require_as_shown(plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> None:
+def _require_as_shown(plan: ImportPlan | ImportResult, shown: ImportPlan | ImportResult) -> None:
     """Raise PolicyError where another command changed what becomes of a node; taken in meanwhile is fine."""
-    if not isinstance(plan, handover_room.incoming.Imported):
-        require_same(not isinstance(shown, handover_room.incoming.Imported) and plan.nodes == shown.nodes)
+    if not isinstance(plan, handover_room.incoming.ImportResult):
+        require_same(not isinstance(shown, handover_room.incoming.ImportResult) and plan.nodes == shown.nodes)
 
 
-def _import_plan(plan: ImportPlan | Imported) -> dict[str, Any]:
+def _import_plan(plan: ImportPlan | ImportResult) -> dict[str, Any]:
     """The result as far as it is known before anything happens."""
-    if isinstance(plan, handover_room.incoming.Imported):
+    if isinstance(plan, handover_room.incoming.ImportResult):
         return _taken_before(plan)
     bundle = plan.opened.bundle
     nodes = ((one.node.uuid.hex(), one.decision, one.why) for one in plan.nodes)
@@ -360,16 +360,16 @@ def _import_plan(plan: ImportPlan | Imported) -> dict[str, Any]:
     return told | {"notes": notes, "revocations_passed_over": passed_over}
 
 
-def _taken_before(done: Imported) -> dict[str, Any]:
+def _taken_before(done: ImportResult) -> dict[str, Any]:
     refused = done.refused_uuids
     same = ((uuid, "same", "") for uuid in done.notes.uuids if uuid not in refused)
     nodes = chain(same, ((uuid, "refused", why) for uuid, why in done.notes.refused))
     return _import_result(done.row.peers[0], done.row.mode, done.row.id, nodes, [])
 
 
-def _import_text(station: Station, plan: ImportPlan | Imported) -> str:
+def _import_text(station: Station, plan: ImportPlan | ImportResult) -> str:
     """The plan for people."""
-    if isinstance(plan, handover_room.incoming.Imported):
+    if isinstance(plan, handover_room.incoming.ImportResult):
         return f"This bundle was imported on {plan.row.created}; there is nothing to do."
     bundle, nodes = plan.opened.bundle, plan.nodes
     lines = [
@@ -409,7 +409,7 @@ def _import_result(
     }
 
 
-def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:
+def _prove(app: App, station: Station, done: ImportResult, links: LinkSettings) -> list[dict[str, Any]]:
     proven = handover_room.incoming.proven_of(station, done.uuids)
     waiting = [uuid for uuid in done.uuids if uuid not in proven]
 
@@ -421,14 +421,14 @@ def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> l
     )
     return [
         {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
-        if isinstance(one, handover_room.incoming.Proven)
+        if isinstance(one, handover_room.incoming.NodeProof)
         else {"uuid": one.uuid.hex(), "rotated": False, "why": one.why}
         for one in outcomes
     ]
 
 
 def _tell_import(
-    app: App, station: Station, done: Imported, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
+    app: App, station: Station, done: ImportResult, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
 ) -> None:
     imported = told["imported"]
     known = handover_room.incoming.proven_of(station, map(bytes.fromhex, imported))
@@ -439,7 +439,7 @@ def _tell_import(
     app.emit(told, _summary(done, receipt, not_met, pending, sum(bool(one["rotated"]) for one in outcomes)))
 
 
-def _summary(done: Imported, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
+def _summary(done: ImportResult, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
     lines = [
         f"{count_of(len(done.notes.uuids) - len(done.notes.refused))} imported"
         + ("." if done.fresh else " earlier; nothing changed.")
@@ -519,9 +519,9 @@ def receipt(app: App, file: Path) -> None:
 
 def _close_all(
     app: App, station: Station, files: list[Path], *, go_on: bool
-) -> tuple[list[Closed], TedsProvisionError | None]:
+) -> tuple[list[CloseResult], TedsProvisionError | None]:
     """Close what each receipt closes; what was closed, and the first error where one ends not all (``go_on``)."""
-    closed: list[Closed] = []
+    closed: list[CloseResult] = []
     failed: TedsProvisionError | None = None
     for path in files:
         try:
@@ -537,7 +537,7 @@ def _close_all(
     return closed, failed
 
 
-def _closed(done: Closed) -> dict[str, Any]:
+def _closed(done: CloseResult) -> dict[str, Any]:
     return {
         "id": done.row.id,
         "from": done.receipt.sender,
@@ -549,7 +549,7 @@ def _closed(done: Closed) -> dict[str, Any]:
     }
 
 
-def _closed_text(station: Station, done: Closed) -> str:
+def _closed_text(station: Station, done: CloseResult) -> str:
     imported, refused = done.receipt.imported, done.receipt.refused
     text = f"Station {handover_room.pending.peer_name(station, done.receipt.sender)} imported {count_of(len(imported))}"
     text += (

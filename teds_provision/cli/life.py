@@ -14,7 +14,7 @@ from teds_provision.errors import LinkError, PolicyError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
-    from teds_provision.handover.life import TakeOver
+    from teds_provision.handover.life import TakeoverPlan
     from teds_provision.station.measurements import HandedOn
     from teds_provision.station.station import Station
     from teds_provision.steps.agree import ResetReceipt
@@ -209,7 +209,7 @@ def replace(
     app.emit(told, f"{text}.{_handed_on(moved, 'Moved')}\n{next_step}")
 
 
-def _takeover(plan: TakeOver) -> tuple[dict[str, Any], str]:
+def _takeover(plan: TakeoverPlan) -> tuple[dict[str, Any], str]:
     """What one node takes over from another, for scripts and in a sentence."""
     taken = plan.new if plan.done else plan.old
     told = {

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from teds_provision.plant.office import Answered
+    from teds_provision.plant.office import AnsweredRequest
     from teds_provision.plant.verify_evidence import JudgedEvidence
-    from teds_provision.plant.yields import StationYield
+    from teds_provision.plant.yield_stats import StationYield
     from teds_provision.protocol.plant.job import CalibrationRule, Job
     from teds_provision.protocol.plant.roster import Roster
     from teds_provision.station.station import Station
@@ -312,12 +312,12 @@ def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
     station = app.station()
     found = plant.jobs.find_job(station, which)
     roster = plant.jobs.roster_of(station)
-    to = plant.asking.receivers(station, found)
+    to = plant.sign_requests.receivers(station, found)
     if not dry_run:
         station.unlock()
-        post = plant.asking.post_of(station, files)
+        post = plant.sign_requests.post_of(station, files)
         app.closing(post.close)
-        plant.asking.send_job(station, post, found)
+        plant.sign_requests.send_job(station, post, found)
     names = [roster.name_of(one) for one in to]
     sent = f"{'Would send' if dry_run else 'Sent'} {found.id[:8]} to {', '.join(names)}."
     app.emit({"id": found.id, "to": to}, sent if to else f"{found.id[:8]} is for this station alone: nothing to send.")
@@ -360,10 +360,10 @@ def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None)
     station = app.station()
     found = plant.jobs.find_job(station, which)
     names = json_files([Path(file) for file in evidence], "evidence")
-    attempts = plant.yields.attempts_of(station, found.id, (read_file(Path(name)) for name in names))
-    parts = plant.yields.yields(station, found, attempts)
+    attempts = plant.yield_stats.attempts_of(station, found.id, (read_file(Path(name)) for name in names))
+    parts = plant.yield_stats.yields(station, found, attempts)
     if csv_file is not None:
-        write_file(csv_file, plant.yields.to_csv(station, attempts))
+        write_file(csv_file, plant.yield_stats.to_csv(station, attempts))
     told = {**_to_json(station, found), "stations": [part.to_json() for part in parts]}
     app.emit(told, lambda console: _table(console, found, parts, station.fingerprint))
 
@@ -436,9 +436,9 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station = app.station()
     ids = {plant.jobs.find_job(station, job).id for job in jobs}
     station.unlock()
-    post = plant.asking.post_of(station, files)
+    post = plant.sign_requests.post_of(station, files)
     app.closing(post.close)
-    inbox = plant.asking.Inbox(station, post, protocol.plant.document.SIGN_REQUEST)
+    inbox = plant.sign_requests.Inbox(station, post, protocol.plant.document.SIGN_REQUEST)
     app.closing(inbox.close)
     stop = talk.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())
@@ -490,10 +490,10 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
         write_file(output, sealed.decode())
     elif answered.security:
         write_file(output, request.image.with_block(teds.image.SECURITY, answered.security).to_json())
-    _tell(app, station, plant.office.Answered(request, answered), end=True)
+    _tell(app, station, plant.office.AnsweredRequest(request, answered), end=True)
 
 
-def _tell(app: App, station: Station, one: Answered, *, end: bool = False) -> None:
+def _tell(app: App, station: Station, one: AnsweredRequest, *, end: bool = False) -> None:
     request, answered = one.request, one.answer
     told: dict[str, Any] = {"uuid": request.uuid.hex(), "job": request.job, "from": request.signer}
     roster = station.plant.roster
@@ -502,7 +502,7 @@ def _tell(app: App, station: Station, one: Answered, *, end: bool = False) -> No
         app.emit({**told, "sequence": answered.sequence}, f"signed   {request.uuid.hex()}  {answered.sequence}  {name}")
         return
     if end:
-        raise plant.asking.OfficeRefusedError(f"Not signed ({answered.refused}): {answered.why}.")
+        raise plant.sign_requests.OfficeRefusedError(f"Not signed ({answered.refused}): {answered.why}.")
     refused = {**told, "refused": answered.refused, "why": answered.why}
     app.emit(refused, f"refused  {request.uuid.hex()}  {answered.refused}  {name}: {answered.why}")
 
@@ -544,7 +544,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
     attempt. Prints one line each, then totals; exits with the worst: 4 for an invalid file, 8 for one that cannot be
     read.
     """
-    grounds = plant.verify_evidence.Grounds.of(protocol.keys.from_pem(read_file(ca)), pins, roster)
+    grounds = plant.verify_evidence.EvidenceAnchors.of(protocol.keys.from_pem(read_file(ca)), pins, roster)
     names = json_files([Path(file) for file in files], "evidence")
     totals = plant.verify_evidence.EvidenceTotals()
     for lines, counted in plant.verify_evidence.verify_evidence(grounds, names, _json if app.json else _line):

@@ -25,7 +25,7 @@ from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
-    from teds_provision.store import AuditEntry, AuditVerdict, Choice
+    from teds_provision.store import AuditEntry, AuditFilter, AuditVerdict
     from teds_provision.trace import recorder
     from teds_provision.trace.record import Record
 else:  # the help of this command does without
@@ -67,7 +67,7 @@ def log(
     station = app.station()
     audit_log = station.audit_log
     wanted = "today" if today else since
-    choice = store.Choice(
+    choice = store.AuditFilter(
         station.nodes.resolve(uuid) if uuid else None, act, failed, since=moment(wanted) if wanted is not None else None
     )
     after = audit_log.before(choice, last=last)
@@ -75,14 +75,14 @@ def log(
     if follow:
         _follow(app, station, choice, verdict, after)
         return
-    entries = _Counted(audit_log.chosen(choice, after))
+    entries = _CountedEntries(audit_log.chosen(choice, after))
     if app.json:
         _tell_json(entries, verdict, after)
     else:
-        _tell_lines(app, entries, verdict, after, narrowed=choice != store.Choice())
+        _tell_lines(app, entries, verdict, after, narrowed=choice != store.AuditFilter())
 
 
-class _Counted:
+class _CountedEntries:
     """Entries one after the other, counted as they are told: a long log is never held in memory."""
 
     def __init__(self, entries: Iterable[AuditEntry]) -> None:
@@ -98,7 +98,7 @@ class _Counted:
             yield entry
 
 
-def _tell_json(entries: _Counted, verdict: AuditVerdict, after: int) -> None:
+def _tell_json(entries: _CountedEntries, verdict: AuditVerdict, after: int) -> None:
     """One object, written as it is read; exits 7 where the chain does not hold."""
     out = sys.stdout
     out.write('{"entries": [')
@@ -119,7 +119,7 @@ def _tell_json(entries: _Counted, verdict: AuditVerdict, after: int) -> None:
         raise click.exceptions.Exit(7)
 
 
-def _tell_lines(app: App, entries: _Counted, verdict: AuditVerdict, after: int, *, narrowed: bool) -> None:
+def _tell_lines(app: App, entries: _CountedEntries, verdict: AuditVerdict, after: int, *, narrowed: bool) -> None:
     """A line for each entry; where not all of them were asked for (``narrowed``), how many came."""
     sys.stdout.writelines(_line(entry) + "\n" for entry in entries)
     sys.stdout.flush()
@@ -131,7 +131,7 @@ def _tell_lines(app: App, entries: _Counted, verdict: AuditVerdict, after: int, 
     app.note(f"{verdict.count} entries, chain intact{part}, head {verdict.head[:16]}.")
 
 
-def _follow(app: App, station: Station, choice: Choice, verdict: AuditVerdict, after: int) -> None:
+def _follow(app: App, station: Station, choice: AuditFilter, verdict: AuditVerdict, after: int) -> None:
     """Give entries as they come, until SIGTERM (exit 0) or Ctrl-C (exit 130)."""
     stop = talk.meeting.IdleStop(None)
     signal.signal(signal.SIGTERM, lambda *_: stop.ask())

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     import pathlib
     from pathlib import Path
 
-    from teds_provision.cli import completing, start
+    from teds_provision.cli import shell_completion, start
 else:
-    completing, start = late("teds_provision.cli.completing"), late("teds_provision.cli.start")
+    shell_completion, start = late("teds_provision.cli.shell_completion"), late("teds_provision.cli.start")
     difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
@@ -176,7 +176,7 @@ def run(arguments: list[str]) -> int:
         # Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)
         from click.shell_completion import shell_complete
 
-        LazyGroup.teachers.append(completing.teach)
+        LazyGroup.teachers.append(shell_completion.teach)
         return shell_complete(cli, {}, "teds-provision", COMPLETE, asked)
     try:
         arguments = in_front(arguments, lambda name: cli.get_command(click.Context(cli), name))

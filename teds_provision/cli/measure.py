@@ -28,9 +28,9 @@ from teds_provision.store.records import COMMAND
 if TYPE_CHECKING:
     from teds_provision.cli import measure_view
     from teds_provision.measure.request import Requirements
-    from teds_provision.measure.runner import Ended
+    from teds_provision.measure.runner import MeasurementEnd
     from teds_provision.measure.running.measurement_job import MeasurementJob
-    from teds_provision.measure.sinks.mcap.recover import Recovered
+    from teds_provision.measure.sinks.mcap.recover import RecoveryResult
     from teds_provision.station.station import Station
 else:  # loads the sinks and numpy
     measure_view = late("teds_provision.cli.measure_view")
@@ -199,7 +199,9 @@ def _carried_on(app: App, station: Station, asked: KeptMeasurement) -> KeptMeasu
     return kept
 
 
-def _run(app: App, job: MeasurementJob, links: LinkSettings, uuids: Sequence[bytes], duration: float | None) -> Ended:
+def _run(
+    app: App, job: MeasurementJob, links: LinkSettings, uuids: Sequence[bytes], duration: float | None
+) -> MeasurementEnd:
     station, stop = job.station, talk.meeting.IdleStop(None)
     group = job.kept.group or ""
     nodes = [uuid.hex() for uuid in uuids]
@@ -224,7 +226,7 @@ def _run(app: App, job: MeasurementJob, links: LinkSettings, uuids: Sequence[byt
     return ended
 
 
-def _tell_end(app: App, ended: Ended, require: Requirements | None) -> None:
+def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None) -> None:
     result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files, "sinks": ended.sinks}
     if require is not None:
         result["fits"] = require.fits
@@ -233,7 +235,7 @@ def _tell_end(app: App, ended: Ended, require: Requirements | None) -> None:
     app.conclude(result, "\n".join(_end_lines(ended, require)) or "Nothing was measured.", ended.error)
 
 
-def _end_lines(ended: Ended, require: Requirements | None) -> list[str]:
+def _end_lines(ended: MeasurementEnd, require: Requirements | None) -> list[str]:
     lines = [_stream_line(node["uuid"], stream) for node in ended.nodes for stream in node["streams"]]
     lines += [f"Written: {name}" for name in ended.files]
     lines += [f"{one['sink']}: {one['dropped']} values dropped" for one in ended.sinks if one["dropped"]]
@@ -245,7 +247,7 @@ def _end_lines(ended: Ended, require: Requirements | None) -> list[str]:
 def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
     lost = f"lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}, invalid {stream['invalid']}"
     blocks = measure_room.blocks
-    why = blocks.why_invalid([blocks.Invalid(**one) for one in stream["invalid_why"]])
+    why = blocks.why_invalid([blocks.InvalidValues(**one) for one in stream["invalid_why"]])
     return f"{uuid}: {stream['samples']} values in {stream['messages']} messages, {lost}{f' ({why})' if why else ''}"
 
 
@@ -269,7 +271,7 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
     app.conclude(result, text, error)
 
 
-def _damage(file: str, done: Recovered) -> BadDataError:
+def _damage(file: str, done: RecoveryResult) -> BadDataError:
     named = [f"{one.what} at octet {one.offset} ({one.octets} octets)" for one in done.damaged[:MOST_NAMED]]
     more = len(done.damaged) - len(named)
     return BadDataError(

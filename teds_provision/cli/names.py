@@ -141,7 +141,7 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
         image = station.nodes.datasheet(record.uuid)
         if image is None:
             continue
-        sheet, judged = teds.sheet.Sheet.of(image), steps.reading.verdict_of(station, record.uuid)
+        sheet, judged = teds.sheet.Sheet.of(image), steps.readings.verdict_of(station, record.uuid)
         unsigned = judged is not None and judged.verified.verdict == "unsigned"  # it is called what it calls itself
         name = sheet.meta.name if unsigned else record.name or ""
         for one in sheet.channels:

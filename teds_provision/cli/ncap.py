@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 
     from teds_provision.api.bodies import Mode
     from teds_provision.measure import matching
-    from teds_provision.ncap import running, settings
+    from teds_provision.ncap import service_run, settings
     from teds_provision.ncap.web import tokens
 else:
-    running, settings = late("teds_provision.ncap.running"), late("teds_provision.ncap.settings")
+    service_run, settings = late("teds_provision.ncap.service_run"), late("teds_provision.ncap.settings")
     tokens = late("teds_provision.ncap.web.tokens")
     matching = late("teds_provision.measure.matching")
 
@@ -148,13 +148,13 @@ def run(
     settings.require_places(wanted)
     station = app.station()
     if wanted.registry:
-        plant.folding.require_roster(station)
+        plant.apply_pages.require_roster(station)
     if wanted.measure is not None:
-        matching.Match.parse(wanted.measure).require_groups(station)
+        matching.NodeMatch.parse(wanted.measure).require_groups(station)
     station.unlock()  # nobody is asked for a passphrase later
     lines = DaemonLog(app)
     with tracing(trace) as opened:
-        running.run(station, replace(wanted, trace=opened), lines.tell)
+        service_run.run(station, replace(wanted, trace=opened), lines.tell)
     if not lines.end():
         os._exit(0)  # all has ended in order; a line that nobody takes would hold the end of the process up for ever
 
@@ -333,7 +333,7 @@ def measure(app: App, expression: str, rate: float | None, frozen: bool, files: 
     """
     with client.connect(home=app.home) as station:
         made = station.measure(match=expression, rate=rate, frozen=frozen, sinks=files)
-    unknown = measure_room.matching.Match.parse(expression).unknown_type(app.station())
+    unknown = measure_room.matching.NodeMatch.parse(expression).unknown_type(app.station())
     if unknown:
         app.warn(f"The measurement waits: {unknown}. To list the profiles: teds-provision profile list")
     app.emit({**made}, f"Measuring {expression} (measurement {made['id']}).")

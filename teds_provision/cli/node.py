@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from teds_provision.node.can.server import CanServer
     from teds_provision.node.flash_file import FlashFile
     from teds_provision.node.hardware.board import ActuatorReading, Board
-    from teds_provision.node.nfc.tnep import Extras
+    from teds_provision.node.nfc.tnep import ExtraRecords
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.protocol.operation.streams import DataFrame
 
@@ -109,7 +109,7 @@ def create(
     """
     if teds is not None and profile is not None:
         raise UsageError("--teds and --profile cannot be combined.", hint="A node has one datasheet: use one of them.")
-    made = node_room.described.create(
+    made = node_room.node_template.create(
         folder,
         uuid=uuid,
         name=name,
@@ -219,7 +219,7 @@ def run(
     """
     _check_options(len(folders), source, **links)
     delays = node_room.virtual.Delays(crypto_delay / 1000, flash_delay / 1000)
-    lines, pulse = ActuatorLines(app), node_room.pulse.Pulse()
+    lines, pulse = ActuatorLines(app), node_room.realtime_loop.RealtimeLoop()
     make = _boards(app, lines, source, battery)
     nodes = [
         node_room.virtual.VirtualNode(
@@ -338,7 +338,7 @@ def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
     bus.send_data(node, frame.identifier, frame.data, fd=frame.fd)
 
 
-def _extras(node: VirtualNode, air: BleServer | None) -> Extras:
+def _extras(node: VirtualNode, air: BleServer | None) -> ExtraRecords:
     """What the initial message says beside: charge, and the address in the air; and what a reader's field does."""
     battery = node.board.battery if node.board is not None else None
     charging = nfc_room.tnep
@@ -349,7 +349,7 @@ def _extras(node: VirtualNode, air: BleServer | None) -> Extras:
         if air is not None:
             air.tapped()
 
-    return charging.Extras(
+    return charging.ExtraRecords(
         before=lambda: charging.charge_records(battery.power()) if battery is not None else (),
         after=lambda: (charging.out_of_band_record(air.address.octets, random=True),) if air is not None else (),
         field=field,

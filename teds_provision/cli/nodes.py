@@ -132,7 +132,7 @@ def _with_plant(station: Station, described: Iterable[dict[str, Any]]) -> Iterat
 
 def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) -> None:
     """What the stations of the plant say of nodes, those too that this one never met."""
-    described = plant.status.nodes(station, plant.folding.require_roster(station), text)
+    described = plant.status.nodes(station, plant.apply_pages.require_roster(station), text)
     if as_json:
         print_json_list("nodes", described)
         return

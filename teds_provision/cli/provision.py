@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
     from teds_provision.links import Notice
     from teds_provision.station.summary import NodeSummary
-    from teds_provision.steps.adopting import Brought
-    from teds_provision.steps.batch import Boards, ProvisionPlan, ProvisionRequest, Questions
+    from teds_provision.steps.adoption import FactoryDatasheet
+    from teds_provision.steps.batch import BatchRun, ProvisionPlan, ProvisionRequest, Questions
     from teds_provision.steps.batch_sheet import BoardResult, SheetRow
-    from teds_provision.steps.identify import Identified
-    from teds_provision.steps.provision import Provisioned
+    from teds_provision.steps.identify import IdentifiedNode
+    from teds_provision.steps.provision import ProvisionResult
     from teds_provision.teds.diff import Change
 
 _CHANGES_SHOWN = 20
@@ -153,15 +153,15 @@ def provision(
             line.scans = plant.line.Scans(sys.stdin, app.note)
             threading.Thread(target=line.scans.listen, name="scanner", daemon=True).start()
         if found is not None and found.office not in (None, base.identity.fingerprint):
-            post = plant.asking.post_of(base, files)
-            line.office = office = plant.asking.PostOffice(base, post, links.timeout)
+            post = plant.sign_requests.post_of(base, files)
+            line.office = office = plant.sign_requests.RemoteOffice(base, post, links.timeout)
             app.closing(office.close)
     elif any((calibrations, operator and report is None, files, only, label_to, scan)):
         raise UsageError(
             "--calibrations, --operator, --files, --only, --label-to and --scan require a job.",
             hint="Add --job FILE, or --evidence.",
         )
-    boards = steps_room.batch.Boards(base, links, request, reporter, line=line)
+    boards = steps_room.batch.BatchRun(base, links, request, reporter, line=line)
     for warning in boards.warnings:
         app.warn(warning)
     if dry_run and everything:
@@ -191,7 +191,7 @@ def _check_line(request: ProvisionRequest, job: str | None, only: str | None) ->
         )
 
 
-def _one(app: App, boards: Boards, questions: Questions) -> None:
+def _one(app: App, boards: BatchRun, questions: Questions) -> None:
     try:
         done = boards.one(questions)
     except steps_room.build.UnrequestedChangeError as error:
@@ -199,7 +199,7 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
         changes = [change.text for change in error.changes]
         app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
         return
-    except steps_room.adopting.NotAdoptedError as error:
+    except steps_room.adoption.NotAdoptedError as error:
         _show_brought(app, error.brought)
         app.conclude({"findings": error.brought.findings}, None, error)
         return
@@ -207,12 +207,12 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
     _tell(app, done, error=failure, **_of_line(boards, done.who.uuid))
 
 
-def _of_line(boards: Boards, uuid: bytes) -> dict[str, Any]:
+def _of_line(boards: BatchRun, uuid: bytes) -> dict[str, Any]:
     """Job, unit, attempt and evidence of a board, nothing outside a line."""
     return boards.line.unit_to_json(uuid) if boards.line is not None else {}
 
 
-def _many(app: App, boards: Boards, questions: Questions, screen: Screen, *, totals: bool) -> None:
+def _many(app: App, boards: BatchRun, questions: Questions, screen: Screen, *, totals: bool) -> None:
     signal.signal(signal.SIGTERM, lambda *_: boards.stop.ask())
     try:
         for board in boards.many(questions):
@@ -241,7 +241,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
     accepted: set[tuple[bytes, str]] = set()
     turn = threading.Lock()  # one question at a time, however many readers there are
 
-    def accept(who: Identified) -> None:
+    def accept(who: IdentifiedNode) -> None:
         if (yes and strangers) or (who.uuid, who.fingerprint) in accepted:
             return
         if not app.interactive:
@@ -283,10 +283,10 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
     asked = app.interactive
     retype = app.asks_retype(yes=yes or several)
 
-    def adopt(brought: Brought) -> None:
+    def adopt(brought: FactoryDatasheet) -> None:
         with turn:
             if not yes and not asked:
-                steps_room.adopting.nobody_adopts(brought)
+                steps_room.adoption.nobody_adopts(brought)
             _show_brought(app, brought)
             if yes:
                 return
@@ -298,7 +298,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
     )
 
 
-def _show_brought(app: App, brought: Brought) -> None:
+def _show_brought(app: App, brought: FactoryDatasheet) -> None:
     """What a board says of itself, a line for each channel, and what was found."""
     app.note(f"Node {brought.image.uuid.hex()} brought its own datasheet: {brought.name or '(no name)'}")
     for one in brought.channels[:_CHANGES_SHOWN]:
@@ -331,7 +331,7 @@ def _tell_plan(app: App, plan: ProvisionPlan) -> None:
     app.emit(told, text)
 
 
-def _tell_plans(app: App, boards: Boards) -> None:
+def _tell_plans(app: App, boards: BatchRun) -> None:
     """A plan for each node of the bus that is meant, at last how many they are; the worst refusal ends the command."""
     planned = 0
     for one in boards.plans():
@@ -346,7 +346,7 @@ def _tell_plans(app: App, boards: Boards) -> None:
         raise click.exceptions.Exit(boards.worst.exit_code)
 
 
-def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = None, **more: object) -> None:
+def _tell(app: App, done: ProvisionResult, *, error: TedsProvisionError | None = None, **more: object) -> None:
     """Tell one node's end; ``error`` ends the command, ``more`` stands on the line of one of many."""
     for warning in done.warnings:
         app.warn(warning)
@@ -386,7 +386,7 @@ def _tell_board(app: App, board: BoardResult, **line: Any) -> None:
         app.fail_line(board.error, **of)
 
 
-def _tell_one_of(app: App, boards: Boards, board: BoardResult) -> None:
+def _tell_one_of(app: App, boards: BatchRun, board: BoardResult) -> None:
     """One line for one of many on a bus: ``37 of 200  8d4d…  arm 3  authentic  1.2 s``; why, where it did not pass."""
     name = station.summary.summarise(board.done.image).name if board.done is not None else None
     words = board.done.verified.verdict if board.result == "passed" and board.done is not None else board.result
@@ -396,7 +396,7 @@ def _tell_one_of(app: App, boards: Boards, board: BoardResult) -> None:
         app.note(f"{board.uuid.hex()}: {board.failure.message}\n  → {board.failure.hint}".removesuffix("\n  → "))
 
 
-def _tell_totals(app: App, boards: Boards) -> None:
+def _tell_totals(app: App, boards: BatchRun) -> None:
     totals = boards.totals()
     told: dict[str, Any] = {
         "passed": totals.passed,
@@ -416,7 +416,7 @@ def _tell_totals(app: App, boards: Boards) -> None:
     app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in total.{steps}")
 
 
-def _summary(console: Console, done: Provisioned, summary: NodeSummary, more: Mapping[str, object]) -> None:
+def _summary(console: Console, done: ProvisionResult, summary: NodeSummary, more: Mapping[str, object]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -480,8 +480,8 @@ def big(text: str) -> list[str]:
     return [line.replace("#", "██").replace(" ", "  ") for line in lines]
 
 
-class Told(Protocol):
-    """What the screen needs to know of the batch: :class:`Boards` is one."""
+class BatchState(Protocol):
+    """What the screen needs to know of the batch: :class:`BatchRun` is one."""
 
     def __len__(self) -> int:
         """How many boards the sheet has."""
@@ -517,7 +517,7 @@ class Screen(Protocol):
         """Give the terminal back."""
 
 
-class _Plain:
+class _NoScreen:
     """No screen: a pipe, --json, --quiet, or no sheet. The bell is for people alone."""
 
     tells = False
@@ -558,7 +558,7 @@ class BoardReporter:
 class OperatorScreen:
     """Drawn anew when a board is begun and when it ends, on stderr; ``live_line`` takes away what runs below it."""
 
-    def __init__(self, console: Console, boards: Told, live_line: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, console: Console, boards: BatchState, live_line: Callable[[], None] = lambda: None) -> None:
         self.tells = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
         self._console, self._boards, self._live_line = console, boards, live_line
         self._last: deque[BoardResult] = deque(maxlen=_LAST)
@@ -645,10 +645,10 @@ def _clock(moment: str) -> str:
 
 
 @contextmanager
-def screen_for(app: App, boards: Boards, reporter: BoardReporter | None = None) -> Iterator[Screen]:
+def screen_for(app: App, boards: BatchRun, reporter: BoardReporter | None = None) -> Iterator[Screen]:
     """The operator's screen on a terminal with a sheet, else none; ``reporter`` tells it when a board is begun."""
     if app.json or app.quiet or not len(boards) or not sys.stderr.isatty():
-        yield _Plain()
+        yield _NoScreen()
         return
     screen = OperatorScreen(app.console(stderr=True), boards, app.live_line)
     if reporter is not None:

@@ -30,9 +30,9 @@ from teds_provision.lazy import late
 from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
-    from teds_provision.plant.post import Post
     from teds_provision.plant.status import PlantStatus, StationStanding
-    from teds_provision.plant.sync import Synced
+    from teds_provision.plant.sync import SyncResult
+    from teds_provision.plant.transport import Transport
     from teds_provision.protocol import keys
     from teds_provision.protocol.plant import document, roster
     from teds_provision.protocol.plant.roster import Roster
@@ -112,7 +112,7 @@ def _emit_change(
         signed = plant.owner.signed(station, draft)
         if output is not None:
             write_new(output, signed.octets + b"\n", mode=SHARED)
-        plant.folding.put_roster(station, signed)
+        plant.apply_pages.put_roster(station, signed)
     app.emit(
         _to_json(signed), f"Roster {signed.version} is in force here. To tell the others: teds-provision registry sync"
     )
@@ -242,7 +242,7 @@ def add(app: App, /, file: Path, roles: Sequence[roster.Role], name: str | None,
 def role(app: App, /, name: str, roles: Sequence[roster.Role], signed: int | None, **how: Any) -> None:
     """Set a member's roles. If it loses "sign", what it has signed stays authentic."""
     station = app.station()
-    member = plant.owner.require_member(plant.folding.require_roster(station), name)
+    member = plant.owner.require_member(plant.apply_pages.require_roster(station), name)
     place = None if signed is None else plant.owner.page_place(station, member.fingerprint, signed)
     _emit_change(app, station, plant.owner.with_roles(station, name, frozenset(roles), place), **_named(how))
 
@@ -262,7 +262,7 @@ def share(
 ) -> None:
     """Copy node keys to these members automatically."""
     station = app.station()
-    held = plant.folding.require_roster(station)
+    held = plant.apply_pages.require_roster(station)
     to = tuple(plant.owner.require_member(held, name).fingerprint for name in names)
     draft = plant.owner.shared(station, roster.Share(_what(every, group, profile), to, forget))
     _emit_change(app, station, draft, **_named(how))
@@ -307,7 +307,7 @@ def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
         raise click.UsageError("Give one of --retired, --lost and --stolen.")
     (why,) = given
     station = app.station()
-    member = plant.folding.require_roster(station).named(name)
+    member = plant.apply_pages.require_roster(station).named(name)
     if isinstance(member, roster.Member) and last is None and why != "retired":
         pages = plant.status.page_list(station, member.fingerprint)
         listed = "\n".join(f"  {n:>6}  {local_time(created)}  {hash[:16]}" for n, hash, created in pages)
@@ -362,7 +362,7 @@ def sign(app: App, file: Path, output: Path, yes: bool, dry_run: bool) -> None:
     write_new(output, signed.octets + b"\n", mode=SHARED)
     if same:
         with station.lock("registry sign", app.note):
-            plant.folding.take_rosters(station, [signed.octets])
+            plant.apply_pages.take_rosters(station, [signed.octets])
     app.emit(
         _to_json(signed),
         f"Signed: {output}. To distribute it: registry sync --files DIR, or connect --roster {quote(output.name)}",
@@ -400,17 +400,17 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
     if (files is None) == (url is None):
         raise click.UsageError("Give a URL, or --files DIR.")
     station = app.station()
-    post: Post
+    post: Transport
     if url is not None:
         station.unlock()
-        post = plant.reaching.database(station, plant.reaching.absolute(url))
+        post = plant.connecting.database(station, plant.connecting.absolute(url))
     else:
         assert files is not None
-        post = plant.files.FilesPost(files)
+        post = plant.folder_transport.FolderTransport(files)
     octets = None if roster_file is None else read_file(roster_file).strip()
     found = plant.membership.found_roster(station, post, octets)
     if url is not None:
-        plant.reaching.require_registry(post, found.registry)
+        plant.connecting.require_registry(post, found.registry)
     joined = station.plant.joined
     same = joined is not None and joined.registry == found.registry
     if joined is not None and not same:
@@ -433,7 +433,7 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
         app.confirm("Join this registry?", yes=yes)
     station.unlock()
     with station.lock("registry connect", app.note):
-        place = plant.membership.FILES + str(files.resolve()) if files else plant.reaching.absolute(url or "")
+        place = plant.membership.FILES + str(files.resolve()) if files else plant.connecting.absolute(url or "")
         events = plant.owner.join(station, found, url=place, told=past)
     post.close()
     app.emit({**told, "events": events}, f"Joined {found.name}. Next: teds-provision registry sync")
@@ -446,7 +446,7 @@ def connect(app: App, url: str | None, files: Path | None, roster_file: Path | N
 def disconnect(app: App, yes: bool, dry_run: bool) -> None:
     """Leave the registry. Keys, pins and pages stay; the roster no longer applies here."""
     station = app.station()
-    held = plant.folding.require_roster(station)
+    held = plant.apply_pages.require_roster(station)
     said = (
         f"Leave {held.name}: this station stops publishing, and trusts every station that the CA certified again,"
         " removed ones included. It stays on the roster until the owner runs: registry remove"
@@ -461,14 +461,14 @@ def disconnect(app: App, yes: bool, dry_run: bool) -> None:
     app.emit({"registry": held.registry}, f"Left {held.name}.")
 
 
-def _post(station: Station, files: Path | None) -> tuple[Post, bool]:
+def _post(station: Station, files: Path | None) -> tuple[Transport, bool]:
     """What carries, and whether it is what this station joined by."""
-    joined = plant.reaching.post_of(station)
+    joined = plant.connecting.post_of(station)
     if files is not None:
-        named = plant.files.FilesPost(files)
+        named = plant.folder_transport.FolderTransport(files)
         return named, joined is not None and joined.where == str(files.resolve())
     if joined is None:
-        plant.folding.require_roster(station)
+        plant.apply_pages.require_roster(station)
         raise NotFoundError(
             "This station does not know how to reach the registry.", hint="Name a folder: registry sync --files DIR"
         )
@@ -487,7 +487,7 @@ def sync(app: App, files: Path | None) -> None:
     post, connected = _post(station, files)
     try:
         done = plant.sync.sync(station, post, connected=connected)
-        doors = plant.reaching.check_database(station, post)
+        doors = plant.connecting.check_database(station, post)
     finally:
         post.close()
     alarms = [one for one in station.plant.tables.alarms() if not one.seen]
@@ -510,7 +510,7 @@ def sync(app: App, files: Path | None) -> None:
         raise click.exceptions.Exit(4)
 
 
-def _synced(station: Station, done: Synced, alarms: Sequence[Any]) -> str:
+def _synced(station: Station, done: SyncResult, alarms: Sequence[Any]) -> str:
     lines = [f"{_count(done.pushed, 'page')} out, {done.fetched} in"]
     if done.parcels_in or done.parcels_out:
         lines.append(f"{_count(done.parcels_out, 'parcel')} out, {done.parcels_in} in")
@@ -545,7 +545,7 @@ def status(app: App) -> None:
     removed.
     """
     station = app.station()
-    held = plant.folding.require_roster(station)
+    held = plant.apply_pages.require_roster(station)
     record = station.plant.joined
     assert record is not None
     found = plant.status.status(station, record, held)
@@ -559,7 +559,7 @@ def status(app: App) -> None:
         "synced": record.synced,
         "conflicts": found.conflicts,
         "alarms": [_alarm(station, one) for one in found.alarms],
-        "to_rotate": plant.leaving.due(station),
+        "to_rotate": plant.removed_members.due(station),
         "heads": list(found.heads),
         "open_doors": station.plant.tables.doors(),
     }
@@ -593,7 +593,7 @@ def _shown(station: Station, found: PlantStatus) -> str:
         lines.append(f"{one.name:<{wide}}  {' '.join(one.roles):<{roles}}  page {one.n:>5}  {age:>8}  {one.state}")
     last = f"last sync {local_time(found.record.synced)}" if found.record.synced else "never synced"
     lines.append(f"{_count(found.conflicts, 'conflict')}, {_count(found.unsent, 'event')} unsent, {last}")
-    review, due = plant.leaving.last(station), plant.leaving.due(station)
+    review, due = plant.removed_members.last(station), plant.removed_members.due(station)
     if review is not None and due:
         tap = f"; {review.alone} need a tap" if review.alone else ""
         lines.append(f"to rotate: {due} of {review.of}{tap}")
@@ -633,7 +633,7 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
     Every page's signature has been checked.
     """
     station = app.station()
-    held = plant.folding.require_roster(station)
+    held = plant.apply_pages.require_roster(station)
     of = None
     if name is not None:
         found = held.named(name)
@@ -705,9 +705,9 @@ def vouch(app: App, nodes: Sequence[str], every: bool, yes: bool, dry_run: bool)
 def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool, dry_run: bool) -> None:
     """Accept one of a station's two histories, here only."""
     station = app.station()
-    held = plant.folding.require_roster(station)
+    held = plant.apply_pages.require_roster(station)
     member = plant.owner.require_member(held, name)
-    post = plant.files.FilesPost(files) if files is not None else plant.reaching.post_of(station)
+    post = plant.folder_transport.FolderTransport(files) if files is not None else plant.connecting.post_of(station)
     if dry_run:
         n, hash = plant.membership.branch(station, member.fingerprint, page, post)
         app.emit(
@@ -718,7 +718,7 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool,
     station.unlock()
     with plant.sync.alone(station):
         n, hash = plant.membership.accept(station, member.fingerprint, page, post)
-        plant.folding.apply_claims(station)
+        plant.apply_pages.apply_claims(station)
     app.emit({"done": 1, "n": n, "hash": hash}, f"Page {n} ({hash[:16]}) and its successors count here.")
 
 
@@ -754,7 +754,7 @@ def seen(app: App) -> None:
     They are still shown, but commands no longer exit 4 because of them.
     """
     station = app.station()
-    plant.folding.require_roster(station)
+    plant.apply_pages.require_roster(station)
     with station.lock("registry seen", app.note):
         done = station.plant.tables.see_alarms()
         station.audit("registry", None, "seen", alarms=done)
@@ -782,7 +782,7 @@ def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str]
     if sum(one is not None for one in (member, closed, mend)) > 1:
         raise click.UsageError("Give one of --member, --close and --mend.")
     station = app.station()
-    held = plant.folding.require_roster(station)
+    held = plant.apply_pages.require_roster(station)
     if member is not None:
         asked = document.open_request(read_file(member))
         left = held.removed_one(asked.fingerprint)

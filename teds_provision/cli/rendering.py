@@ -15,7 +15,7 @@ import click
 
 from teds_provision.errors import TedsProvisionError, UsageError
 from teds_provision.sanitize import sanitize
-from teds_provision.talk.progress import NOTHING, Reporter, Silent, StepResult
+from teds_provision.talk.progress import NOTHING, Reporter, SilentReporter, StepResult
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -97,7 +97,7 @@ def reporter_for(app: App, *, several: bool = False) -> Reporter:
     ``several`` nodes are worked on at once: their lines come between each other.
     """
     if app.json or app.quiet:
-        return Silent()
+        return SilentReporter()
     if several or not sys.stderr.isatty():
         return LineReporter(app)
     live = LiveReporter(app)

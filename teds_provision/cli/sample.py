@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.measure.sampling import Sample
-    from teds_provision.measure.trusting import Trusted
-    from teds_provision.protocol.operation.commands import OperationReply, Power
+    from teds_provision.measure.verified_session import VerifiedSession
+    from teds_provision.protocol.operation.commands import OperationReply, PowerReply
     from teds_provision.station.station import Station
     from teds_provision.talk.conversation import Conversation
     from teds_provision.talk.meeting import IdleStop
@@ -65,12 +65,12 @@ def where_met(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> 
 
 
 @contextmanager
-def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *, by: str) -> Iterator[Trusted]:
+def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *, by: str) -> Iterator[VerifiedSession]:
     """A node in a session, its datasheet verified for the command ``by``; left in order."""
     reporter = reporter_for(app)
     with talk.meeting.meet(station, over_the_bus(links), uuid, reporter, before=lambda: station.unlock(uuid)) as node:
         try:
-            yield measure.trusting.open_trusted(station, node, by=by)
+            yield measure.verified_session.open_trusted(station, node, by=by)
         except talk.conversation.SessionLostError as lost:
             raise lost.cause from lost
 
@@ -123,11 +123,13 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
     """Show a node's operating mode, the state of each channel, and power."""
     station = app.station()
     uuid = station.nodes.resolve(node)
-    power: operation.commands.Power | None = None
+    power: operation.commands.PowerReply | None = None
     with trusted_node(app, station, links, uuid, by="mode") as trusted:
-        found = measure.trusting.operation(trusted.node)
+        found = measure.verified_session.operation(trusted.node)
         try:
-            power = operation.commands.Power.decode(trusted.node.send(operation.commands.POWER, "to tell its power"))
+            power = operation.commands.PowerReply.decode(
+                trusted.node.send(operation.commands.POWER, "to tell its power")
+            )
         except NodeRefusedError:
             power = None
         names = {one.number: one.name for one in trusted.sheet.channels}
@@ -157,7 +159,7 @@ def _charging(station: Station, node: Conversation) -> dict[str, Any] | None:
     return dict(json.loads(known.charging)) if known is not None and known.charging else None
 
 
-def _mode(console: Console, found: OperationReply, names: dict[int, str], power: Power | None) -> None:
+def _mode(console: Console, found: OperationReply, names: dict[int, str], power: PowerReply | None) -> None:
     from rich.markup import escape
     from rich.table import Table
 

@@ -25,11 +25,19 @@ from teds_provision.protocol import handover
 from teds_provision.protocol.messages.message import Argument, Message, decode_message, looks_like_message
 from teds_provision.sanitize import sanitize
 from teds_provision.teds import convert, decode
-from teds_provision.teds.codec.model import AccessCode, Conformity, Decoded, Edition, Finding, TimeInstance
+from teds_provision.teds.codec.model import AccessCode, Conformity, DecodedTeds, Edition, Finding, TimeInstance
 from teds_provision.teds.formats import Kind, TedsBlock, class_of, detect, read_blocks, with_class
 from teds_provision.teds.formats.jsonform import FORMAT, value_to_json
 from teds_provision.teds.guard import check_calibration
-from teds_provision.teds.show import Shown, ShownField, describe, finding_to_json, hexadecimal, instant, shown_to_json
+from teds_provision.teds.show import (
+    ShownField,
+    ShownTeds,
+    describe,
+    finding_to_json,
+    hexadecimal,
+    instant,
+    shown_to_json,
+)
 
 if TYPE_CHECKING:
     from rich import markup
@@ -198,7 +206,7 @@ def print_files(console: Console, files: Iterable[ShownFile]) -> None:
             console.print(f"[{colour}]{guarded.severity}[/]  {escape(where + guarded.message)}")
 
 
-def print_teds(console: Console, shown: Shown) -> None:
+def print_teds(console: Console, shown: ShownTeds) -> None:
     """Print one TEDS: title, meaning, fields, findings."""
     decoded = shown.decoded
     colour = "green" if decoded.verdict in _GOOD else "red"
@@ -295,7 +303,7 @@ class ShownFile:
 
     name: str
     kind: Kind
-    teds: tuple[Shown, ...] = ()
+    teds: tuple[ShownTeds, ...] = ()
     message: Message | None = None
     bundle: BundleHeader | None = None
     guard: tuple[GuardFinding, ...] = ()
@@ -436,7 +444,7 @@ def _converted(blocks: Sequence[TedsBlock], edition: Edition) -> tuple[list[Teds
     out: list[TedsBlock] = []
     said: dict[int, tuple[Finding, ...]] = {}
     for number, block in enumerate(blocks):
-        decoded: Decoded = decode(block.octets)
+        decoded: DecodedTeds = decode(block.octets)
         try:
             octets, findings = convert(decoded, edition)
         except BadDataError as error:

@@ -17,7 +17,7 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.measure.present import Present
+    from teds_provision.measure.link_survey import LinkSurvey
     from teds_provision.station.station import Station
 
 _SHOWN = 20
@@ -30,7 +30,7 @@ def start(app: App, ctx: click.Context) -> None:
     except NotFoundError:
         found: dict[str, Any] = {
             "station": None,
-            "links": [_link(each) for each in measure.present.readers()],
+            "links": [_link(each) for each in measure.link_survey.readers()],
             "nodes": [],
             "problems": [],
             "next": "teds-provision init",
@@ -68,7 +68,7 @@ def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
     known = [node["uuid"] for node in steps.inventory.inventory(station, steps.inventory.search(station))]
     remembered = sorted(set(station.nodes.last_places([bytes.fromhex(uuid) for uuid in known]).values()))
     places = [place for place in named.places if named.nfc] + list(named.buses or remembered)
-    present = [*measure.present.look(station, places), *([] if named.nfc else measure.present.readers())]
+    present = [*measure.link_survey.look(station, places), *([] if named.nfc else measure.link_survey.readers())]
     nodes = [_node(station, link.place, address, who) for link in present for address, who in link.nodes]
     problems = [{"what": link.why, "fix": link.cure} for link in present if link.state == "down"]
     problems += [{"what": text, "fix": f"teds-provision identify --via can --can {link.place.partition(':')[2]}"}
@@ -82,7 +82,7 @@ def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
     }
 
 
-def _link(link: Present) -> dict[str, Any]:
+def _link(link: LinkSurvey) -> dict[str, Any]:
     return {"place": link.place, "state": link.state, "nodes": len(link.nodes), "why": link.why or None}
 
 

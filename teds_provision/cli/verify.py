@@ -20,7 +20,7 @@ from teds_provision.sanitize import printable
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.steps.verify import Verified
+    from teds_provision.steps.verify import Verification
     from teds_provision.steps.verify_files import FileVerdict
 
 
@@ -66,7 +66,7 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
     app.conclude(result, lambda console: _table(console, verified), done.error)
 
 
-def _table(console: Console, verified: Verified) -> None:
+def _table(console: Console, verified: Verification) -> None:
     from rich.markup import escape
     from rich.table import Table
 

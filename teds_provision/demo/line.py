@@ -23,17 +23,17 @@ from teds_provision.plant.evidence import export
 from teds_provision.plant.jobs import digest_of_file, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer
-from teds_provision.plant.verify_evidence import EvidenceTotals, Grounds, judge_file
+from teds_provision.plant.verify_evidence import EvidenceAnchors, EvidenceTotals, judge_file
 from teds_provision.protocol.plant.document import MemberRequest
 from teds_provision.protocol.plant.job import CalibrationRule, Job, seal_job
 from teds_provision.protocol.plant.roster import Role
 from teds_provision.protocol.plant.signing import SignRequest
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.provision import Provisioned, inspect, provision
+from teds_provision.steps.provision import ProvisionResult, inspect, provision
 from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import Reporter, Silent, StepResult
+from teds_provision.talk.progress import Reporter, SilentReporter, StepResult
 from teds_provision.teds.profile.load import find_profile
 
 OTHER = "tactile-finger-sensor"
@@ -43,7 +43,7 @@ _LOGIN = "SCRAM-SHA-256$4096:" + "A" * 22 + "==$" + "B" * 43 + "=:" + "C" * 43 +
 
 
 @dataclass(frozen=True)
-class LineDone:
+class LineDemoResult:
     """What the line came to: its steps, units that passed, evidence by verdict, and the boards that were refused."""
 
     steps: tuple[StepResult, ...]
@@ -52,7 +52,7 @@ class LineDone:
     refused: tuple[str, ...]
 
 
-class _AtHand:
+class _LocalOffice:
     """The office, in this process: a request goes to it directly."""
 
     def __init__(self, station: Station) -> None:
@@ -62,7 +62,7 @@ class _AtHand:
         return answer(self._station, request.octets)
 
 
-def run_line(reporter: Reporter, say: Callable[[str], None]) -> LineDone:
+def run_line(reporter: Reporter, say: Callable[[str], None]) -> LineDemoResult:
     """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
     folder = Path(tempfile.mkdtemp(prefix="teds-provision-demo-"))
     try:
@@ -73,7 +73,7 @@ def run_line(reporter: Reporter, say: Callable[[str], None]) -> LineDone:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _run(demo: Demo) -> LineDone:
+def _run(demo: Demo) -> LineDemoResult:
     demo.say("One owner: the office has the CA key and signs; the bench keys boards but signs nothing.")
     office, bench = _plant(demo)
     demo.say(f"The order: {BOARDS} boards of one type, a job signed by the office as keeper.")
@@ -95,11 +95,11 @@ def _run(demo: Demo) -> LineDone:
         with (
             demo.steps.step(f"test {name}") as step,
             run_node(folders[name], "--nfc", demo.nfc) as uuid,
-            meet(office, demo.over("nfc"), uuid, Silent()) as node,
+            meet(office, demo.over("nfc"), uuid, SilentReporter()) as node,
         ):
-            step.detail = inspect(office, node, tests, Silent()).verified.verdict
+            step.detail = inspect(office, node, tests, SilentReporter()).verified.verdict
     totals = _proof(demo, office, bench)
-    return LineDone(tuple(demo.steps.done), line.passed, totals.words, tuple(refused))
+    return LineDemoResult(tuple(demo.steps.done), line.passed, totals.words, tuple(refused))
 
 
 def _plant(demo: Demo) -> tuple[Station, Station]:
@@ -115,7 +115,7 @@ def _plant(demo: Demo) -> tuple[Station, Station]:
         now = datetime.now(UTC).replace(microsecond=0)
         request = MemberRequest(bench.name, bench.point, bench.identity.signature, _LOGIN, now)
         roles: frozenset[Role] = frozenset({"line"})
-        plant.folding.put_roster(office, plant.owner.signed(office, plant.owner.add(office, request, roles)))
+        plant.apply_pages.put_roster(office, plant.owner.signed(office, plant.owner.add(office, request, roles)))
         roster = plant.jobs.roster_of(office)
         plant.owner.join(bench, roster, url=None, told=[])
         step.detail = f"roster {roster.version}: office keeper, sign; bench line"
@@ -147,14 +147,14 @@ def _job(demo: Demo, office: Station, bench: Station) -> LineRun:
         take_job(office, document)
         job = take_job(bench, document)
         step.detail = f"“{job.title}”, {job.total} boards, signed by office"
-    return LineRun(bench, job, office=_AtHand(office))
+    return LineRun(bench, job, office=_LocalOffice(office))
 
 
 def _build(demo: Demo, line: LineRun, uuid: bytes) -> int:
     """Provision one board of the job; its unit."""
-    with meet(line.station, demo.over("nfc"), uuid, Silent()) as node:
-        done: Provisioned = provision(
-            line.station, node, line.order, accept=lambda who: None, reporter=Silent(), line=line
+    with meet(line.station, demo.over("nfc"), uuid, SilentReporter()) as node:
+        done: ProvisionResult = provision(
+            line.station, node, line.order, accept=lambda who: None, reporter=SilentReporter(), line=line
         )
     require_authentic(done.verified)
     return int(line.unit_to_json(uuid)["unit"])
@@ -179,7 +179,7 @@ def _proof(demo: Demo, office: Station, bench: Station) -> EvidenceTotals:
         for station in (bench, office):
             rows = station.plant.line.evidence()
             for path in export(station.plant.line, rows, demo.folder / "evidence" / station.name):
-                totals.add(judge_file(Grounds(office.ca, roster=plant.jobs.roster_of(office)), path))
+                totals.add(judge_file(EvidenceAnchors(office.ca, roster=plant.jobs.roster_of(office)), path))
         if totals.exit_code:
             raise LinkError(f"The demo's evidence is not valid: {totals.words}")
         step.detail = f"{totals.files} files valid: " + ", ".join(f"{n} {word}" for word, n in totals.words.items())

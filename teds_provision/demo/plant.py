@@ -22,14 +22,14 @@ from teds_provision.demo.story import PROFILE, Demo, _node, provision_over
 from teds_provision.errors import NotAuthenticError
 from teds_provision.handover import trust
 from teds_provision.links.ports import free_port
-from teds_provision.plant.post import Post
+from teds_provision.plant.transport import Transport
 from teds_provision.protocol.plant.document import open_request
 from teds_provision.protocol.plant.roster import Role, Roster, Share
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
-from teds_provision.steps.read import read_image
+from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, StepResult
@@ -42,7 +42,7 @@ _ROLES: Final[dict[str, frozenset[Role]]] = {
 
 
 @dataclass(frozen=True)
-class PlantDone:
+class PlantDemoResult:
     """The steps, by what the stations met (``postgresql`` or ``files``), and the verdict before and after the theft."""
 
     steps: tuple[StepResult, ...]
@@ -52,7 +52,7 @@ class PlantDone:
     seconds: float
 
 
-def run_plant_demo(reporter: Reporter, say: Callable[[str], None]) -> PlantDone:
+def run_plant_demo(reporter: Reporter, say: Callable[[str], None]) -> PlantDemoResult:
     """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
     folder = Path(tempfile.mkdtemp(prefix="teds-provision-plant-"))
     folder.chmod(0o755)  # the server runs as another user
@@ -76,7 +76,7 @@ class _Story:
         self.places.mkdir(mode=0o700)
         self.secret = secrets.token_hex(16)
 
-    def run(self) -> PlantDone:
+    def run(self) -> PlantDemoResult:
         demo, began = self.demo, time.monotonic()
         if self.bin is None:
             lacks = "PostgreSQL 15" if find_spec("psycopg") is not None else "psycopg (the extra registry)"
@@ -108,7 +108,7 @@ class _Story:
         if (before, after) != ("authentic", "not authentic"):
             raise NotAuthenticError(f"South found the board {before} before the theft and {after} after it.")
         by = "files" if self.server is None else "postgresql"
-        return PlantDone(tuple(demo.steps.done), by, before, after, time.monotonic() - began)
+        return PlantDemoResult(tuple(demo.steps.done), by, before, after, time.monotonic() - began)
 
     def __getitem__(self, name: str) -> Station:
         return self.stations[name]
@@ -190,12 +190,12 @@ class _Story:
             finally:
                 post.close()
 
-    def _post(self, station: Station) -> Post:
+    def _post(self, station: Station) -> Transport:
         if self.server is None:
             folder = self.demo.folder / "stick"
             folder.mkdir(exist_ok=True)
-            return plant.files.FilesPost(folder)
-        return plant.reaching.database(station, self.server.url(_DATABASE))
+            return plant.folder_transport.FolderTransport(folder)
+        return plant.connecting.database(station, self.server.url(_DATABASE))
 
     def _login(self, station: Station) -> Any:
         """The station's request, and at the database its login."""
@@ -205,7 +205,7 @@ class _Story:
         return asked
 
     def _change(self, draft: Roster) -> None:
-        plant.folding.put_roster(self["north"], plant.owner.signed(self["north"], draft))
+        plant.apply_pages.put_roster(self["north"], plant.owner.signed(self["north"], draft))
 
     def _keep(self, name: str, station: Station) -> None:
         self.stations[name] = station

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from teds_provision import steps as steps_room
 from teds_provision import vault
 from teds_provision.errors import LinkError, NotAuthenticError, PolicyError
-from teds_provision.handover.incoming import Imported, Proven, import_bundle, plan_import, prove_nodes
+from teds_provision.handover.incoming import ImportResult, NodeProof, import_bundle, plan_import, prove_nodes
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
 from teds_provision.handover.trust import Candidate, add
@@ -37,8 +37,8 @@ from teds_provision.station.station import Station, initialise
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.steps.read import read_image
+from teds_provision.steps.provision import ProvisionResult, provision
+from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import require_authentic
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.store import TrustRecord
@@ -46,10 +46,10 @@ from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, StepResult, Steps
 
 if TYPE_CHECKING:
-    from teds_provision.measure import blocks, held_actuator, request, runner, sinks, trusting
+    from teds_provision.measure import blocks, held_actuator, request, runner, sinks, verified_session
     from teds_provision.measure import buses as buses_room
 else:  # numpy and what measuring needs are loaded when the demo gets there
-    blocks, buses_room, held_actuator, runner, sinks, trusting, request = (
+    blocks, buses_room, held_actuator, runner, sinks, verified_session, request = (
         late(f"teds_provision.measure.{name}")
         for name in ("blocks", "buses", "held_actuator", "runner", "sinks", "trusting", "request")
     )
@@ -80,7 +80,7 @@ class Demo:
         return LinkSettings(via, self.nfc, self.can, timeout=15.0)
 
 
-def provision_over(demo: Demo, station: Station, via: str, uuid: bytes, order: BuildOrder) -> Provisioned:
+def provision_over(demo: Demo, station: Station, via: str, uuid: bytes, order: BuildOrder) -> ProvisionResult:
     """Every step of provisioning, from one station over one link; raises unless the node is authentic at the end."""
     with meet(station, demo.over(via), uuid, demo.reporter) as node:
         done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
@@ -133,9 +133,9 @@ def _send(demo: Demo, sender: Station, receiver: Station, mode: Literal["copy", 
         step.detail = f"{mode}: {sealed.octets} octets, sealed to {receiver.fingerprint[:16]}"
     with demo.steps.step("import-keys") as step:
         planned = plan_import(receiver, bundle.read_bytes())
-        taken = planned if isinstance(planned, Imported) else import_bundle(receiver, planned)
+        taken = planned if isinstance(planned, ImportResult) else import_bundle(receiver, planned)
         outcome = prove_nodes(receiver, demo.over("can"), taken.uuids, demo.reporter)[0]
-        if not isinstance(outcome, Proven):
+        if not isinstance(outcome, NodeProof):
             raise LinkError(f"The node was not reached after the import: {outcome.why}")
         rotated = ", key rotated, the sender is locked out" if outcome.rotated else ""
         step.detail = f"proven in a session{rotated}"
@@ -225,7 +225,7 @@ def move_gripper(demo: Demo, station: Station, uuid: bytes) -> None:
     """Operate the gripper within its limits for a moment, let go, and see that it is safe."""
     with demo.steps.step("set") as step:
         with meet(station, demo.over("can"), uuid, demo.reporter) as node:
-            trusted = trusting.open_trusted(station, node, by="demo")
+            trusted = verified_session.open_trusted(station, node, by="demo")
             with held_actuator.HeldActuator(trusted, 1, unit="mm") as hand:
                 applied = hand.apply(OPENING)
                 time.sleep(min(hand.pause, _HALF_WAY))
@@ -241,7 +241,7 @@ _STOP_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
-class DemoDone:
+class DemoResult:
     """The demo's steps and its verdict: that of the last verification."""
 
     steps: tuple[StepResult, ...]
@@ -249,7 +249,7 @@ class DemoDone:
     uuid: bytes
 
 
-def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoDone:
+def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoResult:
     """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
     folder = Path(tempfile.mkdtemp(prefix="teds-provision-demo-"))
     try:
@@ -260,7 +260,7 @@ def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoDone:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _run(demo: Demo) -> DemoDone:
+def _run(demo: Demo) -> DemoResult:
     demo.say("Two base stations with their own keys, and a virtual sensor on a reader, in a process of its own.")
     first, second = new_station(demo, "bench"), new_station(demo, "crane")
     with demo.steps.step("start node") as step:
@@ -277,7 +277,7 @@ def _run(demo: Demo) -> DemoDone:
         " the gripper."
     )
     _measure(demo, second)
-    return DemoDone(tuple(demo.steps.done), done.verified.verdict, demo.uuid)
+    return DemoResult(tuple(demo.steps.done), done.verified.verdict, demo.uuid)
 
 
 def _measure(demo: Demo, station: Station) -> None:

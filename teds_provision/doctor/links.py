@@ -20,9 +20,9 @@ from teds_provision.doctor.checks import Finding, Result, System, check
 from teds_provision.errors import LinkError, NoReaderError, UsageError
 from teds_provision.links import can as can_room
 from teds_provision.links import nfc as nfc_room
+from teds_provision.links.ble.ble_errors import POWER_HINT
 from teds_provision.links.ble.bluez import AdapterFacts, adapters
 from teds_provision.links.ble.spec import BleSpec, parse_spec
-from teds_provision.links.ble.troubles import POWER_HINT
 from teds_provision.links.ports import free_port
 
 READERS: Final = {
@@ -274,7 +274,7 @@ def can(system: System) -> Iterator[Finding]:
     except (LinkError, UsageError) as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
-    rivals = can_room.shared.Rivals(bus.spec.source)
+    rivals = can_room.bus_multiplexer.AddressConflicts(bus.spec.source)
     until = time.monotonic() + _LISTEN_SECONDS
     try:
         while (left := until - time.monotonic()) > 0:

@@ -19,7 +19,7 @@ from typing import Any, Final
 from teds_provision import __version__
 from teds_provision.doctor.checks import Finding, System
 from teds_provision.errors import TedsProvisionError
-from teds_provision.store import Choice, Store
+from teds_provision.store import AuditFilter, Store
 from teds_provision.store.database import has_store
 
 FORMAT: Final = "teds-report/1"
@@ -121,7 +121,7 @@ def _last_errors(system: System, mask: Mask) -> list[dict[str, str]]:
         return []
     try:
         with Store.open(system.home) as opened:
-            choice = Choice(failed=True)
+            choice = AuditFilter(failed=True)
             entries = list(opened.audit.chosen(choice, opened.audit.before(choice, last=_LAST_ERRORS)))
     except TedsProvisionError:
         return []

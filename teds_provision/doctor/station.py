@@ -15,7 +15,7 @@ from teds_provision import vault as vault_room
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import KeyringUnavailableError, NotFoundError, StoreError, VaultError
 from teds_provision.files import open_to_read
-from teds_provision.store import Choice, Store
+from teds_provision.store import AuditFilter, Store
 from teds_provision.store.database import has_store
 from teds_provision.store.lock import holder_of
 from teds_provision.vault import agent
@@ -101,7 +101,7 @@ def _audit(opened: Store) -> Iterator[Finding]:
 
 
 def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
-    taken = [entry.at for entry in opened.audit.chosen(Choice(act="backup"))]
+    taken = [entry.at for entry in opened.audit.chosen(AuditFilter(act="backup"))]
     fix = "teds-provision backup FILE"
     if not taken:
         why = "There is no backup: without one, losing this machine means re-keying every node at the bench."

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from teds_provision.errors import LinkError, NoNodeError, NotAuthenticError, PolicyError, TedsProvisionError
 from teds_provision.handover import gc_pause
 from teds_provision.handover.deny import deny_all, why_not
-from teds_provision.handover.pending import IMPORTED, Notes, digest_of
+from teds_provision.handover.pending import IMPORTED, BundleNotes, digest_of
 from teds_provision.links import LinkSettings, open_port
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.protocol.handover.bundle import Bundle, BundledNode, OpenedBundle, check_times, open_bundle
@@ -31,7 +31,7 @@ from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
-from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, pages, utc_now
+from teds_provision.store import BulkRows, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, pages, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Reporter
 
@@ -75,8 +75,8 @@ class ImportedRows:
                 self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
             self.station.handovers.take_in(self._rows(taken))
 
-    def _rows(self, taken: Sequence[PlannedNode]) -> Batch:
-        return Batch(
+    def _rows(self, taken: Sequence[PlannedNode]) -> BulkRows:
+        return BulkRows(
             nodes=[self._node(one) for one in taken],
             whitelist=[entry for entry in map(self._entry, taken) if entry is not None],
             keys=[self._key(one.node) for one in taken if one.decision != "same"],
@@ -188,11 +188,11 @@ class ImportPlan:
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportResult:
     """A bundle that was taken in, now or before (``fresh`` False), with its receipt as the octets of a file."""
 
     row: Handover
-    notes: Notes
+    notes: BundleNotes
     receipt: bytes
     fresh: bool
 
@@ -220,7 +220,7 @@ class NothingImportedError(PolicyError):
 
 
 @gc_pause.put_off()
-def plan_import(station: Station, source: Source, now: datetime | None = None) -> ImportPlan | Imported:
+def plan_import(station: Station, source: Source, now: datetime | None = None) -> ImportPlan | ImportResult:
     """Open and check a bundle (octets, or a file), and say what would become of each node; changes nothing.
 
     A bundle that was taken in before is returned as such, even when it has expired since. What it says of sequences
@@ -261,7 +261,7 @@ def _is_known_ca(station: Station, ca: bytes) -> bool:
 
 
 @gc_pause.put_off()
-def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = None) -> Imported:
+def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = None) -> ImportResult:
     """Take the bundle in, all of it in one transaction, and sign its receipt."""
     bundle = plan.opened.bundle
     receipt = Receipt(
@@ -274,7 +274,7 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
         created=(now or datetime.now(UTC)).replace(microsecond=0),
     )
     text = seal_receipt(receipt, station.vault.identity())
-    notes = Notes(
+    notes = BundleNotes(
         tuple(node.uuid.hex() for node in bundle.nodes),
         plan.content,
         bundle.ca.hex(),
@@ -307,19 +307,19 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
         taken = [uuid for uuid in notes.uuids if uuid not in refused]
         detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}
         station.audit("import", None, "done", refused=len(receipt.refused), **detail)
-    return Imported(row, notes, text, fresh=True)
+    return ImportResult(row, notes, text, fresh=True)
 
 
-def _before(row: Handover, content: str) -> Imported:
+def _before(row: Handover, content: str) -> ImportResult:
     """A bundle of an id that came before: the same import again, or PolicyError where its content differs."""
-    notes = Notes.from_json(row.nodes)
+    notes = BundleNotes.from_json(row.nodes)
     if notes.content != content:
         raise PolicyError(
             f"The bundle {row.id} was already imported with different content: it is a replay or a forgery.",
             hint="Ask its sender by voice what was sent.",
         )
     assert row.receipt is not None
-    return Imported(row, notes, row.receipt.encode("ascii"), fresh=False)
+    return ImportResult(row, notes, row.receipt.encode("ascii"), fresh=False)
 
 
 def _check_certified(station: Station, opened: OpenedBundle) -> None:
@@ -446,7 +446,7 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
 
 
 @dataclass(frozen=True)
-class Proven:
+class NodeProof:
     """A node that opened a session; ``rotated``: under a new key, so that the former holders are locked out."""
 
     uuid: bytes
@@ -455,14 +455,14 @@ class Proven:
 
 
 @dataclass(frozen=True)
-class NotProven:
+class NodeProofFailure:
     """A node that did not, and why."""
 
     uuid: bytes
     why: str
 
 
-def prove_node(station: Station, node: Conversation) -> Proven:
+def prove_node(station: Station, node: Conversation) -> NodeProof:
     """Have one node prove its identity key and open a session; a move's key is rotated in it.
 
     Raises TedsProvisionError: link, other key, unknown key.
@@ -471,7 +471,7 @@ def prove_node(station: Station, node: Conversation) -> Proven:
     identify(station, node)
     held = require_session(station, node)
     station.audit("handover", node.uuid, "taken over", epoch=held.record.epoch, rotated=due)
-    return Proven(node.uuid, held.record.epoch, rotated=due)
+    return NodeProof(node.uuid, held.record.epoch, rotated=due)
 
 
 def proven_of(station: Station, uuids: Iterable[bytes]) -> set[bytes]:
@@ -490,16 +490,16 @@ def prove_nodes(
     reporter: Reporter,
     *,
     hold: Callable[[], AbstractContextManager[object]] = nullcontext,
-) -> list[Proven | NotProven]:
+) -> list[NodeProof | NodeProofFailure]:
     """Meet each of these nodes on the chosen link, in whatever order they come; ends when none comes in time.
 
     ``hold`` holds the store for as long as one node is worked on, never while one is waited for.
     """
-    waiting, outcomes = set(uuids), dict[bytes, Proven | NotProven]()
+    waiting, outcomes = set(uuids), dict[bytes, NodeProof | NodeProofFailure]()
     try:
         port = open_port(links)
     except LinkError as error:
-        return [NotProven(uuid, error.message) for uuid in uuids]
+        return [NodeProofFailure(uuid, error.message) for uuid in uuids]
     try:
         while waiting:
             try:
@@ -514,9 +514,9 @@ def prove_nodes(
                 with Conversation(contact, notice=reporter.notice) as node, hold():
                     outcomes[uuid] = prove_node(station, node)
             except TedsProvisionError as error:
-                outcomes[uuid] = NotProven(uuid, error.message)
+                outcomes[uuid] = NodeProofFailure(uuid, error.message)
     except LinkError as error:
-        return [outcomes.get(uuid, NotProven(uuid, error.message)) for uuid in uuids]
+        return [outcomes.get(uuid, NodeProofFailure(uuid, error.message)) for uuid in uuids]
     finally:
         port.close()
-    return [outcomes.get(uuid, NotProven(uuid, "it was not met")) for uuid in uuids]
+    return [outcomes.get(uuid, NodeProofFailure(uuid, "it was not met")) for uuid in uuids]

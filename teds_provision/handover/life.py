@@ -28,20 +28,20 @@ UNCONFIRMED = ", unconfirmed"
 
 
 @dataclass(frozen=True)
-class Revoked:
+class RevokeResult:
     """A node on the deny list; ``fresh`` False where there was nothing left to do."""
 
     entry: RevocationRecord
     fresh: bool
 
 
-def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
+def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
     """Ban a node's key: off the whitelist, its keys deleted, and a signed statement that travels in every bundle."""
     if not why.strip() or not is_label(why):
         raise UsageError("Say why, in printable text of at most 1,024 characters.")
     present = station.policy.revocation(uuid)
     if present is not None and not station.keys.held(uuid) and station.pins.entry(uuid) is None:
-        return Revoked(present, fresh=False)
+        return RevokeResult(present, fresh=False)
     statement = None
     if present is None:
         now = datetime.now(UTC)
@@ -59,7 +59,7 @@ def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
         station.audit("revoke", uuid, "done", why=why, keys=keys)
     entry = station.policy.revocation(uuid)
     assert entry is not None
-    return Revoked(entry, fresh=True)
+    return RevokeResult(entry, fresh=True)
 
 
 def is_retired(record: NodeRecord | None) -> bool:
@@ -92,7 +92,7 @@ def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: 
 
 
 @dataclass(frozen=True)
-class TakeOver:
+class TakeoverPlan:
     """What a spare takes over; ``calibration`` counts the channels whose calibration goes along."""
 
     old: NodeRecord
@@ -105,7 +105,7 @@ class TakeOver:
         return (self.old.retired or "").startswith(f"{REPLACED} {self.new.uuid.hex()}")
 
 
-def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration: bool) -> TakeOver:
+def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration: bool) -> TakeoverPlan:
     """Look at both nodes.
 
     Raises NotFoundError (OLD unknown, no calibration known), UsageError, NotWhitelistedError (NEW).
@@ -118,7 +118,7 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
     station.policy.require_not_given_away(old)
     station.policy.require_whitelisted(new)
     after = station.nodes.get(new) or NodeRecord(new)
-    return TakeOver(before, after, _calibration_of(station, before) if copy_calibration else {})
+    return TakeoverPlan(before, after, _calibration_of(station, before) if copy_calibration else {})
 
 
 def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
@@ -140,7 +140,7 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
     return blocks
 
 
-def hand_on(station: Station, plan: TakeOver) -> HandedOn:
+def hand_on(station: Station, plan: TakeoverPlan) -> HandedOn:
     """Move what is still with the old node: groups, chosen names, measurements; for a spare in its place already."""
     with station.transaction():
         moved = station.measurements.hand_on(plan.old.uuid, plan.new.uuid)
@@ -149,7 +149,7 @@ def hand_on(station: Station, plan: TakeOver) -> HandedOn:
     return moved
 
 
-def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) -> tuple[tuple[str, ...], HandedOn]:
+def take_over(station: Station, plan: TakeoverPlan, receipt: ResetReceipt | None) -> tuple[tuple[str, ...], HandedOn]:
     """Give the spare name, groups, measurements and profile, and take the old node out of service, in one transaction.
 
     Returns warnings (with a calibration the spare's datasheet is built, to be signed and written), and what it moved.

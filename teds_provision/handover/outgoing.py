@@ -18,17 +18,17 @@ from typing import NamedTuple
 from teds_provision.errors import NotFoundError, PolicyError, UsageError
 from teds_provision.files import new_file, require_new
 from teds_provision.handover import gc_pause
-from teds_provision.handover.pending import OPEN, Notes, content_digest
+from teds_provision.handover.pending import OPEN, BundleNotes, content_digest
 from teds_provision.handover.trust import find_trusted
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_pieces
-from teds_provision.protocol.handover.envelope import Sealing
+from teds_provision.protocol.handover.envelope import EnvelopeWriter
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import (
-    Batch,
-    ExportFacts,
+    BulkRows,
+    ExportEligibility,
     Handover,
     Holder,
     NodeRecord,
@@ -57,7 +57,7 @@ class ExportOrder:
     ca: str | None = None
 
 
-class Leaving(NamedTuple):
+class LeavingNode(NamedTuple):
     """A node that goes, by its UUID, and the key that it has now: the rest is read when it is sealed."""
 
     uuid: bytes
@@ -65,7 +65,7 @@ class Leaving(NamedTuple):
     epoch: int
 
 
-Chosen = list[Leaving]
+Chosen = list[LeavingNode]
 
 
 class Selection:
@@ -73,11 +73,11 @@ class Selection:
 
     def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
         self.order, self.receivers = order, receivers
-        self.keys: dict[bytes, Leaving] = {}
+        self.keys: dict[bytes, LeavingNode] = {}
         self.pending: set[bytes] = set()
         for uuid, key_id, epoch, state in _keys(station, order.nodes):
             if state == "active":
-                self.keys[uuid] = Leaving(uuid, key_id, epoch)
+                self.keys[uuid] = LeavingNode(uuid, key_id, epoch)
             else:
                 self.pending.add(uuid)
         self.stays = _why_nodes_stay(station, order.nodes)
@@ -170,7 +170,7 @@ class Selection:
         if self.order.mode != "move":
             return []
         rows = [row for row in self.open.values() if row.mode == "move" and set(row.peers) == self.receivers]
-        together = _of_the_last_run([Notes.from_json(row.nodes) for row in rows])
+        together = _of_the_last_run([BundleNotes.from_json(row.nodes) for row in rows])
         return sorted(bytes.fromhex(uuid) for one in together for uuid in one.uuids)
 
 
@@ -184,7 +184,7 @@ def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[
 
 def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[bytes, str]:
     """Why each node of the wanted ones, or of all, cannot go, whatever its key is; "" for nothing."""
-    known: Iterable[Sequence[NodeRecord | ExportFacts]] = (
+    known: Iterable[Sequence[NodeRecord | ExportEligibility]] = (
         pages(station.nodes.each_shown())
         if wanted is None
         else (list(station.nodes.of_page(page).values()) for page in pages(wanted))
@@ -197,7 +197,7 @@ def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[
     return stays
 
 
-def _why_node_stays(node: NodeRecord | ExportFacts, pin: str) -> str:
+def _why_node_stays(node: NodeRecord | ExportEligibility, pin: str) -> str:
     if (node.retired or "").startswith(OUT_OF_SERVICE):
         return "it is out of service"
     if node.point is None:
@@ -207,7 +207,7 @@ def _why_node_stays(node: NodeRecord | ExportFacts, pin: str) -> str:
     return ""
 
 
-def _of_the_last_run(notes: list[Notes]) -> list[Notes]:
+def _of_the_last_run(notes: list[BundleNotes]) -> list[BundleNotes]:
     """The newest bundle, with all that one command made together with it."""
     return [one for one in notes if one.run and one.run == notes[-1].run] or notes[-1:]
 
@@ -229,7 +229,7 @@ class ExportPlan:
     receivers: tuple[TrustRecord, ...]
     ca: bytes
     signatures: Mapping[str, bytes]
-    nodes: tuple[Leaving, ...]
+    nodes: tuple[LeavingNode, ...]
     skipped: tuple[tuple[bytes, str], ...]
     content: str
     expires: datetime
@@ -240,7 +240,7 @@ class ExportPlan:
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportResult:
     """A bundle that lies in a file; ``fresh`` False where it lay there already."""
 
     plan: ExportPlan
@@ -279,13 +279,15 @@ def plan_exports(
     if order.ca is not None:
         nodes = [node for node, kept in _with_ca(station, nodes) if kept == ca]
     signatures = {record.fingerprint: _signature(station, ca, record) for record in receivers}
-    common = _Common(order, receivers, ca, signatures, now or datetime.now(UTC), station.fingerprint, selection.rows)
+    common = _SharedFields(
+        order, receivers, ca, signatures, now or datetime.now(UTC), station.fingerprint, selection.rows
+    )
     plans = [common.plan(part, _other_holders(station, part, receivers)) for part in selection.parts(nodes, most)]
     return [replace(plans[0], skipped=tuple(skipped)), *plans[1:]]
 
 
 @dataclass(frozen=True)
-class _Common:
+class _SharedFields:
     """What the bundles of one command share."""
 
     order: ExportOrder
@@ -302,7 +304,7 @@ class _Common:
         listed = ((node.uuid, node.key_id, node.epoch) for node in sorted(nodes, key=attrgetter("uuid")))
         content = content_digest(self.sender, to, mode, self.ca, listed)
         earlier = next((row for row in self.rows if _is_same(row, content, self.now)), None)
-        expires = datetime.fromisoformat(Notes.from_json(earlier.nodes).expires) if earlier else None
+        expires = datetime.fromisoformat(BundleNotes.from_json(earlier.nodes).expires) if earlier else None
         if expires is None or expires <= self.now:
             expires = self.now.replace(microsecond=0) + timedelta(days=self.order.days)
         return ExportPlan(
@@ -317,12 +319,12 @@ class _Common:
             expires,
             earlier,
             also_held_by,
-            Notes.from_json(earlier.nodes).run if earlier else "",
+            BundleNotes.from_json(earlier.nodes).run if earlier else "",
         )
 
 
 @gc_pause.put_off()
-def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> Exported:
+def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> ExportResult:
     """Seal the bundle into a new file of mode 0600; a move's keys rest from before anybody could open that file.
 
     What is written before the store has it is a draft without signature and tag, under a name of its own.
@@ -331,7 +333,7 @@ def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetim
     """
     before = _already(plan, output)
     if before is not None:
-        return Exported(plan, before, output.stat().st_size, fresh=False)
+        return ExportResult(plan, before, output.stat().st_size, fresh=False)
     require_new(output)
     made = _sealing(station, plan, now or datetime.now(UTC))
     with new_file(output) as file:
@@ -341,11 +343,11 @@ def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetim
         with station.transaction():
             _record(station, plan, (made.sha256, made.signed_sha256))
         file.write(end)
-    return Exported(plan, made.sha256, made.octets, fresh=True)
+    return ExportResult(plan, made.sha256, made.octets, fresh=True)
 
 
 @dataclass(frozen=True)
-class Sealed:
+class SealedBundle:
     """A bundle that lies in no file; :func:`record_export` has to be durable before anybody gets it."""
 
     plan: ExportPlan
@@ -355,14 +357,14 @@ class Sealed:
 
 
 @gc_pause.put_off()
-def seal_export(station: Station, plan: ExportPlan, now: datetime) -> Sealed:
+def seal_export(station: Station, plan: ExportPlan, now: datetime) -> SealedBundle:
     """Seal a bundle in memory, for a parcel. Raises StoreError, VaultError, PolicyError (a node changed)."""
     made = _sealing(station, plan, now)
     octets = b"".join([*made.body(), made.end()])
-    return Sealed(plan, octets, made.sha256, made.signed_sha256)
+    return SealedBundle(plan, octets, made.sha256, made.signed_sha256)
 
 
-def record_export(station: Station, sealed: Sealed) -> None:
+def record_export(station: Station, sealed: SealedBundle) -> None:
     """Note who holds what from now on; the caller holds the transaction in which the parcel is kept."""
     _record(station, sealed.plan, (sealed.sha256, sealed.signed_sha256))
 
@@ -380,11 +382,11 @@ def plan_copies(
     if not nodes:
         return []
     signatures = {receiver.fingerprint: _signature(station, station.ca, receiver)}
-    common = _Common(order, (receiver,), station.ca, signatures, now, station.fingerprint, selection.rows)
+    common = _SharedFields(order, (receiver,), station.ca, signatures, now, station.fingerprint, selection.rows)
     return [common.plan(part, ()) for part in selection.parts(nodes, most)]
 
 
-def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[Path]) -> list[Exported]:
+def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[Path]) -> list[ExportResult]:
     """Seal each plan into its file. Of several, all keys of a move rest before the first file exists.
 
     Raises what :func:`export_bundle` raises; the same command carries on.
@@ -394,7 +396,7 @@ def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[
             require_new(output)
     ready = list(plans)
     if len(plans) > 1:
-        run = plans[0].earlier and Notes.from_json(plans[0].earlier.nodes).run
+        run = plans[0].earlier and BundleNotes.from_json(plans[0].earlier.nodes).run
         with station.transaction():
             ready = [plan if plan.earlier else _announced(station, plan, run or plans[0].id) for plan in plans]
     return [export_bundle(station, plan, output) for plan, output in zip(ready, outputs, strict=True)]
@@ -432,7 +434,7 @@ def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
     return next(iter(found.values()))
 
 
-def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[Leaving, bytes]]:
+def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[LeavingNode, bytes]]:
     """Each node with the CA that it keeps."""
     own = station.ca
     for page in pages(nodes):
@@ -470,7 +472,7 @@ def _other_holders(station: Station, nodes: Chosen, receivers: tuple[TrustRecord
 def _is_same(row: Handover, content: str, now: datetime) -> bool:
     if row.direction != "out" or row.state != OPEN:
         return False
-    notes = Notes.from_json(row.nodes)
+    notes = BundleNotes.from_json(row.nodes)
     return notes.content == content and (row.mode == "move" or datetime.fromisoformat(notes.expires) > now)
 
 
@@ -483,7 +485,7 @@ def _already(plan: ExportPlan, output: Path) -> str | None:
     return digest if digest in _files_before(plan) else None
 
 
-def _sealing(station: Station, plan: ExportPlan, now: datetime) -> Sealing:
+def _sealing(station: Station, plan: ExportPlan, now: datetime) -> EnvelopeWriter:
     own = station.identity.certificate(plan.ca, station.point)
     bundle = Bundle(
         id=plan.id,
@@ -502,7 +504,7 @@ def _sealing(station: Station, plan: ExportPlan, now: datetime) -> Sealing:
     return seal_pieces(bundle, _bundled(station, plan.nodes), len(plan.nodes), station.vault.identity(), to)
 
 
-def _bundled(station: Station, nodes: Iterable[Leaving]) -> Iterator[BundledNode]:
+def _bundled(station: Station, nodes: Iterable[LeavingNode]) -> Iterator[BundledNode]:
     """Read the nodes and unwrap their keys, a page at a time."""
     for page in pages(nodes):
         uuids_of_page = [node.uuid for node in page]
@@ -533,7 +535,7 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
     files = _files_before(plan)
     uuids_hex = tuple(node.uuid.hex() for node in plan.nodes)
     keys = tuple(node.key_id for node in plan.nodes)
-    notes = Notes(
+    notes = BundleNotes(
         uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), (*files, *digests), (), keys, plan.run
     )
     peers = tuple(record.fingerprint for record in plan.receivers)
@@ -556,14 +558,16 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
 
 def _files_before(plan: ExportPlan) -> tuple[str, ...]:
     """Digests of the files that this very handover gave in earlier runs."""
-    return Notes.from_json(plan.earlier.nodes).files if plan.earlier else ()
+    return BundleNotes.from_json(plan.earlier.nodes).files if plan.earlier else ()
 
 
 def _record_holders(station: Station, plan: ExportPlan, peers: tuple[str, ...]) -> None:
     """Who holds the keys from now on: each receiver of a copy beside us; of a move, that is, the receiver alone."""
     now, uuids_of_nodes = utc_now(), [node.uuid for node in plan.nodes]
     if plan.mode == "copy":
-        station.handovers.take_in(Batch(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers]))
+        station.handovers.take_in(
+            BulkRows(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers])
+        )
     elif plan.earlier is None:
         tombstones = [Tombstone(uuid, peers[0], plan.id, now) for uuid in uuids_of_nodes]
-        station.handovers.take_in(Batch(tombstones=tombstones))
+        station.handovers.take_in(BulkRows(tombstones=tombstones))

@@ -1,7 +1,7 @@
 """Handovers under way: what the store remembers of a bundle, the receipt that closes it, and undoing a move.
 
 A bundle that left is ``open`` until its receipt comes (``closed``) or it is taken back (``undone``); one that came is
-``imported``. What belongs to it beyond the columns of the table is in :class:`Notes`.
+``imported``. What belongs to it beyond the columns of the table is in :class:`BundleNotes`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
 
 
 @dataclass(frozen=True)
-class Notes:
+class BundleNotes:
     """What is kept with a bundle: its nodes (UUIDs in hex), what it says in one digest, and its files.
 
     ``files`` are the SHA-256 of every file that was sealed with this content, and of what was signed in each: sealing
@@ -47,7 +47,7 @@ class Notes:
         return json.dumps(vars(self))
 
     @classmethod
-    def from_json(cls, text: str) -> Notes:
+    def from_json(cls, text: str) -> BundleNotes:
         """Read what :meth:`to_json` gave."""
         members: dict[str, Any] = json.loads(text)
         refused = tuple((str(uuid), str(why)) for uuid, why in members["refused"])
@@ -108,7 +108,7 @@ def find_handover(station: Station, text: str) -> Handover:
 
 
 @dataclass(frozen=True)
-class Undone:
+class UndoResult:
     """A move taken back: its nodes, and whether there was anything to do."""
 
     row: Handover
@@ -116,13 +116,13 @@ class Undone:
     fresh: bool
 
 
-def undo(station: Station, row: Handover) -> Undone:
+def undo(station: Station, row: Handover) -> UndoResult:
     """Take a move back before its receipt: the keys may be used again, and the next contact rotates them.
 
     The receiver may have the bundle all the same; until the rotation it can use the keys. Raises PolicyError for a
     copy and for a move whose receipt came.
     """
-    uuids = tuple(bytes.fromhex(uuid) for uuid in Notes.from_json(row.nodes).uuids)
+    uuids = tuple(bytes.fromhex(uuid) for uuid in BundleNotes.from_json(row.nodes).uuids)
     if row.mode == "copy":
         raise PolicyError(
             "A copy cannot be undone: the other station holds the keys.",
@@ -134,18 +134,18 @@ def undo(station: Station, row: Handover) -> Undone:
             hint="Have the nodes handed back: export-keys there, import-keys here.",
         )
     if row.state == UNDONE:
-        return Undone(row, uuids, fresh=False)
+        return UndoResult(row, uuids, fresh=False)
     with station.transaction():
         for uuid in uuids:
             _lift(station, uuid, row)
             station.plant.tell("undone", uuid, bundle=row.id, peer=row.peers[0], why="taken back")
         station.handovers.put(replace(row, state=UNDONE))
         station.audit("handover", None, "undone", handover=row.id, nodes=[uuid.hex() for uuid in uuids])
-    return Undone(row, uuids, fresh=True)
+    return UndoResult(row, uuids, fresh=True)
 
 
 @dataclass(frozen=True)
-class Closed:
+class CloseResult:
     """A bundle whose receipt came: what the receiver took in and what not; ``fresh`` False when it came before."""
 
     row: Handover
@@ -153,7 +153,7 @@ class Closed:
     fresh: bool
 
 
-def close(station: Station, octets: bytes) -> Closed:
+def close(station: Station, octets: bytes) -> CloseResult:
     """Take in the receipt of a bundle that left here; a move is then over: its keys are deleted.
 
     Only the keys that were in the bundle are deleted, and only while this very move stands: a receipt that comes after
@@ -172,7 +172,7 @@ def close(station: Station, octets: bytes) -> Closed:
     text = octets.strip().decode("ascii")
     texts = (row.receipt or "").split()
     if receipt.sender in map(signer_of, texts) or (row.state == CLOSED and row.mode == "move"):
-        return Closed(row, receipt, fresh=False)
+        return CloseResult(row, receipt, fresh=False)
     if row.state == UNDONE:
         station.audit("handover", None, "receipt of an undone move", handover=row.id)
         raise PolicyError(
@@ -188,7 +188,7 @@ def close(station: Station, octets: bytes) -> Closed:
         station.handovers.put(row)
         detail = {"handover": row.id, "imported": len(receipt.imported), "refused": len(receipt.refused)}
         station.audit("handover", None, "receipt", state=state, **{"from": receipt.sender}, **detail)
-    return Closed(row, receipt, fresh=True)
+    return CloseResult(row, receipt, fresh=True)
 
 
 def _settle(station: Station, row: Handover, receipt: Receipt) -> None:
@@ -205,7 +205,7 @@ def _settle(station: Station, row: Handover, receipt: Receipt) -> None:
 
 def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -> None:
     """Delete the keys that were in the bundle, of the nodes that rest because of this very move."""
-    notes = Notes.from_json(row.nodes)
+    notes = BundleNotes.from_json(row.nodes)
     left = dict(zip(notes.uuids, notes.keys, strict=False))
     for uuid in uuids:
         tombstone = station.policy.tombstone(uuid)
@@ -228,7 +228,7 @@ def signer_of(text: str) -> str:
 
 
 def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
-    notes = Notes.from_json(row.nodes)
+    notes = BundleNotes.from_json(row.nodes)
     if receipt.to != station.fingerprint or receipt.sender not in row.peers:
         raise PolicyError(
             f"The receipt is between {receipt.to[:16]} and {receipt.sender[:16]}, not between this station and one"
@@ -266,7 +266,7 @@ def list_handovers(station: Station, now: datetime) -> list[ListedHandover]:
     names = {record.fingerprint: record.name for record in station.policy.trusted("station")}
     listed = []
     for row in station.handovers.all():
-        notes = Notes.from_json(row.nodes)
+        notes = BundleNotes.from_json(row.nodes)
         expired = row.state == OPEN and datetime.fromisoformat(notes.expires) <= now
         peers = tuple(names.get(peer, peer[:16]) for peer in row.peers)
         listed.append(ListedHandover(row, peers, len(notes.uuids), notes.expires, expired))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from teds_provision import vault as vaults
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, UsageError
 from teds_provision.files import read_limited
-from teds_provision.handover.pending import OPEN, Notes, signer_of
+from teds_provision.handover.pending import OPEN, BundleNotes, signer_of
 from teds_provision.protocol.handover.jose import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, from_pem, station_key_message, verify
@@ -466,7 +466,7 @@ def _brought_cas(station: Station) -> dict[bytes, set[str]]:
     brought: dict[bytes, set[str]] = {}
     for row in station.handovers.all():
         if row.direction == "in":
-            brought.setdefault(bytes.fromhex(Notes.from_json(row.nodes).ca), set()).update(row.peers)
+            brought.setdefault(bytes.fromhex(BundleNotes.from_json(row.nodes).ca), set()).update(row.peers)
     return brought
 
 

@@ -111,7 +111,7 @@ class Link(Protocol):
 
 
 @runtime_checkable
-class Repeats(Protocol):
+class ResendLink(Protocol):
     """A link on which a request can be sent again on purpose, to see what the node makes of it."""
 
     def again(self, frame: bytes) -> bytes:
@@ -122,7 +122,7 @@ class Repeats(Protocol):
 
 
 @runtime_checkable
-class OnABus(Protocol):
+class MultiStationLink(Protocol):
     """A node's line on a bus, where others can ask it as well (CAN): under the addresses of other base stations.
 
     ``address`` is the node's; a node that has moved is asked at its new one once this is set.
@@ -147,7 +147,7 @@ class OnABus(Protocol):
 
 
 @runtime_checkable
-class Announces(Protocol):
+class AnnouncingLink(Protocol):
     """A link on which the node says beforehand how it wants to be talked to (NFC: the record ``Tp``)."""
 
     @property
@@ -156,7 +156,7 @@ class Announces(Protocol):
 
 
 @runtime_checkable
-class Prompt(Protocol):
+class DeadlineLink(Protocol):
     """A link on which a request can be given up soon: what it orders would be too late afterwards."""
 
     def exchange_within(self, frame: bytes, seconds: float) -> bytes:
@@ -167,7 +167,7 @@ class Prompt(Protocol):
 
 
 @runtime_checkable
-class Timed(Protocol):
+class TimestampedLink(Protocol):
     """A link that knows better than who asks when messages left and came, in seconds of ``time.monotonic()``.
 
     ``left``: a moment just before the first request left since this was last set to 0. ``came``: when the last reply
@@ -179,14 +179,14 @@ class Timed(Protocol):
 
 
 @runtime_checkable
-class Spaced(Protocol):
+class PacedLink(Protocol):
     """A link on which a reply can be asked for with a ``gap`` (ms) between its frames, so that data find room there."""
 
     gap: int
 
 
 @runtime_checkable
-class Abandons(Protocol):
+class CancellableLink(Protocol):
     """A link whose exchange is given up (NodeSilentError) as soon as ``hopeless()`` says that no reply will come."""
 
     hopeless: Callable[[], bool]

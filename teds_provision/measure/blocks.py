@@ -136,7 +136,7 @@ class GroupRows:
 
 
 @dataclass(frozen=True)
-class Invalid:
+class InvalidValues:
     """So many values of a channel that are not valid, and why, as half a sentence."""
 
     channel: int
@@ -144,7 +144,7 @@ class Invalid:
     count: int
 
 
-def why_invalid(found: Sequence[Invalid]) -> str:
+def why_invalid(found: Sequence[InvalidValues]) -> str:
     """``66 of channel 1 above its high limit, 360 °``, the largest counts first; empty where all are valid."""
     most = sorted(found, key=lambda one: -one.count)
     told = [f"{one.count} of channel {one.channel}: {one.why}" for one in most[:MOST_TOLD]]
@@ -166,7 +166,7 @@ class NodeReport:
     invalid: int = 0
     clock_error: float | None = None
     time: float = 0.0  # unix seconds
-    invalid_why: tuple[Invalid, ...] = ()
+    invalid_why: tuple[InvalidValues, ...] = ()
 
 
 @dataclass(frozen=True)

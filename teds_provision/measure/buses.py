@@ -13,10 +13,10 @@ from teds_provision.errors import LinkError
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.hearing import CanHearing, Hearing
-from teds_provision.measure.lookout import AirHearing, AirLookout, Lookout, air_time
+from teds_provision.measure.discovery import BleDiscovery, BleStreamReceiver, CanDiscovery, air_time
 from teds_provision.measure.planning import BusShare, BusTime
-from teds_provision.measure.sightings import Sighting, Sightings
+from teds_provision.measure.presence import Presence, Sighting
+from teds_provision.measure.stream_receiver import CanStreamReceiver, StreamReceiver
 from teds_provision.protocol.messages.ble import LEAST_MTU
 from teds_provision.protocol.operation.can_frames import DriveAddress, StreamAssembly, cut
 
@@ -25,7 +25,7 @@ class MeasuredBus:
     """One link that carries data: ``port``, who hears its data messages, how much of it is taken, who is on it."""
 
     def __init__(
-        self, port: CanPort | BlePort, hearing: Hearing, share: BusShare, lookout: Lookout | AirLookout
+        self, port: CanPort | BlePort, hearing: StreamReceiver, share: BusShare, lookout: CanDiscovery | BleDiscovery
     ) -> None:
         self.port, self.hearing, self.share, self.lookout = port, hearing, share, lookout
         self.reading = threading.Lock()
@@ -59,14 +59,14 @@ class MeasuredBus:
             self.port.send(Frame(identifier, piece.data, self.port.spec.fd))
 
 
-def bus_at(port: CanPort | BlePort, sightings: Sightings, *, poll: float | None) -> MeasuredBus:
+def bus_at(port: CanPort | BlePort, sightings: Presence, *, poll: float | None) -> MeasuredBus:
     """The bus, or the adapter, behind a port."""
     if isinstance(port, BlePort):
         return MeasuredBus(
-            port, AirHearing(port), BusShare(BusTime(mtu=LEAST_MTU)), AirLookout(port, sightings, poll=poll)
+            port, BleStreamReceiver(port), BusShare(BusTime(mtu=LEAST_MTU)), BleDiscovery(port, sightings, poll=poll)
         )
     time = BusTime(port.spec.bitrate, port.spec.data_bitrate if port.spec.fd else None)
-    return MeasuredBus(port, CanHearing(port), BusShare(time), Lookout(port, sightings, poll=poll))
+    return MeasuredBus(port, CanStreamReceiver(port), BusShare(time), CanDiscovery(port, sightings, poll=poll))
 
 
 class Buses:
@@ -82,7 +82,7 @@ class Buses:
         news: Callable[[Sighting], None] = lambda _sighting: None,
         note: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        self.sightings = Sightings(news, note)
+        self.sightings = Presence(news, note)
         self._poll: float | None = None
         self._buses: dict[str, MeasuredBus] = {}
         for port in ports:

@@ -320,14 +320,14 @@ def _extend(hull: list[tuple[int, int]], point: tuple[int, int]) -> None:
 
 
 @dataclass(frozen=True)
-class Wall:
+class WallClock:
     """Monotonic to unix seconds, read once, to ``error`` seconds."""
 
     offset: float
     error: float = 0.0
 
     @classmethod
-    def now(cls, readings: int = 9) -> Wall:
+    def now(cls, readings: int = 9) -> WallClock:
         """The narrowest of a few readings, so that an interruption between the two clocks does not count."""
         found = []
         for _ in range(readings):
@@ -351,16 +351,16 @@ class HostClock:
     looks and sets; any thread reads :attr:`present`.
     """
 
-    def __init__(self, wall: Wall | None = None) -> None:
-        self._walls = [wall or Wall.now()]
+    def __init__(self, wall: WallClock | None = None) -> None:
+        self._walls = [wall or WallClock.now()]
         self.present: tuple[int, float] = 0, self._walls[0].offset
         self.apart = 0.0
 
     def was_set(self) -> bool:
         """Whether the system's clock was set by more than STEP since; costs a microsecond where it was not."""
-        return self._differs(Wall.now(1)) and self._differs(Wall.now())
+        return self._differs(WallClock.now(1)) and self._differs(WallClock.now())
 
-    def _differs(self, wall: Wall) -> bool:
+    def _differs(self, wall: WallClock) -> bool:
         apart = max(0.0, abs(wall.offset - self.present[1]) - wall.error)
         if apart > STEP:
             return True
@@ -369,7 +369,7 @@ class HostClock:
 
     def set_anew(self) -> float:
         """Follow the system's clock; gives the seconds by which it was put forward."""
-        self._walls.append(Wall.now())
+        self._walls.append(WallClock.now())
         before, self.present = self.present, (len(self._walls) - 1, self._walls[-1].offset)
         self.apart = 0.0
         return self.present[1] - before[1]
@@ -383,7 +383,7 @@ class HostClock:
         return time.monotonic() + self.present[1]
 
 
-class Monotone:
+class MonotonicStamps:
     """Stamps of one stream never go back, whatever a refit says."""
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from teds_provision.errors import BadDataError, LinkError, PolicyError, TedsProvisionError
 from teds_provision.measure.sinks.lines import plain
-from teds_provision.measure.trusting import DEAD_MAN, LEASE, Trusted, claim, operation
+from teds_provision.measure.verified_session import DEAD_MAN, LEASE, VerifiedSession, claim, operation
 from teds_provision.protocol.operation.commands import ChannelState, idle, write_data_set
 from teds_provision.talk.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
@@ -27,7 +27,7 @@ LONGEST_PAUSE = 0.5  # seconds; a node that may not be moved any more is let go 
 
 
 @dataclass(frozen=True)
-class Applied:
+class AppliedSetPoint:
     """What an actuator was told: ``value`` in ``unit``, as the raw value stands for it after rounding."""
 
     channel: int
@@ -60,7 +60,9 @@ def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
 class HeldActuator:
     """One claimed actuator: ``with HeldActuator(…) as hand: hand.apply(value)`` again and again; let go at the end."""
 
-    def __init__(self, trusted: Trusted, number: int, *, unit: str | None = None, dead_man: int = DEAD_MAN) -> None:
+    def __init__(
+        self, trusted: VerifiedSession, number: int, *, unit: str | None = None, dead_man: int = DEAD_MAN
+    ) -> None:
         channel = trusted.channel(number)
         if not channel.actuator:
             raise BadDataError(f"Channel {number} of node {trusted.uuid} is not an actuator.")
@@ -99,7 +101,7 @@ class HeldActuator:
         """Seconds after which a value that stays is sent again, and the node's standing is looked at."""
         return min(self._dead_man / 4000, LONGEST_PAUSE)
 
-    def apply(self, value: float) -> Applied:
+    def apply(self, value: float) -> AppliedSetPoint:
         """Send one value; raises PolicyError (limits, the node), LinkError where it was not taken in time."""
         octets = self.octets_of(value)
         began = time.monotonic()
@@ -119,4 +121,4 @@ class HeldActuator:
         raw = self._interpreter.reader.raw(octets)
         shown = float(np.asarray(self._interpreter.values(raw).value)[0])
         taken = self.unit.from_si(self._interpreter.unit.to_si(shown)) if np.isfinite(shown) else value
-        return Applied(self.channel.number, taken, self.unit.text, plain(raw.tolist()[0]))
+        return AppliedSetPoint(self.channel.number, taken, self.unit.text, plain(raw.tolist()[0]))

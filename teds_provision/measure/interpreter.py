@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from teds_provision.measure.blocks import Block, Invalid
-from teds_provision.measure.clock import ClockMap, HostClock, Monotone
+from teds_provision.measure.blocks import Block, InvalidValues
+from teds_provision.measure.clock import ClockMap, HostClock, MonotonicStamps
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.protocol.operation.subscription import StreamMessage, StreamPlan
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
@@ -36,7 +36,7 @@ class StreamInterpreter:
         run: int,
         clock: ClockMap,
         host: HostClock,
-        monotone: Monotone,
+        monotone: MonotonicStamps,
         *,
         raw_only: str = "",
     ) -> None:
@@ -66,9 +66,9 @@ class StreamInterpreter:
         self._invalid: dict[tuple[int, str], int] = {}
 
     @property
-    def invalid(self) -> tuple[Invalid, ...]:
+    def invalid(self) -> tuple[InvalidValues, ...]:
         """How many values of the run were not valid, and why. Of any thread."""
-        return tuple(Invalid(channel, why, count) for (channel, why), count in self._invalid.copy().items())
+        return tuple(InvalidValues(channel, why, count) for (channel, why), count in self._invalid.copy().items())
 
     def blocks(self, messages: Sequence[StreamMessage]) -> list[Block]:
         """Messages as blocks: one for all that follow on from each other, and another one after each gap."""

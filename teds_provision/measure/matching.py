@@ -19,7 +19,7 @@ from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.base import ROWS
 from teds_provision.station.groups import ALL
 from teds_provision.station.station import Station
-from teds_provision.steps.reading import verdict_of
+from teds_provision.steps.readings import verdict_of
 from teds_provision.store import Search
 from teds_provision.teds.fits import Requirement, judge, met, parse_fits
 from teds_provision.teds.profile.load import default_folders, find_profile, is_profile_name
@@ -30,7 +30,7 @@ _KINDS = ("type", "name", "group")
 
 
 @dataclass(frozen=True)
-class Match:
+class NodeMatch:
     """An expression, read: ``types`` by name, ``names`` as patterns, ``groups``, and what the datasheet must fit.
 
     ``text`` is the expression as it was said.
@@ -43,7 +43,7 @@ class Match:
     fits: Requirement | None = None
 
     @classmethod
-    def parse(cls, text: str) -> Match:
+    def parse(cls, text: str) -> NodeMatch:
         """Read an expression; raises UsageError with the term that is wrong."""
         parts = [part.strip() for part in text.split(",")]
         if parts == [ALL]:
@@ -107,13 +107,13 @@ class Match:
 
 
 @dataclass(frozen=True)
-class Unsigned:
+class UnsignedNodes:
     """Every node that describes itself, which nobody has signed: ``ncap run --adopt --unverified``."""
 
     text: str = "unverified"
 
     def why_not(self, station: Station, uuid: bytes) -> str:
-        """As :meth:`Match.why_not`."""
+        """As :meth:`NodeMatch.why_not`."""
         if station.measurements.detection != "transparent":
             return "detection is not transparent"
         judged = verdict_of(station, uuid)
@@ -126,20 +126,20 @@ class Unsigned:
 
 
 @dataclass(frozen=True)
-class Of:
+class ListedNodes:
     """The nodes of a list that grows: those that were adopted while they were measured."""
 
     uuids: Set[bytes]
     text: str = "adopted"
 
     def why_not(self, station: Station, uuid: bytes) -> str:
-        """As :meth:`Match.why_not`."""
+        """As :meth:`NodeMatch.why_not`."""
         judged = verdict_of(station, uuid) if uuid in self.uuids else None
         return "" if judged is not None and judged.verified.verdict == "authentic" else "it was not adopted here"
 
 
 @dataclass(frozen=True)
-class Load:
+class NodeLoad:
     """What a node would take by the datasheet that is kept of it.
 
     ``bus`` is the share of an empty one (None: not known), ``rate`` that of the fastest channel in Hz.
@@ -154,20 +154,20 @@ class Load:
         return self.channels * min(scalar_rate, self.rate) + (2 * min(self.rate, ROWS) if rows else 0)
 
 
-def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: BusTime) -> Load:
-    """What a node would take; ``Load()`` where no datasheet of it is kept, or none that can be measured so."""
+def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: BusTime) -> NodeLoad:
+    """What a node would take; ``NodeLoad()`` where no datasheet of it is kept, or none that can be measured so."""
     image = station.nodes.datasheet(uuid)
     if image is None:
-        return Load()
+        return NodeLoad()
     sensors = [one for one in Sheet.of(image).channels if one.sample and not one.actuator]
     try:
         plans = plan_node(
             sensors_of(sensors, (), request.kind), time, rate=request.rate, kind=request.kind, at_most=True
         )
     except (BadDataError, PolicyError):  # its session will say so
-        return Load()
+        return NodeLoad()
     rates = [1 / period for period in plans.periods().values() if period > 0]
-    return Load(plans.load, len(rates), max(rates, default=0.0))
+    return NodeLoad(plans.load, len(rates), max(rates, default=0.0))
 
 
 def _is_profile(kind: str, station: Station) -> bool:

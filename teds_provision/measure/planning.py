@@ -1,7 +1,7 @@
 """Which streams a node is asked for: channels by period, instants in a message, the gap, what the bus bears.
 
 Raises PolicyError where an asked rate does not fit, with the fastest that does; without one the datasheet's periods
-are slowed to what fits, and ``Plans.slowed`` says so.
+are slowed to what fits, and ``NodePlans.slowed`` says so.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class BusShare:
 
 
 @dataclass(frozen=True)
-class Plans:
+class NodePlans:
     """Streams of one node; ``load`` is the share of the bus that they take at worst-case stuffing."""
 
     streams: tuple[StreamPlan, ...]
@@ -152,7 +152,7 @@ def plan_node(
     start: int = SOON,
     slower: float = 1.0,
     at_most: bool = False,
-) -> Plans:
+) -> NodePlans:
     """Streams over these channels of one node; ``rate`` in Hz for all of them, ``slower`` multiplies every period.
 
     ``at_most``: a channel whose datasheet gives fewer samples than ``rate`` is measured at the datasheet's rate, where
@@ -174,7 +174,7 @@ def plan_node(
         )
     slowed = _slowed(_fastest(groups), _fastest(paced), rate, by_bus=factor > slower)
     streams = tuple(replace(plan, subscribe=replace(plan.subscribe, gap=gap)) for plan in plans)
-    return Plans(streams, load - bus.taken, slowed)
+    return NodePlans(streams, load - bus.taken, slowed)
 
 
 def _fastest(groups: Sequence[_Group]) -> int:

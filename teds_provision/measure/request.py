@@ -10,7 +10,7 @@ from typing import Any
 
 from teds_provision.errors import PolicyError
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
-from teds_provision.measure.trusting import DEAD_MAN, LEASE
+from teds_provision.measure.verified_session import DEAD_MAN, LEASE
 from teds_provision.protocol.operation.stream_commands import StreamKind
 from teds_provision.teds.fits import Fit, Requirement, judge, met
 from teds_provision.teds.sheet import Sheet

@@ -28,12 +28,12 @@ from teds_provision.measure.blocks import (
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.clock import HostClock
 from teds_provision.measure.grid import Grid
-from teds_provision.measure.keeper import NodeKeeper
+from teds_provision.measure.node_supervisor import NodeSupervisor
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running import trigger
 from teds_provision.measure.running.common_start import TOGETHER, CommonStart
 from teds_provision.measure.sinks import Sink
-from teds_provision.measure.trusting import Trusted
+from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.station.station import Station
 
 BEAT = 0.02  # seconds between rows of the group
@@ -55,7 +55,7 @@ class Watcher:
 
 
 @dataclass(frozen=True)
-class Ended:
+class MeasurementEnd:
     """How a measurement ended: the ``end`` event of ``measure --json``, and the worst error, None for none."""
 
     nodes: list[dict[str, Any]]
@@ -78,10 +78,10 @@ class Measurement:
     watcher: Watcher = field(default_factory=Watcher)
     began: Callable[[], None] = lambda: None
     lent: set[bytes] = field(default_factory=set)
-    keepers: list[NodeKeeper] = field(default_factory=list, init=False)
+    keepers: list[NodeSupervisor] = field(default_factory=list, init=False)
     ready: threading.Event = field(default_factory=threading.Event, init=False)  # nodes may join
 
-    def run(self, stop: threading.Event, duration: float | None = None) -> Ended:
+    def run(self, stop: threading.Event, duration: float | None = None) -> MeasurementEnd:
         """Measure until ``stop``, for ``duration`` seconds of data, or until no node is left.
 
         Raises what a sink's ``open`` raises; everything else stands in the result.
@@ -109,7 +109,7 @@ class Measurement:
             self.request.require.expect(self.uuids)
         events = self._events = Events(self._block, self._describe, self._report, self._read)
         self.keepers = [
-            NodeKeeper(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
+            NodeSupervisor(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
         ]
         for keeper in self.keepers:
@@ -226,7 +226,7 @@ class Measurement:
         self.watcher.note(news.words)
 
     @contextmanager
-    def session(self, uuid: bytes) -> Iterator[Trusted | None]:
+    def session(self, uuid: bytes) -> Iterator[VerifiedSession | None]:
         """The session in which a node is measured now, for one more command; None where there is none.
 
         The node's other exchanges wait meanwhile: be brief. Raises nothing of its own.
@@ -243,11 +243,11 @@ class Measurement:
         """Whether nodes come and go."""
         return self.request.newcomers
 
-    def join(self, uuid: bytes) -> NodeKeeper:
+    def join(self, uuid: bytes) -> NodeSupervisor:
         """Take in a node that has come, or come back; nobody else notices. Its counts go on where they ended."""
         keeper = self._keeper(uuid)
         if keeper is None:
-            keeper = NodeKeeper(
+            keeper = NodeSupervisor(
                 self.station, self.buses, uuid, self.request, self._host, self._events, self._common_start
             )
             self.keepers = [*self.keepers, keeper]
@@ -281,7 +281,7 @@ class Measurement:
             keeper.start()
         self.lent.discard(uuid)
 
-    def _keeper(self, uuid: bytes) -> NodeKeeper | None:
+    def _keeper(self, uuid: bytes) -> NodeSupervisor | None:
         return next((one for one in self.keepers if one.uuid == uuid), None)
 
     def command(self, command: SetPointCommand) -> None:
@@ -368,17 +368,17 @@ class Measurement:
                     hint="Check its power, the bit rate and the address.",
                 )
 
-    def _ended(self) -> Ended:
+    def _ended(self) -> MeasurementEnd:
         nodes = [_summary(keeper) for keeper in self.keepers]
         errors = [keeper.error for keeper in self.keepers if keeper.error is not None]
         errors += [error for sink in self.sinks if (error := _as_error(sink)) is not None]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
         sinks = [{"sink": one.name, "written": one.stats.written, "dropped": one.stats.dropped} for one in self.sinks]
-        return Ended(nodes, files, worst, self._common_start.apart, sinks)
+        return MeasurementEnd(nodes, files, worst, self._common_start.apart, sinks)
 
 
-def _summary(keeper: NodeKeeper) -> dict[str, Any]:
+def _summary(keeper: NodeSupervisor) -> dict[str, Any]:
     """A node of the ``end`` event of ``measure --json``."""
     streams = [asdict(one) | {"channels": list(one.channels)} for _, one in sorted(keeper.streams.totals.items())]
     node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}

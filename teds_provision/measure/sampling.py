@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from teds_provision.measure.clock import END_OF_TICKS, ClockMap, Wall
+from teds_provision.measure.clock import END_OF_TICKS, ClockMap, WallClock
 from teds_provision.measure.planning import sensors_of
 from teds_provision.measure.sinks.lines import plain
-from teds_provision.measure.trusting import Trusted, claim, exchange_clock
-from teds_provision.protocol.operation.commands import MOST_SAMPLE_CHANNELS, Sampled, idle, sample
+from teds_provision.measure.verified_session import VerifiedSession, claim, exchange_clock
+from teds_provision.protocol.operation.commands import MOST_SAMPLE_CHANNELS, SampleReply, idle, sample
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.units import WrittenUnit
@@ -58,11 +58,11 @@ def shown_json(value: float | None, uncertainty: float | None, unit: WrittenUnit
     }
 
 
-def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
+def take_samples(trusted: VerifiedSession, numbers: Sequence[int]) -> list[Sample]:
     """Fresh values of these channels (none: every sensor), taken together as far as one reply holds them."""
     channels = sensors_of(trusted.sheet.channels, numbers, None)
     interpreters = _interpreters(trusted.sheet, [one.number for one in channels])
-    clock, wall = ClockMap(), Wall.now()
+    clock, wall = ClockMap(), WallClock.now()
     for _ in range(3):
         exchange_clock(trusted.node, clock)
     for number in interpreters:
@@ -72,7 +72,7 @@ def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
     good: dict[int, bool] = {}
     for part in _parts(interpreters):
         width = sum(interpreters[number].octets for number in part)
-        reply = Sampled.decode(trusted.node.send(sample(part), "to sample"), width)
+        reply = SampleReply.decode(trusted.node.send(sample(part), "to sample"), width)
         at, stamp = 0, _moment(clock, wall, reply.tick)
         for number in part:
             one = interpreters[number]
@@ -83,7 +83,7 @@ def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
     return [_sample(interpreters[one.number], raws, good, times[one.number]) for one in channels]
 
 
-def _moment(clock: ClockMap, wall: Wall, tick: int) -> float:
+def _moment(clock: ClockMap, wall: WallClock, tick: int) -> float:
     """Unix time of a sample that has just come; where the node's clock lies, that of its arrival."""
     if clock.lie or tick >= END_OF_TICKS:
         return time.time()

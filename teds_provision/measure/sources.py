@@ -18,7 +18,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import CanSpec, parse_spec
 from teds_provision.protocol.operation.can_frames import DATA
 from teds_provision.station.station import Station
-from teds_provision.store.lock import Mark, UsageLockTakenError
+from teds_provision.store.lock import UsageLock, UsageLockTakenError
 
 LISTENING = 0.25  # seconds in which the data of somebody else's streams to our address is heard
 SIGN_OF_LIFE = 4.0  # seconds in which whoever reads it sends something: lease / 3 is 3.3 s unless he says otherwise
@@ -66,7 +66,7 @@ def beside(station: Station, links: LinkSettings, command: str, *, shared: bool 
         yield replace(links, can=tuple(wheres))
 
 
-def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, shared: bool) -> tuple[Mark, int]:
+def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, shared: bool) -> tuple[UsageLock, int]:
     """Hold the mark of the first source address that is free; gives both."""
     first: UsageLockTakenError | None = None
     for source in spec.sources:

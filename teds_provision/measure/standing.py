@@ -20,7 +20,7 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.station.station import Station
-from teds_provision.steps.reading import verdict_of
+from teds_provision.steps.readings import verdict_of
 from teds_provision.store.records import iso
 
 SETTLING: Final = 0.5

@@ -23,12 +23,12 @@ import numpy as np
 from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NotAuthenticError, TedsProvisionError
 from teds_provision.measure.blocks import Block, SetPointCommand
 from teds_provision.measure.clock import ClockMap
-from teds_provision.measure.trusting import LEASE, Trusted, claim
+from teds_provision.measure.verified_session import LEASE, VerifiedSession, claim
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import write_data_set
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
-from teds_provision.protocol.operation.stream_commands import CLOCK, Driven, drive
+from teds_provision.protocol.operation.stream_commands import CLOCK, DriveReply, drive
 from teds_provision.talk.conversation import SessionLostError
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 
@@ -59,7 +59,7 @@ class TopicActuators:
 
     def __init__(
         self,
-        trusted: Trusted,
+        trusted: VerifiedSession,
         send: Callable[[bytes], None],
         numbers: tuple[int, ...],
         *,
@@ -202,7 +202,7 @@ class TopicActuators:
         number = command.channel
         if actuator.driver is None:
             layout = Layout((number,), (len(octets),))
-            reply = Driven.decode(self._trusted.node.send(drive([number]), "to be driven"))
+            reply = DriveReply.decode(self._trusted.node.send(drive([number]), "to be driven"))
             key = self._trusted.node.message_key
             actuator.driver = Driver(layout, reply, key, dead_man=self._dead_man, after=self._last_drive)
             self._last_drive = reply.run

@@ -1,19 +1,19 @@
 """The base station as a service (`ncap run`): what is on its links, what it measures, its API and its page.
 
-====================  ========================================================================
-module                what it does
-====================  ========================================================================
-``running``           from start to end: lock, socket, servers, signals
-``settings``          what it was started with
-``daemon``            begins and ends all of its parts, in order
-``measuring``         what it measures, across restarts
-``newcomers``         who joins and leaves one that measures whoever comes
-``sinks``, ``names``  where values go, and under which topics
-``live``              values and events to many clients, none of which holds up another
-``nodes/``            the nodes on its links, and what is done with them
-``web/``              HTTP: the guard, tokens, routes
-``page/``             the files of the page
-====================  ========================================================================
+==========================  ========================================================================
+module                      what it does
+==========================  ========================================================================
+``service_run``             from start to end: lock, socket, servers, signals
+``settings``                what it was started with
+``daemon``                  begins and ends all of its parts, in order
+``measurement_supervisor``  what it measures, across restarts
+``dynamic_membership``      who joins and leaves one that measures whoever comes
+``sinks``, ``names``        where values go, and under which topics
+``live``                    values and events to many clients, none of which holds up another
+``nodes/``                  the nodes on its links, and what is done with them
+``web/``                    HTTP: the guard, tokens, routes
+``page/``                   the files of the page
+==========================  ========================================================================
 
 Threads do what talks to nodes and to the disk; one event loop serves the clients. Nothing here writes keys, whitelist
 or TEDS except through ``steps``.

@@ -14,17 +14,17 @@ from teds_provision.errors import FrozenError, NotFoundError, UsageError, VaultE
 from teds_provision.links import Port
 from teds_provision.measure.blocks import SetPointCommand
 from teds_provision.measure.buses import Buses
-from teds_provision.measure.sightings import Sighting
+from teds_provision.measure.presence import Sighting
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.measuring import Measuring
+from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor
 from teds_provision.ncap.names import Names
-from teds_provision.ncap.nodes.desk import Desk, Turns
+from teds_provision.ncap.nodes.actuator_leases import ActuatorLeases
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.holding import Holding
-from teds_provision.ncap.nodes.provisioning import Adopting, Provisioning
+from teds_provision.ncap.nodes.link_watch import LinkWatch
+from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
+from teds_provision.ncap.nodes.provisioning import AutoProvisioner, Provisioning
 from teds_provision.ncap.nodes.sheets import Sheets
 from teds_provision.ncap.nodes.virtual import Virtuals
-from teds_provision.ncap.nodes.watching import Watch
 from teds_provision.ncap.plant import PlantWatch
 from teds_provision.ncap.settings import Detection, Settings, own_source, with_source
 from teds_provision.ncap.sinks import DaemonSinks
@@ -43,10 +43,10 @@ class Daemon:
 
     def __init__(self, station: Station, settings: Settings) -> None:
         self.station, self.settings = station, settings
-        self.live, self.turns, self.tokens = Live(), Turns(), Tokens(station.home)
+        self.live, self.turns, self.tokens = Live(), NodeLocks(), Tokens(station.home)
         self.roster = NodeDirectory(station, self.live)
         self.buses = Buses(news=self._saw)
-        self.desk = Desk(self.roster, self.turns, self._port_of)
+        self.desk = NodeJobs(self.roster, self.turns, self._port_of)
         sinks = DaemonSinks(
             station.home,
             settings.sinks,
@@ -54,7 +54,7 @@ class Daemon:
             actuators=settings.actuators,
             brokers=settings.brokers,
         )
-        self.measuring = Measuring(
+        self.measuring = MeasurementSupervisor(
             station, self.roster, self.live, self.turns, self.buses, sinks, self._admits, dead_man=settings.dead_man
         )
         self.turns.given = self._free_again
@@ -62,7 +62,7 @@ class Daemon:
         self.names = Names(station, self.roster, self.live, self.measuring.is_measured, self.measuring.facts_of)
         self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
         self.provisioning = Provisioning(station, self.roster, self.live, self.desk, self.measuring.apart)
-        self.holding = Holding(
+        self.holding = ActuatorLeases(
             station,
             self.live,
             self.desk,
@@ -73,7 +73,7 @@ class Daemon:
         )
         self.virtuals = Virtuals(station, self.live)
         self.plant = PlantWatch(station, self.live, self._plant_changed)
-        self.adopting = Adopting(
+        self.adopting = AutoProvisioner(
             station, self.roster, self.live, self.virtuals, lambda: self._adopts, signs=settings.yes
         )
         self.roster.topic, self.roster.actuator = self.names.topic, self.holding.state
@@ -146,12 +146,12 @@ class Daemon:
         self.roster.refresh()
         self.live.event("store", state="changed")
 
-    def _watch(self, place: str) -> Watch:
+    def _watch(self, place: str) -> LinkWatch:
         def transparent() -> bool:
             return self.detection == "transparent"
 
         buses, trace = self.buses, self.settings.trace
-        return Watch(place, self.station, self.roster, self.live, self.turns, self, transparent, buses, trace)
+        return LinkWatch(place, self.station, self.roster, self.live, self.turns, self, transparent, buses, trace)
 
     def _start_virtuals(self) -> None:
         """Virtual transducers hang on a bus of their own, which is a link like others."""
@@ -249,7 +249,7 @@ class Daemon:
     def _admits(self, set_point: SetPointCommand) -> bool:
         return self.holding.admits(set_point)
 
-    def _link(self, watch: Watch) -> dict[str, Any]:
+    def _link(self, watch: LinkWatch) -> dict[str, Any]:
         state = watch.state
         return {
             "place": watch.place,

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.lazy import late
 from teds_provision.measure.sinks.lines import plain
-from teds_provision.ncap.past import Past
+from teds_provision.ncap.history import History
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN
 
@@ -43,7 +43,7 @@ Key = tuple[str, int]
 
 
 @dataclass(frozen=True)
-class Last:
+class LastValue:
     """The newest value of a channel: SI unit of the datasheet, None where it is not valid; unix seconds."""
 
     value: float | None
@@ -111,11 +111,11 @@ class Live:
     """
 
     def __init__(self) -> None:
-        self.past = Past()
+        self.past = History()
         self._lock = threading.Lock()
         self._waiting: deque[Block] = deque()
         self._channels: dict[Key, _Channel] = {}
-        self._last: dict[Key, Last] = {}
+        self._last: dict[Key, LastValue] = {}
         self._turning: frozenset[Key] = frozenset()
         self._listeners: set[LiveClient] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -150,7 +150,7 @@ class Live:
         if loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(self._tell, text, json.dumps({"type": "event", **for_readers(line)}))
 
-    def last(self, uuid: str, channel: int) -> Last | None:
+    def last(self, uuid: str, channel: int) -> LastValue | None:
         """The newest value of a channel."""
         return self._last.get((uuid, channel))
 
@@ -231,7 +231,7 @@ class Live:
                 one.values.append(np.where(block.valid[:, column], block.value[:, column], np.nan))
                 touched.add(key)
                 value = float(block.value[-1, column]) if block.valid[-1, column] else None
-                self._last[key] = Last(value, plain(block.raw[-1:, column].tolist()[0]), float(block.time[-1]))
+                self._last[key] = LastValue(value, plain(block.raw[-1:, column].tolist()[0]), float(block.time[-1]))
         return touched
 
 

@@ -23,8 +23,8 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.ncap.live import Live
-from teds_provision.plant.post import Post
-from teds_provision.plant.postgres import PostgresPost, Registry
+from teds_provision.plant.postgres import PostgresTransport, Registry
+from teds_provision.plant.transport import Transport
 from teds_provision.protocol.plant.job import Job
 from teds_provision.station.station import Station
 
@@ -47,14 +47,14 @@ class PlantWatch:
         self._station, self._live, self._changed = station, live, changed
         self._wake, self._stop = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
-        self._post: Post | None = None
+        self._post: Transport | None = None
         self._listener: Registry | None = None
         self._told = ("", "")
         self._look_again = 0.0
 
     def start(self) -> None:
         """Begin; raises PolicyError where no registry was joined."""
-        plant.folding.require_roster(self._station)
+        plant.apply_pages.require_roster(self._station)
         for run, name in ((self._run, "registry"), (self._listen, "registry listener")):
             self._threads.append(threading.Thread(target=run, name=name, daemon=True))
             self._threads[-1].start()
@@ -64,7 +64,7 @@ class PlantWatch:
         self._stop.set()
         self._wake.set()
         for connection in (self._post, self._listener):
-            if isinstance(connection, PostgresPost | Registry):
+            if isinstance(connection, PostgresTransport | Registry):
                 connection.interrupt()
         for thread in self._threads:
             thread.join(_SOON)
@@ -86,7 +86,7 @@ class PlantWatch:
             "synced": synced,
             "age": None if synced is None else max(0.0, time.time() - synced),
             "unsent": found.unsent,
-            "to_rotate": plant.leaving.due(self._station),
+            "to_rotate": plant.removed_members.due(self._station),
             "stations": [
                 {
                     "name": one.name,
@@ -111,7 +111,7 @@ class PlantWatch:
 
     def nodes(self, text: str) -> dict[str, Any]:
         """api.md, `/plant/nodes`; raises PolicyError where no registry was joined."""
-        found = plant.status.nodes(self._station, plant.folding.require_roster(self._station), text)
+        found = plant.status.nodes(self._station, plant.apply_pages.require_roster(self._station), text)
         first = list(islice(found, MOST_SHOWN + 1))
         return {"nodes": first[:MOST_SHOWN], "more": len(first) > MOST_SHOWN}
 
@@ -130,7 +130,7 @@ class PlantWatch:
             raise NotFoundError(f"{len(rows) or 'No'} jobs begin with {text[:64]}.", hint="GET /jobs lists them.")
         [row] = rows
         found = plant.jobs.kept_job(self._station, row)
-        parts = plant.yields.yields(self._station, found, plant.yields.attempts_of(self._station, found.id))
+        parts = plant.yield_stats.yields(self._station, found, plant.yield_stats.attempts_of(self._station, found.id))
         return {**self._job(found, row.state), "stations": [part.to_json() for part in parts]}
 
     def _job(self, found: Job, state: str) -> dict[str, Any]:
@@ -159,14 +159,14 @@ class PlantWatch:
         station = self._station
         try:
             if self._post is None:
-                self._post = plant.reaching.post_of(station)
+                self._post = plant.connecting.post_of(station)
             if self._post is None:
                 self._tell("unreachable", "nothing is known that carries: registry connect")
                 return False
             self._say_daily()
             done = plant.sync.sync(station, self._post)
             if time.monotonic() >= self._look_again:
-                plant.reaching.check_database(station, self._post)
+                plant.connecting.check_database(station, self._post)
                 self._look_again = time.monotonic() + _DATABASE_CHECK
         except StoreLockedError:
             return True
@@ -215,7 +215,7 @@ class PlantWatch:
         while not self._stop.is_set():
             try:
                 if self._listener is None:
-                    self._listener = plant.reaching.listener(self._station)
+                    self._listener = plant.connecting.listener(self._station)
                     if self._listener is None:
                         return
                 self._listener.listen()

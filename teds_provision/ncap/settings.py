@@ -16,7 +16,7 @@ from teds_provision.links import Trace
 from teds_provision.links.ble import spec as ble
 from teds_provision.links.can import spec as can
 from teds_provision.links.can.bus import require_known
-from teds_provision.measure.trusting import DEAD_MAN
+from teds_provision.measure.verified_session import DEAD_MAN
 
 Detection = Literal["transparent", "whitelist"]
 _FIRST, _SOURCES = 0xF2, 6

@@ -5,6 +5,16 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.node import can, described, flash_file, handler, hardware, nfc, pulse, sources, virtual
+    from teds_provision.node import (
+        can,
+        flash_file,
+        handler,
+        hardware,
+        nfc,
+        node_template,
+        realtime_loop,
+        sources,
+        virtual,
+    )
 else:
     __getattr__ = lazy(__name__)

@@ -68,7 +68,7 @@ class MeasuringHandler(Protocol):
         """A Drive frame of this link's station came."""
 
 
-class InTheAir(NodeHandler, MeasuringHandler, Protocol):
+class BleHandler(NodeHandler, MeasuringHandler, Protocol):
     """What a node's BLE asks beside (profile.md, "BLE")."""
 
     def in_factory_state(self) -> bool:
@@ -91,7 +91,7 @@ MOST_THREADS: Final = 48
 Job = Callable[[], None]
 
 
-class Crew:
+class WorkerPool:
     """At most ``most`` threads, made as they are needed.
 
     Not concurrent.futures: a request has nobody who waits for its end, and what a Future costs stands between each

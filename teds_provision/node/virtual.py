@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
-from teds_provision.node.can.seat import BUS
+from teds_provision.node.can.endpoint import BUS
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board
 from teds_provision.node.hardware.clock import NANOSECONDS
-from teds_provision.node.pulse import Pulse
+from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, verify
 from teds_provision.protocol.messages.identity import NodeState
@@ -146,7 +146,7 @@ class VirtualNode:
         clock: Callable[[], float] = time.monotonic,
         exclusive: bool = False,
         board: Callable[[FlashFile], Board | None] = lambda file: None,
-        pulse: Pulse | None = None,
+        pulse: RealtimeLoop | None = None,
         has_can: bool = True,
     ) -> None:
         self._delays = delays or Delays()
@@ -223,12 +223,12 @@ class VirtualNode:
             self.tim.drive(link, data)
 
     def unheard(self, link: str) -> None:
-        """Data messages were disabled; see InTheAir."""
+        """Data messages were disabled; see BleHandler."""
         with self._core.interrupt():
             self.tim.unheard(link)
 
     def in_session(self, link: str) -> bool:
-        """Whether a session is open; see InTheAir."""
+        """Whether a session is open; see BleHandler."""
         with self._core.interrupt():
             return self.tim.in_session(link)
 

@@ -6,29 +6,29 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.plant import (
-        asking,
+        apply_pages,
         backlog,
+        connecting,
         evidence,
         fetching,
-        files,
-        folding,
+        folder_transport,
         jobs,
-        leaving,
         line,
         membership,
         office,
         owner,
         parcels,
-        post,
         postgres,
-        reaching,
+        removed_members,
         returned,
         schema,
         scram,
+        sign_requests,
         status,
         sync,
+        transport,
         verify_evidence,
-        yields,
+        yield_stats,
     )
 else:
     __getattr__ = lazy(__name__)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from teds_provision.errors import BadDataError, TedsProvisionError
-from teds_provision.handover.pending import UNDONE, Notes
+from teds_provision.handover.pending import UNDONE, BundleNotes
 from teds_provision.protocol.datasheet import signature_good
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.revocation import open_revocation
@@ -49,7 +49,7 @@ def backlog(station: Station) -> Iterator[Told]:
 def _handed(station: Station, keys: dict[bytes, KeyRecord]) -> Iterator[Told]:
     """Keys that left and came, by the handovers that are remembered."""
     for row in station.handovers.all():
-        notes = Notes.from_json(row.nodes)
+        notes = BundleNotes.from_json(row.nodes)
         refused = {uuid for uuid, _ in notes.refused}
         for at, digits in enumerate(notes.uuids):
             uuid = bytes.fromhex(digits)

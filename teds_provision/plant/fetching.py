@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from teds_provision.errors import NotAuthenticError, TedsProvisionError
-from teds_provision.plant.folding import EVENTS_AT_ONCE, alarm, take_pages
-from teds_provision.plant.post import Carried, Post
+from teds_provision.plant.apply_pages import EVENTS_AT_ONCE, alarm, take_pages
+from teds_provision.plant.transport import CarriedPage, Transport
 from teds_provision.protocol.plant.document import NewerFormatError, hash_of
 from teds_provision.protocol.plant.page import Page, open_page
 from teds_provision.protocol.plant.roster import Roster
@@ -19,12 +19,12 @@ class Taken:
     """The result of reading pages of one station: how many were taken, and which ones it did not sign."""
 
     pages: int = 0
-    junk: list[Carried] = field(default_factory=list)
+    junk: list[CarriedPage] = field(default_factory=list)
     waits: str | None = None
     """Why the chain is not read on: a page of a newer format."""
 
 
-def open_carried(carried: Carried, roster: Roster, station: str) -> Page:
+def open_carried(carried: CarriedPage, roster: Roster, station: str) -> Page:
     """Return a page that its station signed and that is in its own place.
 
     Raises NotAuthenticError, NewerFormatError.
@@ -35,7 +35,7 @@ def open_carried(carried: Carried, roster: Roster, station: str) -> Page:
     return page
 
 
-def read_pages(carried: Iterable[Carried], roster: Roster, station: str) -> tuple[list[Page], list[int]]:
+def read_pages(carried: Iterable[CarriedPage], roster: Roster, station: str) -> tuple[list[Page], list[int]]:
     """Return the pages that a station signed among those under its name, and the numbers of those that it did not."""
     good: list[Page] = []
     junk: list[int] = []
@@ -49,7 +49,7 @@ def read_pages(carried: Iterable[Carried], roster: Roster, station: str) -> tupl
     return good, junk
 
 
-def fetch(station: Station, post: Post, roster: Roster) -> int:
+def fetch(station: Station, post: Transport, roster: Roster) -> int:
     """Take in what others say, station by station, and return how many pages came.
 
     Whatever is wrong with the pages of one station holds up no other's.
@@ -71,8 +71,8 @@ def take_carried(
     station: Station,
     roster: Roster,
     author: str,
-    pages: Iterable[Carried],
-    on_junk: Callable[[Carried], None] = lambda _: None,
+    pages: Iterable[CarriedPage],
+    on_junk: Callable[[CarriedPage], None] = lambda _: None,
 ) -> Taken:
     """Keep the pages of one station that are new and follow one that is here; ``pages`` ascend by number.
 
@@ -117,7 +117,7 @@ def note_waiting(station: Station, author: str, taken: Taken) -> None:
         station.plant.tables.put_chain(replace(chain, waits=taken.waits))
 
 
-def _report_junk(station: Station, roster: Roster, one: str, junk: Sequence[int], post: Post) -> None:
+def _report_junk(station: Station, roster: Roster, one: str, junk: Sequence[int], post: Transport) -> None:
     if not junk:
         station.plant.tables.end_alarms("junk", one)
     for n in junk[:1]:

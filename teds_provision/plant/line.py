@@ -12,10 +12,10 @@ from typing import Any, Final
 
 from teds_provision.errors import KeyMismatchError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.files import read_limited
-from teds_provision.plant.asking import Office, Wanted, by_office
+from teds_provision.plant.apply_pages import heads_digest
 from teds_provision.plant.evidence import TOOL, make_folder, sign_evidence
-from teds_provision.plant.folding import heads_digest
 from teds_provision.plant.jobs import digest_of_file, profile_file, require_adopted, require_open
+from teds_provision.plant.sign_requests import Office, SignatureOrder, by_office
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
@@ -25,11 +25,11 @@ from teds_provision.station.label import label_of, read_label, write_label
 from teds_provision.station.station import Station
 from teds_provision.steps.batch_sheet import BoardResult
 from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.build import BuildOrder, Prepared, Proposal, prepare
-from teds_provision.steps.identify import Identified
-from teds_provision.steps.provision import Provisioned
-from teds_provision.steps.read import Survey
-from teds_provision.steps.sign import Signed
+from teds_provision.steps.build import BuildOrder, PreparedOrder, Proposal, prepare
+from teds_provision.steps.identify import IdentifiedNode
+from teds_provision.steps.provision import ProvisionResult
+from teds_provision.steps.sign import SignResult
+from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.store import EvidenceRow, UnitRow, WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import StepResult
@@ -60,7 +60,7 @@ class LineRun:
     scans: Scans | None = None
     _turn: threading.Lock = field(default_factory=threading.Lock)
     _digests: dict[bytes, str] = field(default_factory=dict)
-    _common: dict[str | None, Prepared] = field(default_factory=dict)
+    _common: dict[str | None, PreparedOrder] = field(default_factory=dict)
     _units_as_json: dict[bytes, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -109,13 +109,13 @@ class LineRun:
         """Whether the job names this UUID."""
         return self.job is not None and uuid in self.job.boards
 
-    def lists(self, who: Identified) -> bool:
+    def lists(self, who: IdentifiedNode) -> bool:
         """Whether the job names this very board: that is a keeper's word for it."""
         return self.is_listed(who.uuid) and self.job is not None and self.job.boards[who.uuid] == who.fingerprint
 
     # -- what a board gets -----------------------------------------------------------------------------------------
 
-    def order(self, who: Identified) -> Prepared:
+    def order(self, who: IdentifiedNode) -> PreparedOrder:
         """What this board gets; raises PolicyError (not in the job, its calibration), KeyMismatchError."""
         job = self.job
         if self.scans is not None:
@@ -150,7 +150,7 @@ class LineRun:
             self._require_fresh(path, prepared)
         return prepared
 
-    def _with_digest(self, calibration: Path | None, uuid: bytes, read: Callable[[], Prepared]) -> Prepared:
+    def _with_digest(self, calibration: Path | None, uuid: bytes, read: Callable[[], PreparedOrder]) -> PreparedOrder:
         """What ``read`` gives, and note the digest of the calibration's file that evidence of this board names.
 
         Raises PolicyError where the file changed meanwhile: a bench writes calibrations beside the line.
@@ -166,14 +166,14 @@ class LineRun:
                 self._digests[uuid] = digest
         return prepared
 
-    def _prepared(self, calibration: str | None, order: BuildOrder) -> Prepared:
+    def _prepared(self, calibration: str | None, order: BuildOrder) -> PreparedOrder:
         """What all boards get alike, read and guarded once a run; ``calibration`` is the SHA-256 of its file."""
         with self._turn:
             if calibration not in self._common:
                 self._common[calibration] = self._read(order)
             return self._common[calibration]
 
-    def _read(self, order: BuildOrder, uuid: bytes | None = None) -> Prepared:
+    def _read(self, order: BuildOrder, uuid: bytes | None = None) -> PreparedOrder:
         """What an order names; raises PolicyError where the profile's file was changed since the run began.
 
         The digest that evidence names must be of what was read, and files are edited beside a run of many hours.
@@ -216,7 +216,7 @@ class LineRun:
             hint="Give its file or directory: --calibrations PATH",
         )
 
-    def _require_fresh(self, path: Path, prepared: Prepared) -> None:
+    def _require_fresh(self, path: Path, prepared: PreparedOrder) -> None:
         assert self.job is not None
         days = self.job.calibration.max_age_days or 0
         now = datetime.now(UTC)
@@ -229,7 +229,9 @@ class LineRun:
 
     # -- units -----------------------------------------------------------------------------------------------------
 
-    def take(self, node: Conversation, who: Identified, prepared: Prepared, entry: WhitelistEntry | None) -> LineUnit:
+    def take(
+        self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
+    ) -> LineUnit:
         """Take the board's unit, durably, or count a further attempt; raises PolicyError where none is left."""
         job, begun = self.job, utc_now()
         held = entry if entry is not None else who.whitelisted
@@ -343,7 +345,7 @@ class Scans:
                 self._expected = found
             self._notice(f"Waiting for board {found[0].hex()}.")
 
-    def require(self, who: Identified) -> None:
+    def require(self, who: IdentifiedNode) -> None:
         """Raise PolicyError where no label was scanned, WrongBoardError where another board's was."""
         with self._turn:
             expected = self._expected
@@ -368,13 +370,15 @@ class LineUnit:
     """One board of a run; see :class:`teds_provision.steps.provision.Unit`."""
 
     run: LineRun
-    prepared: Prepared
+    prepared: PreparedOrder
     row: UnitRow | None
     attempt: int
     assurance: str
     begun: str
 
-    def sign(self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: Survey) -> Signed | None:
+    def sign(
+        self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: NodeSnapshot
+    ) -> SignResult | None:
         """The datasheet signed by the job's office; None where this station signs."""
         job, station = self.run.job, self.run.station
         if job is None or job.office in (None, station.identity.fingerprint):
@@ -386,7 +390,7 @@ class LineUnit:
             )
         assert job.office is not None
         path = self.prepared.order.calibration
-        wanted = Wanted(
+        wanted = SignatureOrder(
             job.id,
             job.office,
             proposal.image,
@@ -398,7 +402,7 @@ class LineUnit:
         intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()
         return by_office(station, self.run.office, node, keys, wanted, present.image.security if intact else None)
 
-    def ended(self, node: Conversation, done: Provisioned) -> None:
+    def ended(self, node: Conversation, done: ProvisionResult) -> None:
         """Have the board sign the facts, and keep the evidence; without one, note that the unit passed."""
         failure = BoardResult(done.who.uuid, 0.0, done).failure
         teds = done.image.security
@@ -415,7 +419,7 @@ class LineUnit:
             self.run.passed_board(done.who.uuid)
 
     def failed(
-        self, node: Conversation, who: Identified, steps: Sequence[StepResult], step: str, error: TedsProvisionError
+        self, node: Conversation, who: IdentifiedNode, steps: Sequence[StepResult], step: str, error: TedsProvisionError
     ) -> None:
         """Leave evidence of the failure, with the board's signature where it still answers."""
         if self._wanted:

@@ -9,14 +9,14 @@ from dataclasses import replace
 
 from teds_provision.errors import BadDataError, NotFoundError, PolicyError, RosterExpiredError, TedsProvisionError
 from teds_provision.plant import scram
-from teds_provision.plant.folding import now, recount, require_roster
-from teds_provision.plant.post import Post
+from teds_provision.plant.apply_pages import now, recount, require_roster
+from teds_provision.plant.transport import Transport
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
 from teds_provision.protocol.plant.roster import Roster, open_roster
 from teds_provision.station.station import Station
-from teds_provision.steps.verify import Verified, remember, verify_image
+from teds_provision.steps.verify import Verification, remember, verify_image
 from teds_provision.store import utc_now
 from teds_provision.store.tables.plant import Chain
 from teds_provision.teds.codec import security
@@ -40,7 +40,7 @@ def request(station: Station) -> bytes:
     return octets
 
 
-def found_roster(station: Station, post: Post, octets: bytes | None) -> Roster:
+def found_roster(station: Station, post: Transport, octets: bytes | None) -> Roster:
     """The best roster that names this station, of a file or of what carries; one that has expired is refused here.
 
     Raises NotFoundError, PolicyError.
@@ -109,7 +109,7 @@ def vouchable(station: Station, uuids: Sequence[bytes] | None) -> list[tuple[byt
         if shown.station_key is None:
             continue
         signer = fingerprint(shown.station_key)
-        if roster.has(signer, "sign") or Verified(uuid, tuple(verify_image(judging, image))).verdict != "authentic":
+        if roster.has(signer, "sign") or Verification(uuid, tuple(verify_image(judging, image))).verdict != "authentic":
             continue
         found.append((uuid, hashlib.sha256(octets).hexdigest(), signer[:16]))
     return found
@@ -131,7 +131,7 @@ def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
     return fresh
 
 
-def accept(station: Station, of: str, hash: str | None, post: Post | None) -> tuple[int, str]:
+def accept(station: Station, of: str, hash: str | None, post: Transport | None) -> tuple[int, str]:
     """Take the branch of two histories that the registry shows, or the one that ``hash`` (16 digits or more) names.
 
     Local: others decide for themselves, and a roster's ``last`` goes before it. Returns the page that was taken.
@@ -145,7 +145,7 @@ def accept(station: Station, of: str, hash: str | None, post: Post | None) -> tu
     return n, wanted
 
 
-def branch(station: Station, of: str, hash: str | None, post: Post | None) -> tuple[int, str]:
+def branch(station: Station, of: str, hash: str | None, post: Transport | None) -> tuple[int, str]:
     """Return the branch that :func:`accept` takes: number and H of its first page.
 
     An earlier choice can be changed: name the other branch by its ``hash``. Raises NotFoundError, PolicyError.

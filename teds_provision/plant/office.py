@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError, TedsProvisionError
-from teds_provision.plant.asking import Inbox, name_of, send
 from teds_provision.plant.jobs import (
     digest_of_file,
     now_of,
@@ -24,7 +23,8 @@ from teds_provision.plant.jobs import (
     require_open,
     roster_of,
 )
-from teds_provision.plant.post import Post
+from teds_provision.plant.sign_requests import Inbox, name_of, send
+from teds_provision.plant.transport import Transport
 from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint, node_key_good, prove_message, verify
@@ -97,12 +97,12 @@ def answer(station: Station, octets: bytes, jobs: Collection[str] | None = None,
 
 def answer_all(
     station: Station,
-    post: Post,
+    post: Transport,
     inbox: Inbox,
     jobs: Collection[str] | None = None,
     *,
     stop: Callable[[], bool] = lambda: False,
-) -> Iterator[Answered]:
+) -> Iterator[AnsweredRequest]:
     """Answer every request that came, one after the other; each answer is on its way before its parcel goes."""
     for come in inbox.take():
         if stop():
@@ -113,12 +113,12 @@ def answer_all(
             if roster_of(station).member(request.signer) is not None:
                 send(station, post, request.signer, sealed, name_of(hash_of(sealed)))
             told = open_answer(sealed, lambda kid: station.point)
-            yield Answered(request, told)
+            yield AnsweredRequest(request, told)
         come.drop()
 
 
 @dataclass(frozen=True)
-class Answered:
+class AnsweredRequest:
     """A request and what was answered."""
 
     request: SignRequest

@@ -14,8 +14,8 @@ from typing import Any
 from uuid import uuid4
 
 from teds_provision.errors import BadDataError, NotFoundError, PolicyError, UsageError
+from teds_provision.plant.apply_pages import now, put_roster, require_roster
 from teds_provision.plant.backlog import Told, backlog
-from teds_provision.plant.folding import now, put_roster, require_roster
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.plant.document import MemberRequest, payload
@@ -24,7 +24,7 @@ from teds_provision.protocol.plant.roster import (
     USUAL,
     Member,
     Place,
-    Removed,
+    RemovedMember,
     Role,
     Roster,
     Share,
@@ -113,7 +113,7 @@ def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Ros
             hint="A station without nodes can be set up again: init --request, trust ca sign, init --certificate",
         )
     there = own.by_key.get(request.fingerprint)
-    if isinstance(there, Removed):
+    if isinstance(there, RemovedMember):
         raise PolicyError(
             f"{there.name} was removed with this key, and a removed key cannot return.",
             hint="Create a new station on that machine: init in another --home",
@@ -153,7 +153,7 @@ def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
     """
     own = require_roster(station)
     gone = own.named(name)
-    if isinstance(gone, Removed) and gone.why == why and last in (None, gone.last[0]):
+    if isinstance(gone, RemovedMember) and gone.why == why and last in (None, gone.last[0]):
         return following(station)
     member = require_member(own, name)
     chain = station.plant.tables.chain(member.fingerprint)
@@ -163,7 +163,7 @@ def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
             hint="Add --last N; registry log lists its pages.",
         )
     place = chain.counted if last is None else page_place(station, member.fingerprint, last)
-    removed = Removed(member.name, member.point, member.roles, why, place, member.signed)
+    removed = RemovedMember(member.name, member.point, member.roles, why, place, member.signed)
     members = tuple(one for one in own.members if one is not member)
     share = tuple(replace(one, to=tuple(to for to in one.to if to != member.fingerprint)) for one in own.share)
     return following(
@@ -256,7 +256,7 @@ def changes(before: Roster | None, after: Roster) -> list[str]:
             if member.signed is not None:
                 said.append(f"    what it signed up to page {member.signed[0]} stays authentic")
     for left in after.removed:
-        if not isinstance(there.get(left.fingerprint), Removed):
+        if not isinstance(there.get(left.fingerprint), RemovedMember):
             said.append(f"  removes {left.name} ({left.why}); its pages up to {left.last[0]} count")
             said.append(f"    {left.fingerprint}")
     shares = set(before.share) if before is not None else set()

@@ -18,7 +18,7 @@ from typing import Final
 
 from teds_provision.errors import BadDataError, NotAuthenticError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.handover import incoming, outgoing, pending
-from teds_provision.plant.post import SMALL, Parcel, Post
+from teds_provision.plant.transport import SMALL, Parcel, Transport
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, time_text
@@ -26,7 +26,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant import sharing
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, open_document
-from teds_provision.protocol.plant.fold import View
+from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
 from teds_provision.store import TrustRecord, pages
@@ -44,7 +44,7 @@ _KEPT: Final = 64
 OF_A_LINE: Final[dict[str, ParcelKind]] = {JOB.typ: "job", SIGN_REQUEST.typ: "sign-request", SIGNED.typ: "signed"}
 _KINDS: Final = {JOB.typ: JOB, SIGN_REQUEST.typ: SIGN_REQUEST, SIGNED.typ: SIGNED}
 
-Views = Callable[[Sequence[bytes]], Mapping[bytes, View]]
+Views = Callable[[Sequence[bytes]], Mapping[bytes, MergedClaims]]
 """What the plant says of some nodes, by UUID."""
 
 
@@ -59,7 +59,7 @@ class ParcelCounts:
     waiting: int
 
 
-def take_in(station: Station, post: Post, views: Views, now: datetime) -> ParcelCounts:
+def take_in(station: Station, post: Transport, views: Views, now: datetime) -> ParcelCounts:
     """Take in what lies there for this station; what needs a person is kept for ``import-keys --received``."""
     roster = station.plant.roster
     if roster is None:
@@ -112,7 +112,7 @@ class _Reader:
                     self._refuse(error)
                 self.station.plant.parcels.drop_parcel(row.id, "in")
                 return True
-            why = "" if isinstance(plan, incoming.Imported) else self._why_not(plan)
+            why = "" if isinstance(plan, incoming.ImportResult) else self._why_not(plan)
             if why:
                 self.station.plant.parcels.turn_parcel(row.id, "in", "waiting", why)
                 return False
@@ -142,7 +142,7 @@ class _Reader:
                 self._refuse(error)
                 return True
             row = self._row(parcel, "bundle")
-            if isinstance(plan, incoming.Imported):
+            if isinstance(plan, incoming.ImportResult):
                 import_parcel(self.station, replace(row, peer=plan.row.peers[0], about=plan.row.id), plan)
                 return True
             bundle = plan.opened.bundle
@@ -270,10 +270,12 @@ def _inner(octets: bytes, station: Station) -> tuple[str, bytes]:
     return (typ, inner) if isinstance(typ, str) and typ in OF_A_LINE else ("", b"")
 
 
-def import_parcel(station: Station, row: ParcelRow, plan: incoming.ImportPlan | incoming.Imported) -> incoming.Imported:
+def import_parcel(
+    station: Station, row: ParcelRow, plan: incoming.ImportPlan | incoming.ImportResult
+) -> incoming.ImportResult:
     """Take a bundle in and put its receipt among what leaves, all in one transaction; the caller holds the lock."""
     with station.transaction():
-        done = plan if isinstance(plan, incoming.Imported) else incoming.import_bundle(station, plan)
+        done = plan if isinstance(plan, incoming.ImportResult) else incoming.import_bundle(station, plan)
         station.plant.parcels.drop_parcel(row.id, "in")
         _put_out(station, "receipt", done.row.peers[0], done.receipt.strip(), done.row.id)
     return done
@@ -305,7 +307,7 @@ def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> s
     return parcel
 
 
-def send_out(station: Station, post: Post, views: Views, now: datetime) -> int:
+def send_out(station: Station, post: Transport, views: Views, now: datetime) -> int:
     """Send what waits: copies that are due, receipts, what a person sent; returns how many parcels left."""
     roster = station.plant.roster
     if roster is None:
@@ -337,7 +339,7 @@ def _put_out(
     return parcel
 
 
-def _send(station: Station, roster: Roster, post: Post) -> int:
+def _send(station: Station, roster: Roster, post: Transport) -> int:
     tables, sent = station.plant.parcels, 0
     for row in tables.parcels("out", "ready"):
         if roster.member(row.peer) is None:
@@ -367,7 +369,7 @@ def _expire(station: Station, now: datetime) -> None:
                 tables.forget_shared(row.id)
                 tables.drop_parcel(row.id, "out")
             if handover is not None and handover.mode == "move" and handover.state == pending.OPEN:
-                nodes = tuple(bytes.fromhex(one) for one in pending.Notes.from_json(handover.nodes).uuids)
+                nodes = tuple(bytes.fromhex(one) for one in pending.BundleNotes.from_json(handover.nodes).uuids)
                 order = outgoing.ExportOrder((row.peer,), nodes, "move")
                 with suppress(PolicyError, NotFoundError):  # revoked or forgotten since: `handover undo` says so
                     send_export(station, outgoing.plan_export(station, order, now), now)
@@ -422,7 +424,7 @@ def _due(
     return clear, disputed
 
 
-def _with_views(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterator[tuple[bytes, int, str, View]]:
+def _with_views(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterator[tuple[bytes, int, str, MergedClaims]]:
     """Nodes with what the plant says of them, a page at a time."""
     for page in pages(rows):
         seen = views([uuid for uuid, _, _ in page])

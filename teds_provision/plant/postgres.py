@@ -33,7 +33,7 @@ from teds_provision.errors import (
 )
 from teds_provision.lazy import how_to_install, late
 from teds_provision.plant import schema, scram
-from teds_provision.plant.post import AT_ONCE, SMALL, Carried, Offer, Parcel, Returned
+from teds_provision.plant.transport import AT_ONCE, SMALL, CarriedPage, Offer, Parcel, Returned
 from teds_provision.sanitize import printable
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ _RETURNING: Final = 2  # the first schema that has `found`
 
 
 @dataclass(frozen=True)
-class Waiting:
+class WaitingParcel:
     """A parcel that waits in the database; ``sender`` and ``to`` are fingerprints, ``octets`` its size."""
 
     id: str
@@ -76,7 +76,7 @@ class DatabaseState:
     rosters: tuple[bytes, ...] = field(repr=False)
     posted: bytes | None = field(repr=False)
     heads: Mapping[str, tuple[int, str]]
-    parcels: tuple[Waiting, ...]
+    parcels: tuple[WaitingParcel, ...]
     newest: tuple[int, bytes] | None = field(repr=False)
     """This station's own newest page there, where it is a short one: each sync looks at it."""
     open: frozenset[str] = frozenset()
@@ -236,7 +236,9 @@ class Registry:
             tuple(row[3].encode() for row in rows if row[0] == "roster"),
             next((row[3].encode() for row in rows if row[0] == "roster" and row[2]), None),
             {row[1].hex(): (row[2], row[3]) for row in rows if row[0] == "head"},
-            tuple(Waiting(row[3], row[1].hex(), row[4].hex(), row[2], row[5]) for row in rows if row[0] == "parcel"),
+            tuple(
+                WaitingParcel(row[3], row[1].hex(), row[4].hex(), row[2], row[5]) for row in rows if row[0] == "parcel"
+            ),
             next(((row[2], row[3].encode()) for row in rows if row[0] == "page"), None),
             frozenset(row[1].hex() for row in rows if row[0] == "head" and row[4]),
             _handed_in(rows),
@@ -261,7 +263,7 @@ class Registry:
         author = bytes.fromhex(station)
         return [Offer(station, n, hash, octets, by or "") for n, hash, octets, by in self._rows(_OFFERS, (author,) * 2)]
 
-    def offered(self, offers: Sequence[Offer]) -> list[Carried]:
+    def offered(self, offers: Sequence[Offer]) -> list[CarriedPage]:
         """The octets of some offers of one author, in one round trip."""
         asked: list[tuple[str, int, str, str]] = [(one.station, one.n, one.hash, one.by) for one in offers]
         rows = self._rows(
@@ -279,7 +281,9 @@ class Registry:
             ),
         )
         there = {place: jws for place, jws in rows if jws is not None}
-        return [Carried(one.station, one.n, there[k].encode(), one.by) for k, one in enumerate(offers) if k in there]
+        return [
+            CarriedPage(one.station, one.n, there[k].encode(), one.by) for k, one in enumerate(offers) if k in there
+        ]
 
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:
         """Hand in pages (number, octets) of a station that is no open member: one round trip, one transaction.
@@ -379,8 +383,10 @@ class Registry:
                 raise _failure(error, late=ended.is_set()) from error
 
 
-class PostgresPost:
-    """The registry as a :class:`.post.Post`: one look at the beginning of a sync, then only what it showed to be new.
+class PostgresTransport:
+    """The registry as a :class:`.transport.Transport`.
+
+    One look at the beginning of a sync, then only what it showed to be new.
 
     So a sync that finds nothing new is one round trip.
     """
@@ -423,14 +429,14 @@ class PostgresPost:
         """The greatest number of a page that is there, by station."""
         return {station: n for station, (n, _) in self._look.heads.items() if n}
 
-    def pages(self, station: str, after: int) -> Iterator[Carried]:
+    def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
         """The pages of a station above a number."""
         look, there = self._look, self._look.heads.get(station, (0, ""))[0]
         if station == self._station and look.newest is not None and look.newest[0] == there == after + 1:
-            yield Carried(station, *look.newest)
+            yield CarriedPage(station, *look.newest)
         elif there > after:
             for of, n, octets in self._registry.pages({station: after}):
-                yield Carried(of, n, octets)
+                yield CarriedPage(of, n, octets)
 
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
         """Push a page of one's own."""
@@ -475,7 +481,7 @@ class PostgresPost:
 class ReturnedPages:
     """Pages in the database that their authors did not append themselves: others handed them in (table ``found``)."""
 
-    def __init__(self, post: PostgresPost) -> None:
+    def __init__(self, post: PostgresTransport) -> None:
         self._post = post
 
     @property
@@ -511,7 +517,7 @@ class ReturnedPages:
         """Every page of a station that is there, whoever put it there."""
         return self._post._registry.offers(station)
 
-    def octets(self, offers: Sequence[Offer]) -> list[Carried]:
+    def octets(self, offers: Sequence[Offer]) -> list[CarriedPage]:
         """The pages that were offered; one that is gone is left out."""
         return self._post._registry.offered(offers)
 

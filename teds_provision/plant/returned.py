@@ -14,9 +14,9 @@ from itertools import islice
 from typing import Final
 
 from teds_provision.errors import PolicyError
+from teds_provision.plant.apply_pages import alarm, counted_places, octets_of
 from teds_provision.plant.fetching import note_waiting, read_pages, take_carried
-from teds_provision.plant.folding import alarm, counted_places, octets_of
-from teds_provision.plant.post import Carried, Offer, Returned
+from teds_provision.plant.transport import CarriedPage, Offer, Returned
 from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
@@ -84,7 +84,7 @@ def take(station: Station, database: Returned, roster: Roster) -> int:
         offers = [one for one in database.offers(author) if one.hash not in known]
         liars: set[str] = set()
 
-        def distrust(carried: Carried, liars: set[str] = liars) -> None:
+        def distrust(carried: CarriedPage, liars: set[str] = liars) -> None:
             if carried.by:
                 liars.add(carried.by)
                 _report_forged(station, roster, carried)
@@ -99,7 +99,7 @@ def take(station: Station, database: Returned, roster: Roster) -> int:
     return taken_pages
 
 
-def _octets(database: Returned, offers: Sequence[Offer], liars: Collection[str]) -> Iterator[Carried]:
+def _octets(database: Returned, offers: Sequence[Offer], liars: Collection[str]) -> Iterator[CarriedPage]:
     """Yield pages in the order of their numbers, a few for each round trip; none of those in ``liars``."""
     waiting = sorted(offers, key=lambda offer: (offer.n, offer.by))
     while waiting:
@@ -110,7 +110,7 @@ def _octets(database: Returned, offers: Sequence[Offer], liars: Collection[str])
                 yield carried
 
 
-def _report_forged(station: Station, roster: Roster, carried: Carried) -> None:
+def _report_forged(station: Station, roster: Roster, carried: CarriedPage) -> None:
     who, whose = roster.name_of(carried.by), roster.name_of(carried.station)
     alarm(station, FORGED, carried.by, carried.n, f"{who} handed in a page of {whose} that {whose} did not sign")
 

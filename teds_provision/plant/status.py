@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from typing import Any, Final
 
 from teds_provision.errors import NotFoundError, UsageError
-from teds_provision.plant.folding import AT_ONCE, counted_places, heads_digest, now, require_roster, views
+from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_digest, now, require_roster, views
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
@@ -108,7 +108,7 @@ def _standing(station: Station, one: Any, chain: Chain | None, at: datetime) -> 
 
 
 @dataclass(frozen=True)
-class Said:
+class StatedEvent:
     """An event as a station said it, on page ``n``; ``counts``: whether the page does."""
 
     station: str
@@ -119,7 +119,7 @@ class Said:
 
 def log(
     station: Station, *, uuid: bytes | None = None, of: str | None = None, since: str | None = None
-) -> Iterator[Said]:
+) -> Iterator[StatedEvent]:
     """What stations said, chain by chain in the order of their pages: verified when the page came in."""
     roster = require_roster(station)
     for one, chain in sorted(station.plant.tables.chains().items()):
@@ -132,7 +132,7 @@ def log(
             for value in load_exact(page.content, "A page").get("events", ()):
                 read = event.read(value)
                 if isinstance(read, event.Event) and uuid in (None, read.uuid):
-                    yield Said(one, page.n, (page.n, page.hash) in counted, dict(read.members))
+                    yield StatedEvent(one, page.n, (page.n, page.hash) in counted, dict(read.members))
 
 
 def resolve(station: Station, text: str) -> bytes:

@@ -14,8 +14,8 @@ from shlex import quote
 from typing import Final, NoReturn
 
 from teds_provision.errors import ForkError, NotAuthenticError, NotMemberError, PolicyError
-from teds_provision.plant import fetching, leaving, parcels, returned
-from teds_provision.plant.folding import (
+from teds_provision.plant import fetching, parcels, removed_members, returned
+from teds_provision.plant.apply_pages import (
     alarm,
     apply_claims,
     now,
@@ -25,13 +25,13 @@ from teds_provision.plant.folding import (
     take_rosters,
     views,
 )
-from teds_provision.plant.post import Post
+from teds_provision.plant.transport import Transport
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.evidence import PASSED
-from teds_provision.protocol.plant.fold import View
+from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.page import MOST_EVENTS, MOST_PAYLOAD, Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.plant import new_home
@@ -45,7 +45,7 @@ _ROOM: Final = 20_000
 
 
 @dataclass
-class Synced:
+class SyncResult:
     """What a sync did: pages out and in, the sentences that a person should read, stations that were behind."""
 
     pushed: int = 0
@@ -69,7 +69,7 @@ def alone(station: Station) -> Iterator[None]:
         yield
 
 
-def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
+def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncResult:
     """Bring this station and what carries to the same state, as far as signatures go.
 
     ``connected``: it is what the station joined by; how far that came is remembered. Raises LinkError, NotMemberError,
@@ -77,7 +77,7 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
     """
     station.unlock()
     with alone(station):
-        done = Synced()
+        done = SyncResult()
         done.rosters = [one.version for one, how, _ in _rosters(station, post, done) if how.startswith("taken")]
         roster = require_roster(station)
         if roster.member(station.fingerprint) is None:
@@ -103,7 +103,7 @@ def sync(station: Station, post: Post, *, connected: bool = True) -> Synced:
         return done
 
 
-def _return_pages(station: Station, post: Post, roster: Roster, done: Synced) -> None:
+def _return_pages(station: Station, post: Transport, roster: Roster, done: SyncResult) -> None:
     """Take what others handed in for stations that left, and hand in what the registry lacks of them."""
     if post.returned is None or not returned.is_new(station, post.returned, roster):
         return
@@ -117,7 +117,7 @@ def _return_pages(station: Station, post: Post, roster: Roster, done: Synced) ->
         returned.note(station, post.returned, roster)
 
 
-def _rosters(station: Station, post: Post, done: Synced) -> list[tuple[Roster, str, str]]:
+def _rosters(station: Station, post: Transport, done: SyncResult) -> list[tuple[Roster, str, str]]:
     """Take the best roster that lies there, and post one's own."""
     joined = station.plant.joined
     if joined is not None and post.registry() not in (None, joined.registry):
@@ -135,14 +135,14 @@ def _rosters(station: Station, post: Post, done: Synced) -> list[tuple[Roster, s
     return [(one, str(how), why) for one, how, why in told]
 
 
-def _parcels(station: Station, post: Post, roster: Roster, done: Synced) -> None:
+def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult) -> None:
     """Take in and send keys, once the pages are here that say whose they are."""
 
-    def seen(uuids: Sequence[bytes]) -> Mapping[bytes, View]:
+    def seen(uuids: Sequence[bytes]) -> Mapping[bytes, MergedClaims]:
         return views(station, roster, uuids)
 
     at = max(now(), roster.created)
-    leaving.review(station, roster, at)
+    removed_members.review(station, roster, at)
     came = parcels.take_in(station, post, seen, at)
     done.parcels_in, done.waiting = came.taken, came.waiting
     done.parcels_out = parcels.send_out(station, post, seen, at)
@@ -156,7 +156,7 @@ def own_chain(station: Station) -> Chain:
     return station.plant.tables.chain(station.fingerprint)
 
 
-def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, connected: bool) -> None:
+def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
     """Look at what lies there under this station's key before anything is added to it; the order is the contract's."""
     chain, joined = own_chain(station), station.plant.joined
     assert joined is not None
@@ -194,7 +194,7 @@ def _own_head(station: Station, post: Post, roster: Roster, done: Synced, *, con
         done.told.append(f"{post.where} was rolled back: {why}; it is being refilled")
 
 
-def _own_pages(station: Station, post: Post, roster: Roster, done: Synced, above: int) -> list[Page]:
+def _own_pages(station: Station, post: Transport, roster: Roster, done: SyncResult, above: int) -> list[Page]:
     """The pages under this station's key; where only members can write, what it did not sign stops everything."""
     found, junk = fetching.read_pages(post.pages(station.fingerprint, above), roster, station.fingerprint)
     if junk and not post.everybody:
@@ -214,7 +214,7 @@ def _own_pages(station: Station, post: Post, roster: Roster, done: Synced, above
     return found
 
 
-def _stop_at_fork(station: Station, post: Post, new: Sequence[Page]) -> NoReturn:
+def _stop_at_fork(station: Station, post: Transport, new: Sequence[Page]) -> NoReturn:
     """Raise ForkError: another home writes, or has written, under this station's key."""
     homes = ", ".join(sorted({page.home or "unknown" for page in new}))
     first = min(page.n for page in new)
@@ -319,7 +319,7 @@ def _require_all_seen(station: Station, roster: Roster, there: set[int]) -> None
             )
 
 
-def resume(station: Station, post: Post) -> int:
+def resume(station: Station, post: Transport) -> int:
     """Go on after a fork, by a person's word: the pages that lie there are adopted, one's own unsent events stay.
 
     A page of this home whose place another one took there is told again with what it said; returns how many were
@@ -351,12 +351,12 @@ def resume(station: Station, post: Post) -> int:
     return len(new)
 
 
-def strange(station: Station, post: Post) -> list[Page]:
+def strange(station: Station, post: Transport) -> list[Page]:
     """The pages under this station's key that lie there and that it does not know: what :func:`resume` adopts."""
     return _strange(station, _under_our_key(station, post, require_roster(station)))
 
 
-def _under_our_key(station: Station, post: Post, roster: Roster) -> list[Page]:
+def _under_our_key(station: Station, post: Transport, roster: Roster) -> list[Page]:
     post.registry()  # a database is looked at anew
     found, _ = fetching.read_pages(post.pages(station.fingerprint, 0), roster, station.fingerprint)
     return found + returned.own(station, post.returned, roster, {page.hash for page in found}, always=True)
@@ -416,7 +416,7 @@ def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
 # -- out and in --------------------------------------------------------------------------------------------------------
 
 
-def _push(station: Station, post: Post, roster: Roster, done: Synced, *, connected: bool) -> None:
+def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
     """Put there what is lacking: one's own pages, and in a folder everybody's."""
     heads = post.heads()
     for one, chain in station.plant.tables.chains().items():
@@ -438,7 +438,7 @@ def _push(station: Station, post: Post, roster: Roster, done: Synced, *, connect
         station.plant.tables.put_plant(replace(joined, acknowledged=newest))
 
 
-def hearsay(station: Station, roster: Roster, done: Synced) -> None:
+def hearsay(station: Station, roster: Roster, done: SyncResult) -> None:
     """Tell what members say that they saw of others and nobody showed this station; it ends nothing."""
     chains = station.plant.tables.chains()
     for who, about, n, hash in station.plant.tables.heads():

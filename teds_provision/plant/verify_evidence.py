@@ -17,7 +17,7 @@ from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.document import ROSTER
-from teds_provision.protocol.plant.evidence import Evidence, Ready, Signatures
+from teds_provision.protocol.plant.evidence import CheckedEvidence, Evidence, Signatures
 from teds_provision.protocol.plant.roster import Roster, open_roster
 from teds_provision.teds.codec import security
 
@@ -32,7 +32,7 @@ _CHUNK: Final = 64
 
 
 @dataclass(frozen=True)
-class Grounds:
+class EvidenceAnchors:
     """What evidence is judged by: the owner's CA key (65 octets); who belongs; the key of each board."""
 
     ca: bytes
@@ -40,7 +40,7 @@ class Grounds:
     roster: Roster | None = None
 
     @classmethod
-    def of(cls, ca: bytes, pins: Path | None = None, roster: Path | None = None) -> Grounds:
+    def of(cls, ca: bytes, pins: Path | None = None, roster: Path | None = None) -> EvidenceAnchors:
         """Read ``pins``, a whitelist file, and a roster that this CA signed.
 
         Raises NotFoundError, NotAuthenticError, BadDataError.
@@ -54,7 +54,7 @@ class Grounds:
         one = codec.ready(evidence)
         return self.faults_of(one, codec.check_signatures(one))
 
-    def faults_of(self, one: Ready, signatures: Signatures) -> list[str]:
+    def faults_of(self, one: CheckedEvidence, signatures: Signatures) -> list[str]:
         """As :meth:`faults`, where the signatures were checked already."""
         evidence = one.evidence
         found = codec.faults_of(one, signatures, self.ca)
@@ -174,7 +174,7 @@ Tell = Callable[[JudgedEvidence], str]
 
 
 def verify_evidence(
-    grounds: Grounds, files: Sequence[str], tell: Tell, *, processes: int | None = None
+    grounds: EvidenceAnchors, files: Sequence[str], tell: Tell, *, processes: int | None = None
 ) -> Iterator[tuple[list[str], EvidenceTotals]]:
     """Judge every file, in order: what ``tell`` says of each, and their totals; a fault of one stops no other.
 
@@ -194,7 +194,7 @@ def verify_evidence(
 
 @dataclass(frozen=True)
 class _Work:
-    grounds: Grounds
+    grounds: EvidenceAnchors
     tell: Tell
     files: Sequence[str]
 
@@ -221,25 +221,25 @@ def _judge_chunk(places: range) -> tuple[list[str], EvidenceTotals]:
     return _work.judge(places)
 
 
-def judge_file(grounds: Grounds, path: Path) -> JudgedEvidence:
+def judge_file(grounds: EvidenceAnchors, path: Path) -> JudgedEvidence:
     """Judge one file; whatever is wrong with it is in what is returned."""
     return judge_files(grounds, [path])[0]
 
 
-def judge_files(grounds: Grounds, paths: Sequence[Path]) -> list[JudgedEvidence]:
+def judge_files(grounds: EvidenceAnchors, paths: Sequence[Path]) -> list[JudgedEvidence]:
     """Judge some files: all are read, then all signatures are checked in a row."""
     read = [_read(path) for path in paths]
-    checked = [codec.check_signatures(one) if isinstance(one, Ready) else None for one in read]
+    checked = [codec.check_signatures(one) if isinstance(one, CheckedEvidence) else None for one in read]
     found = []
     for path, one, signatures in zip(paths, read, checked, strict=True):
-        if isinstance(one, Ready) and signatures is not None:
+        if isinstance(one, CheckedEvidence) and signatures is not None:
             found.append(JudgedEvidence(path, one.evidence, tuple(grounds.faults_of(one, signatures))))
         elif isinstance(one, TedsProvisionError):
             found.append(JudgedEvidence(path, error=one))
     return found
 
 
-def _read(path: Path) -> Ready | TedsProvisionError:
+def _read(path: Path) -> CheckedEvidence | TedsProvisionError:
     try:
         return codec.ready(codec.read(read_limited(path, codec.MAX_OCTETS, "evidence", failure=BadDataError)))
     except TedsProvisionError as error:

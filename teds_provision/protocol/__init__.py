@@ -6,7 +6,6 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.protocol import (
-        agreement,
         announce,
         datasheet,
         fingerprints,
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
         repetition,
         session,
         tim,
+        wire_agreement,
     )
 else:
     __getattr__ = lazy(__name__)

@@ -17,9 +17,9 @@ from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.errors import GarbledError, NotAuthenticError
-from teds_provision.protocol.agreement import good_one_time, key_id
 from teds_provision.protocol.keys import POINT_OCTETS, PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
+from teds_provision.protocol.wire_agreement import good_one_time, key_id
 
 COUNTER_OCTETS = 8
 KEY_ID_OCTETS = 8

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
         pins,
         plant,
         policy,
-        seals,
+        row_macs,
         station,
         summary,
     )

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotAuthenticError, NotFoundError, PolicyError
 from teds_provision.lazy import late
-from teds_provision.station.seals import Seals
+from teds_provision.station.row_macs import RowMacs
 from teds_provision.store import StationRecord, Store
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import agreement, keys
+    from teds_provision.protocol import keys, wire_agreement
     from teds_provision.vault import Vault
 else:  # cryptography: not for commands that only list
-    agreement, keys = late("teds_provision.protocol.agreement"), late("teds_provision.protocol.keys")
+    wire_agreement, keys = late("teds_provision.protocol.wire_agreement"), late("teds_provision.protocol.keys")
 
 DEFAULT_NAME = "station"
 
@@ -23,7 +23,7 @@ DEFAULT_NAME = "station"
 class StationIdentity:
     """The facts of one station, and the certificates (SIG104) that it knows; secrets come from the vault."""
 
-    def __init__(self, store: Store, vault: Callable[[], Vault], seals: Seals) -> None:
+    def __init__(self, store: Store, vault: Callable[[], Vault], seals: RowMacs) -> None:
         self._store = store
         self._vault = vault
         self._seals = seals
@@ -159,7 +159,7 @@ class StationIdentity:
             )
         return signature
 
-    def credentials(self, ca: bytes | None = None) -> agreement.Credentials:
+    def credentials(self, ca: bytes | None = None) -> wire_agreement.Credentials:
         """What the station shows and signs with under ``ca``, the owner's where none is named."""
         under = self.ca if ca is None else ca
-        return agreement.Credentials(self._vault().identity(), self.signature_under(under), under)
+        return wire_agreement.Credentials(self._vault().identity(), self.signature_under(under), under)

@@ -20,7 +20,7 @@ from pathlib import Path
 from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, UsageError
 from teds_provision.station.groups import Groups
 from teds_provision.store import Store
-from teds_provision.store.lock import Mark, OwnerLock, UsageLockTakenError
+from teds_provision.store.lock import OwnerLock, UsageLock, UsageLockTakenError
 from teds_provision.store.records import COMMAND, DetectionMode, KeptMeasurement
 
 FOLDER = "measuring"  # of the home: who measures what now
@@ -204,17 +204,17 @@ class Measurements:
         """Whether a measurement of this station holds the node, in this process or another one."""
         return self._mark(uuid).is_taken
 
-    def _mark(self, uuid: bytes, what: str = "") -> Mark:
-        return Mark(self._home / FOLDER / f"{uuid.hex()}.lock", command=what, shared=True)
+    def _mark(self, uuid: bytes, what: str = "") -> UsageLock:
+        return UsageLock(self._home / FOLDER / f"{uuid.hex()}.lock", command=what, shared=True)
 
-    def source(self, bus: str, source: int, *, command: str = "", shared: bool = False) -> Mark:
+    def source(self, bus: str, source: int, *, command: str = "", shared: bool = False) -> UsageLock:
         """The mark of who uses a source address on a bus: to be entered by ``with``, which raises Taken (7).
 
         A session belongs to a pair of addresses, and a second Open on it ends the first (operation.md section 6).
         ``bus`` is ``CanSpec.wire``. Who has one short session after another takes it ``shared``.
         """
         name = hashlib.sha256(f"{bus}\0{source}".encode()).hexdigest()[:16]
-        return Mark(self._home / FOLDER / f"bus-{name}.lock", command=command, shared=shared)
+        return UsageLock(self._home / FOLDER / f"bus-{name}.lock", command=command, shared=shared)
 
     # -- detection ---------------------------------------------------------------------------------------------------
 

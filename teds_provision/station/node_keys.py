@@ -17,8 +17,8 @@ from teds_provision.errors import (
 )
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant import Plant
-from teds_provision.station.seals import Seals
-from teds_provision.store import Holder, KeyRecord, Marks, Store, pages, utc_now
+from teds_provision.station.row_macs import RowMacs
+from teds_provision.store import Holder, KeyFlags, KeyRecord, Store, pages, utc_now
 from teds_provision.store.records import KeySource
 from teds_provision.vault.base import node_key_context
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MAX_PENDING = 8
 """So many keys of one node may wait for their proof at a time (issue 7 L4)."""
 
-_NO_MARKS: Final = Marks()
+_NO_MARKS: Final = KeyFlags()
 
 RESTORED = "restored from a backup"
 """Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
@@ -57,7 +57,7 @@ class NodeKeys:
         store: Store,
         vault: Callable[[], Vault],
         identity: StationIdentity,
-        seals: Seals,
+        seals: RowMacs,
         reopened: Callable[[], Vault],
         plant: Plant,
     ) -> None:
@@ -269,7 +269,7 @@ class NodeKeys:
         """P(CA) of those of a page of nodes that keep another CA than the owner's."""
         return self._checked_cas(self._store.marks_of(uuids))
 
-    def _checked_cas(self, marked: Mapping[bytes, Marks]) -> dict[bytes, bytes]:
+    def _checked_cas(self, marked: Mapping[bytes, KeyFlags]) -> dict[bytes, bytes]:
         cas: dict[bytes, bytes] = {}
         for uuid, marks in marked.items():
             if marks.ca is not None:
@@ -282,12 +282,12 @@ class NodeKeys:
         self._mark(uuid, ca=ca)
 
     def mark(self, changes: Mapping[bytes, Mapping[str, Any]]) -> None:
-        """Change marks of many nodes at once, by the names of :class:`Marks`; the owner's CA is none."""
+        """Change marks of many nodes at once, by the names of :class:`KeyFlags`; the owner's CA is none."""
         self._mark_all(changes, {uuid: m for page in pages(changes) for uuid, m in self._store.marks_of(page).items()})
 
-    def _mark_all(self, changes: Mapping[bytes, Mapping[str, Any]], present: Mapping[bytes, Marks]) -> None:
+    def _mark_all(self, changes: Mapping[bytes, Mapping[str, Any]], present: Mapping[bytes, KeyFlags]) -> None:
         own = self._identity.ca
-        wanted: dict[bytes, Marks] = {}
+        wanted: dict[bytes, KeyFlags] = {}
         for uuid, change in changes.items():
             before = present.get(uuid, _NO_MARKS)
             ca = change.get("ca", before.ca)
@@ -297,7 +297,9 @@ class NodeKeys:
             elif ca is not None and ca != before.ca:
                 sealed = {"ca_mac": self._seals.ca(uuid, ca)}
             values = {**change, **sealed}
-            after = Marks(**values) if before is _NO_MARKS else replace(before, **values)  # replace() costs four times
+            after = (
+                KeyFlags(**values) if before is _NO_MARKS else replace(before, **values)
+            )  # replace() costs four times
             if after != before:
                 wanted[uuid] = after
         if wanted:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.lazy import late
 from teds_provision.station.plant import Plant
-from teds_provision.station.seals import Seals
+from teds_provision.station.row_macs import RowMacs
 from teds_provision.store import (
     DatasheetRecord,
     Draft,
-    ExportFacts,
-    Handed,
+    ExportedNode,
+    ExportEligibility,
     NodeOverview,
     NodeReading,
     NodeRecord,
@@ -36,7 +36,7 @@ else:  # TEDS: a list decodes none
 class Nodes:
     """The nodes of one station, by UUID."""
 
-    def __init__(self, store: Store, seals: Seals, plant: Plant) -> None:
+    def __init__(self, store: Store, seals: RowMacs, plant: Plant) -> None:
         self._plant = plant
         self._store = store
         self._seals = seals
@@ -45,7 +45,7 @@ class Nodes:
         """All nodes, by UUID."""
         return self._store.nodes()
 
-    def each_shown(self) -> Iterator[ExportFacts]:
+    def each_shown(self) -> Iterator[ExportEligibility]:
         """Identity key of all nodes, and whether each was retired, by UUID, a page at a time."""
         return self._store.each_shown()
 
@@ -53,7 +53,7 @@ class Nodes:
         """What is known of a page of nodes, by UUID."""
         return self._store.nodes_of(uuids)
 
-    def handed_of_page(self, uuids: Sequence[bytes]) -> dict[bytes, Handed]:
+    def handed_of_page(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
         """What a bundle says of a page of nodes, by UUID."""
         return self._store.handed_of(uuids)
 

@@ -10,13 +10,13 @@ from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.plant import Plant
-from teds_provision.station.seals import Seals
-from teds_provision.store import ExportFacts, NodeRecord, Store, WhitelistEntry
+from teds_provision.station.row_macs import RowMacs
+from teds_provision.store import ExportEligibility, NodeRecord, Store, WhitelistEntry
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import agreement, keys
+    from teds_provision.protocol import keys, wire_agreement
 else:  # cryptography: not for commands that only list
-    agreement, keys = late("teds_provision.protocol.agreement"), late("teds_provision.protocol.keys")
+    wire_agreement, keys = late("teds_provision.protocol.wire_agreement"), late("teds_provision.protocol.keys")
 
 RECORD_AGAIN: Final = 600.0
 """Seconds in which a process records one wrong key of a UUID: anybody on a bus can show wrong keys, and a new one each
@@ -29,7 +29,7 @@ class Pins:
     With an open vault every row that is used has to carry this station's seal: StoreChangedError otherwise.
     """
 
-    def __init__(self, store: Store, keys: NodeKeys, seals: Seals, plant: Plant) -> None:
+    def __init__(self, store: Store, keys: NodeKeys, seals: RowMacs, plant: Plant) -> None:
         self._store = store
         self._keys = keys
         self._seals = seals
@@ -55,7 +55,9 @@ class Pins:
         """Fingerprint of every pinned UUID; ``nodes`` are all of the store where they have been read already."""
         return self.among(self._store.nodes() if nodes is None else nodes, self.whitelist())
 
-    def among(self, nodes: Iterable[NodeRecord | ExportFacts], entries: Iterable[WhitelistEntry]) -> dict[bytes, str]:
+    def among(
+        self, nodes: Iterable[NodeRecord | ExportEligibility], entries: Iterable[WhitelistEntry]
+    ) -> dict[bytes, str]:
         """Fingerprint of each of these nodes and entries that is pinned, by UUID."""
         pins: dict[bytes, str] = {}
         for node in nodes:
@@ -72,7 +74,7 @@ class Pins:
         pinned = self.pinned(uuid)
         if pinned is not None and not same_key(pinned, keys.fingerprint(point)):
             self._record(uuid, keys.fingerprint(point), pinned)
-            raise agreement.other_key(pinned, point)
+            raise wire_agreement.other_key(pinned, point)
 
     def _record(self, uuid: bytes, shown: str, pinned: str) -> None:
         """One entry of the audit log in :data:`RECORD_AGAIN`; ``unrecorded``: how often it happened since the last."""

@@ -17,7 +17,7 @@ from teds_provision.errors import PolicyError, StoreChangedError, StoreError
 from teds_provision.files import read_limited, write_whole
 from teds_provision.lazy import late
 from teds_provision.station.identity import StationIdentity
-from teds_provision.station.seals import Seals
+from teds_provision.station.row_macs import RowMacs
 from teds_provision.store import LineTables, Store, utc_now
 from teds_provision.store.tables.parcels import ParcelTables
 from teds_provision.store.tables.plant import PlantRecord
@@ -48,9 +48,9 @@ class SignerRules:
     counted: Mapping[str, int]
     keepers_behind: bool
     added: frozenset[str]
-    words: Callable[[bytes], Collection[signer.Word]]
+    words: Callable[[bytes], Collection[signer.SignatureClaim]]
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.Signing | None:
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.SignerVerdict | None:
         """Judge who signed a datasheet; None where the roster has no say: another owner's CA, and a key not in it."""
         key = keys.fingerprint(station_key)
         if key not in self.roster.by_key and certifier != self.ca:
@@ -82,7 +82,7 @@ class Plant:
     ``tables`` are its rows, ``parcels`` those of what leaves and comes, ``line`` those of jobs and proof.
     """
 
-    def __init__(self, store: Store, vault: Callable[[], Vault], identity: StationIdentity, seals: Seals) -> None:
+    def __init__(self, store: Store, vault: Callable[[], Vault], identity: StationIdentity, seals: RowMacs) -> None:
         self.tables: Store = store
         self._vault = vault
         self.line: LineTables = store
@@ -153,12 +153,12 @@ class Plant:
         added = frozenset(one.fingerprint for one in self.tables.trusted() if one.role == "station")
         return SignerRules(held, self._identity.ca, counted, behind, added - held.by_key.keys(), self._words)
 
-    def _words(self, digest: bytes) -> list[signer.Word]:
+    def _words(self, digest: bytes) -> list[signer.SignatureClaim]:
         if os.getpid() != self._process:  # a fork that judges files: a connection of SQLite is not shared
             self._process, self._elsewhere = os.getpid(), Store.open(self._store.home)
         tables = self._elsewhere or self.tables
         return [
-            signer.Word(station, n, vouched)
+            signer.SignatureClaim(station, n, vouched)
             for station, n, vouched, mac in tables.digest_words(digest)
             if self._seals.noted("digest", f"{digest.hex()} {station} {n} {'vouched' if vouched else 'signed'}", mac)
         ]

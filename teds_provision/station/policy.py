@@ -13,7 +13,7 @@ from teds_provision.station.identity import StationIdentity
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
 from teds_provision.station.plant import Plant, SignerRules
-from teds_provision.station.seals import Seals
+from teds_provision.station.row_macs import RowMacs
 from teds_provision.store import RevocationRecord, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.store.records import TrustRole
 
@@ -28,7 +28,7 @@ class Policy:
     """What this station trusts and refuses."""
 
     def __init__(
-        self, store: Store, identity: StationIdentity, keys: NodeKeys, pins: Pins, seals: Seals, plant: Plant
+        self, store: Store, identity: StationIdentity, keys: NodeKeys, pins: Pins, seals: RowMacs, plant: Plant
     ) -> None:
         self._plant = plant
         self._store = store
@@ -65,7 +65,7 @@ class Policy:
         roster = self._plant.roster
         return roster is not None and fingerprint in roster.by_key
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.Signing | None:
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> signer.SignerVerdict | None:
         """What roster and pages say of who signed a datasheet; None where they have no say, or there is no plant."""
         rules = self._plant.signer_rules()
         return None if rules is None else rules.signing(certifier, station_key, digest)

@@ -45,9 +45,9 @@ from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
 from teds_provision.station.plant import Plant
 from teds_provision.station.policy import Policy
-from teds_provision.station.seals import Seals
-from teds_provision.store import AuditLog, Batch, Handover, KeyRecord, NodeTurn, Store, StoreLock
-from teds_provision.store.behind import Behind
+from teds_provision.station.row_macs import RowMacs
+from teds_provision.store import AuditLog, BulkRows, Handover, KeyRecord, NodeLock, Store, StoreLock
+from teds_provision.store.background_writer import BackgroundWriter
 from teds_provision.store.database import has_store
 from teds_provision.store.dump import dump
 from teds_provision.store.records import Direction
@@ -55,7 +55,7 @@ from teds_provision.vault import master_socket
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
-    from teds_provision.protocol import agreement, keys
+    from teds_provision.protocol import keys, wire_agreement
     from teds_provision.vault import Ask, Vault
     from teds_provision.vault.master import MasterKeys
 else:  # cryptography: not for commands that only list
@@ -65,7 +65,7 @@ else:  # cryptography: not for commands that only list
 class Handovers:
     """Bundles that left and came, and the many rows that one of them brings at once."""
 
-    def __init__(self, store: Store, keys: NodeKeys, seals: Seals) -> None:
+    def __init__(self, store: Store, keys: NodeKeys, seals: RowMacs) -> None:
         self._store = store
         self._keys = keys
         self._seals = seals
@@ -86,7 +86,7 @@ class Handovers:
         """Forget a bundle; False if there is none."""
         return self._store.remove_handover(handover_id, direction)
 
-    def take_in(self, batch: Batch) -> None:
+    def take_in(self, batch: BulkRows) -> None:
         """Add or replace many rows, all or none; the caller has held them against what is there."""
         with self._store.transaction():
             seals = self._seals
@@ -105,7 +105,7 @@ __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", 
 class _DurableRun:
     """A run of steps: who takes some of them behind its back, and the number of its ``last`` commit not waited for."""
 
-    behind: Behind
+    behind: BackgroundWriter
     last: int = 0
 
 
@@ -130,7 +130,7 @@ class Station:
         self.use_agent = True
         """Whether what ``unlock`` holds open opens the vault; False where the passphrase itself is asked for."""
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
-        self.seals = Seals(store, self._opened, tell)
+        self.seals = RowMacs(store, self._opened, tell)
         self.identity = StationIdentity(store, self._opened, self.seals)
         self.plant = Plant(store, self.current_vault, self.identity, self.seals)
         self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened, self.plant)
@@ -286,7 +286,7 @@ class Station:
         if uuid is None or self.keys.held(uuid):
             self.current_vault()
 
-    def credentials(self, uuid: bytes | None = None) -> agreement.Credentials:
+    def credentials(self, uuid: bytes | None = None) -> wire_agreement.Credentials:
         """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
 
@@ -376,9 +376,9 @@ class Station:
         if run is not None:
             self._store.settle(run.last)
 
-    def turn(self, uuid: bytes) -> NodeTurn:
+    def turn(self, uuid: bytes) -> NodeLock:
         """Have one node to oneself: two commands of this station do not work on the same node at once."""
-        return NodeTurn(self.home, uuid, notice=self.notice)
+        return NodeLock(self.home, uuid, notice=self.notice)
 
     def transaction(self) -> AbstractContextManager[None]:
         """All of the block reaches the disk, or nothing of it; may stand inside another one."""
@@ -471,14 +471,14 @@ def initialise(
 
 
 @dataclass(frozen=True)
-class Rewrapped:
+class RewrapResult:
     """How many keys are wrapped under the new master key, and how many no master key opened (they stay as they are)."""
 
     keys: int
     damaged: int
 
 
-def rewrap(station: Station) -> Rewrapped:
+def rewrap(station: Station) -> RewrapResult:
     """Wrap every link key under a new master key; the caller holds the StoreLock and has unlocked the vault.
 
     Raises VaultError and its leaves, StoreError; the same command carries on.
@@ -510,4 +510,4 @@ def rewrap(station: Station) -> Rewrapped:
     with station.transaction():
         identity.end_rewrapping()
         station.audit("vault", None, "rewrapped", keys=count - damaged, damaged=damaged)
-    return Rewrapped(count - damaged, damaged)
+    return RewrapResult(count - damaged, damaged)

@@ -18,15 +18,15 @@ from teds_provision.errors import (
     NotAuthenticError,
     PolicyError,
 )
-from teds_provision.protocol.agreement import AgreedKey, StationAgreement, TranscriptMismatchError, fit_to_agree
 from teds_provision.protocol.datasheet import signature_good, station_signature_good
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, reset_message, verify
 from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.wire_agreement import AgreedKey, StationAgreement, TranscriptMismatchError, fit_to_agree
 from teds_provision.station.station import NodeKey, Station
-from teds_provision.steps.identify import Identified
-from teds_provision.steps.read import read_block, read_identity
+from teds_provision.steps.identify import IdentifiedNode
+from teds_provision.steps.teds_read import read_block, read_identity
 from teds_provision.store import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
@@ -39,7 +39,7 @@ TakeOver = Callable[[str], object]
 
 
 @dataclass(frozen=True)
-class Agreed:
+class AgreeResult:
     """The key that a session is open under now; ``fresh`` says whether this run agreed on it."""
 
     epoch: int
@@ -197,12 +197,12 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
 def agree(
     station: Station,
     node: Conversation,
-    who: Identified,
+    who: IdentifiedNode,
     *,
     rotate: bool = False,
     newcomer: WhitelistEntry | None = None,
     take_over: TakeOver | None = None,
-) -> Agreed:
+) -> AgreeResult:
     """End with a session open under an agreed key: the present one, or a new one.
 
     ``rotate`` demands a new one, by a person's word: inside a session where a key is known, else by tap.
@@ -213,7 +213,7 @@ def agree(
     Raises NotWhitelistedError, KeyMismatchError, PolicyError, NodeRefusedError, NotAuthenticError, LinkError; whatever
     is cut, the same call carries on.
     """
-    again, word = 0, _Word(rotate, take_over)
+    again, word = 0, _TakeoverConsent(rotate, take_over)
     while True:
         try:
             return _agree(station, node, who, rotate=rotate, newcomer=newcomer, word=word, again=again > 0)
@@ -227,13 +227,13 @@ def agree(
 def _agree(
     station: Station,
     node: Conversation,
-    who: Identified,
+    who: IdentifiedNode,
     *,
     rotate: bool,
     newcomer: WhitelistEntry | None,
-    word: _Word,
+    word: _TakeoverConsent,
     again: bool,
-) -> Agreed:
+) -> AgreeResult:
     new = who.state == NodeState.FACTORY
     with station.reading():
         returning = _may_return(station, who)
@@ -249,14 +249,14 @@ def _agree(
                 _enlist(station, newcomer)
         if demanded or station.keys.rotation_due(node.uuid) is not None:
             return _new_key(station, node, who, entry, returning=returning, demanded=True)
-        return Agreed(held.record.epoch, held.record.key_id, fresh=again)
+        return AgreeResult(held.record.epoch, held.record.key_id, fresh=again)
     if not new:
         word.require(station, node)
     return _new_key(station, node, who, entry, returning=returning, demanded=demanded)
 
 
 @dataclass
-class _Word:
+class _TakeoverConsent:
     """A person's word that a node with another station's key is to get one of ours; asked for once in a run."""
 
     rotate: bool
@@ -289,8 +289,8 @@ def must_take_over(uuid: bytes) -> PolicyError:
 
 
 def _new_key(
-    station: Station, node: Conversation, who: Identified, entry: WhitelistEntry, *, returning: bool, demanded: bool
-) -> Agreed:
+    station: Station, node: Conversation, who: IdentifiedNode, entry: WhitelistEntry, *, returning: bool, demanded: bool
+) -> AgreeResult:
     """Agree on a key; where none is ``demanded``, one that a new node has stored after all is as good."""
     new = who.state == NodeState.FACTORY
     if new:
@@ -310,7 +310,7 @@ def _new_key(
         held = open_session(station, node) if late else None
         if held is None:
             raise
-        return Agreed(held.record.epoch, held.record.key_id, fresh=True)
+        return AgreeResult(held.record.epoch, held.record.key_id, fresh=True)
     except SessionLostError as lost:
         raise lost.cause from lost
 
@@ -326,7 +326,7 @@ def _enlist(station: Station, entry: WhitelistEntry) -> None:
         station.audit("whitelist", entry.uuid, "added", **told)
 
 
-def _may_return(station: Station, who: Identified) -> bool:
+def _may_return(station: Station, who: IdentifiedNode) -> bool:
     """Whether a node whose move was closed by its receipt may be keyed here again, should it prove to be reset."""
     if who.state != NodeState.FACTORY:
         return False
@@ -336,7 +336,7 @@ def _may_return(station: Station, who: Identified) -> bool:
     return row is not None and row.state == "closed" and not station.keys.held(uuid)
 
 
-def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> WhitelistEntry:
+def _pin_for(entry: WhitelistEntry, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
     """The entry with its fingerprint, pinned now where this contact may pin: tapped, or the bus of a new CAN node."""
     if entry.fingerprint is not None:
         return entry
@@ -359,7 +359,7 @@ def _agree_anew(
     *,
     returning: bool = False,
     only_new: bool = False,
-) -> Agreed:
+) -> AgreeResult:
     """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on.
 
     ``teds`` is the node's Security TEDS as it was read on this link, in the session where there is one.
@@ -422,7 +422,7 @@ def _agree_anew(
             station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
 
     station.behind(record)  # the pending key opens a session as well: nothing that is read next depends on it
-    return Agreed(agreed.epoch, key_id, fresh=True)
+    return AgreeResult(agreed.epoch, key_id, fresh=True)
 
 
 def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes, teds: bytes) -> AgreedKey:
@@ -447,7 +447,7 @@ class ResetReceipt:
     proof: bytes
 
 
-def reset_node(station: Station, node: Conversation, who: Identified) -> ResetReceipt:
+def reset_node(station: Station, node: Conversation, who: IdentifiedNode) -> ResetReceipt:
     """Reset in a session; a node that is in factory state already gives the same proof plainly.
 
     The keys held for it are deleted only after the proof was verified. Raises PolicyError without a key,

@@ -25,13 +25,13 @@ from teds_provision.errors import (
 from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.adopting import Adopt, brought_by, nobody_adopts
+from teds_provision.steps.adoption import Adopt, brought_by, nobody_adopts
 from teds_provision.steps.agree import TakeOver
 from teds_provision.steps.batch_sheet import (
-    About,
     BatchTotals,
     BoardResult,
     Progress,
+    ReportHead,
     SheetRow,
     check_report,
     mean_steps,
@@ -43,7 +43,7 @@ from teds_provision.steps.board_type import Retype, WrongBoardError, differences
 from teds_provision.steps.build import (
     BuildOrder,
     Confirm,
-    Prepared,
+    PreparedOrder,
     compose,
     for_several,
     merged,
@@ -52,14 +52,14 @@ from teds_provision.steps.build import (
     prepare,
     propose,
 )
-from teds_provision.steps.identify import Identified, examine
-from teds_provision.steps.provision import Accept, ProductionLine, Provisioned, inspect, provision
-from teds_provision.steps.read import survey
-from teds_provision.steps.reading import verdict_of
+from teds_provision.steps.identify import IdentifiedNode, examine
+from teds_provision.steps.provision import Accept, ProductionLine, ProvisionResult, inspect, provision
+from teds_provision.steps.readings import verdict_of
+from teds_provision.steps.teds_read import survey
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.talk.meeting import IdleStop, meet, onward, refuse_twins, watch_nodes, without_twins
-from teds_provision.talk.progress import OfNode, Reporter
+from teds_provision.talk.progress import NodeReporter, Reporter
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import default_folders, load_profile
@@ -123,7 +123,7 @@ class ProvisionPlan:
     warnings: tuple[str, ...]
 
 
-class Boards:
+class BatchRun:
     """One run of ``provision``. Everything that was ordered is read, fitted and guarded when this is made.
 
     Raises UsageError, NotFoundError, BadDataError, PolicyError before any node is waited for.
@@ -172,7 +172,7 @@ class Boards:
 
     # -- one node --------------------------------------------------------------------------------------------------
 
-    def one(self, questions: Questions) -> Provisioned:
+    def one(self, questions: Questions) -> ProvisionResult:
         """Provision the one node; raises what ends it."""
         with meet(self._station, self._links, self.node, self._reporter, before=self._station.unlock) as node:
             return self._provision(node, questions)
@@ -279,10 +279,10 @@ class Boards:
             if self._request.report is not None and self.progress is not None:
                 write_report(self._request.report, self.progress, self._about())
 
-    def _about(self) -> About:
+    def _about(self) -> ReportHead:
         operator = self._request.operator or os.environ.get("SUDO_USER") or getpass.getuser()
         station = self._station
-        return About(station.name, station.fingerprint, operator, f"teds-provision {__version__}")
+        return ReportHead(station.name, station.fingerprint, operator, f"teds-provision {__version__}")
 
     def totals(self) -> BatchTotals:
         """What it came to: the whole sheet over all runs, or the nodes of this run."""
@@ -300,7 +300,7 @@ class Boards:
         return BatchTotals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), self.worst)
 
     def _as_they_come(self, questions: Questions) -> Iterator[BoardResult]:
-        def work(node: Conversation) -> Provisioned:
+        def work(node: Conversation) -> ProvisionResult:
             with self.stop.working():
                 return self._provision(node, questions)
 
@@ -396,10 +396,10 @@ class Boards:
 
     def _board(self, contact: Contact, place: str, questions: Questions) -> BoardResult:
         began, uuid = time.monotonic(), contact.identity.uuid
-        done: Provisioned | None = None
+        done: ProvisionResult | None = None
         error: TedsProvisionError | None = None
         known = self._station.nodes.get(uuid)
-        told = OfNode(self._reporter, known.name if known is not None and known.name else uuid.hex())
+        told = NodeReporter(self._reporter, known.name if known is not None and known.name else uuid.hex())
         try:
             with Conversation(contact, notice=told.notice) as node:
                 done = self._provision(node, questions, told)
@@ -431,8 +431,8 @@ class Boards:
             hint=f"Calibrate it: teds-provision provision {uuid.hex()} --calibration FILE; for many: --batch SHEET.",
         )
 
-    def _provision(self, node: Conversation, questions: Questions, reporter: Reporter | None = None) -> Provisioned:
-        def accept(who: Identified) -> None:
+    def _provision(self, node: Conversation, questions: Questions, reporter: Reporter | None = None) -> ProvisionResult:
+        def accept(who: IdentifiedNode) -> None:
             row = self._rows.get(who.uuid)
             listed = self.line is not None and self.line.lists(who)
             if not listed and (row is None or row.by_order):  # a sheet or job that names the board is a person's word
@@ -455,7 +455,7 @@ class Boards:
             adopt=questions.adopt,
         )
 
-    def _for(self, who: Identified) -> Prepared:
+    def _for(self, who: IdentifiedNode) -> PreparedOrder:
         """What this board gets.
 
         Raises PolicyError (the sheet does not know it, its name is another's), KeyMismatchError.

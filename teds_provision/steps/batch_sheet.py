@@ -38,8 +38,8 @@ from teds_provision.errors import (
 from teds_provision.files import SHARED, open_lock, private_folder, read_limited, write_whole
 from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
-from teds_provision.steps.build import BuildOrder, Prepared, content_digests, prepare
-from teds_provision.steps.provision import Provisioned
+from teds_provision.steps.build import BuildOrder, PreparedOrder, content_digests, prepare
+from teds_provision.steps.provision import ProvisionResult
 from teds_provision.steps.verify import require_authentic
 from teds_provision.store import utc_now
 
@@ -58,7 +58,7 @@ class BoardResult:
 
     uuid: bytes
     seconds: float
-    done: Provisioned | None = None
+    done: ProvisionResult | None = None
     error: TedsProvisionError | None = None
     row: int | None = None
     place: str = ""
@@ -143,7 +143,7 @@ class SheetRow:
     line: int
     uuid: bytes | None
     fingerprint: str | None
-    prepared: Prepared
+    prepared: PreparedOrder
     digest: str
 
     @cached_property
@@ -196,7 +196,7 @@ def read_sheet(station: Station, path: Path, order: BuildOrder) -> BatchSheet:
 
     Raises NotFoundError (no such file), BadDataError with every line that is wrong.
     """
-    reading = _Reading(station, path, order)
+    reading = _SheetReader(station, path, order)
     reading.read(read_limited(path, MAX_SHEET_OCTETS, "sheet of boards"))
     if reading.mistakes:
         mistakes = [f"{path.name}:{_numbers(lines)}: {why}" for why, lines in reading.mistakes.items()]
@@ -218,14 +218,14 @@ def _numbers(numbers: Sequence[int]) -> str:
     return f"{', '.join(map(str, numbers[:_SHOWN]))}{more}"
 
 
-class _Reading:
+class _SheetReader:
     def __init__(self, station: Station, path: Path, order: BuildOrder) -> None:
         self.station, self.path, self.order = station, path, order
         self.rows: list[SheetRow] = []
         self.mistakes: dict[str, list[int]] = {}
         self.count = 0
         self._seen: dict[tuple[str, str], int] = {}
-        self._prepared: dict[BuildOrder, Prepared | str] = {}
+        self._prepared: dict[BuildOrder, PreparedOrder | str] = {}
 
     def wrong(self, line: int, why: str) -> None:
         self.mistakes.setdefault(why, []).append(line)
@@ -312,7 +312,7 @@ class _Reading:
         if other != line and not (what == "name" and ("{uuid}" in value or "{n}" in value)):
             self.wrong(line, f"the {what} {value} is already in line {other}")
 
-    def _order(self, line: int, values: dict[str, str]) -> Prepared | None:
+    def _order(self, line: int, values: dict[str, str]) -> PreparedOrder | None:
         file = values.get("calibration") or None
         order = replace(
             self.order,
@@ -344,7 +344,7 @@ _MAX_OCTETS: Final = 64 << 20
 
 
 @dataclass
-class Attempted:
+class RowOutcome:
     """What became of one row: the board that took it, its last result, and whether the first try passed.
 
     ``digest`` is of the row's cells: other cells are another board, and begin from nothing. ``content`` has the digests
@@ -389,21 +389,21 @@ class Progress:
         rows = told.get("rows") if isinstance(told, dict) else None
         return rows if isinstance(rows, dict) else {}
 
-    def _attempted(self, row: SheetRow, kept: Any) -> Attempted:
+    def _attempted(self, row: SheetRow, kept: Any) -> RowOutcome:
         try:
-            found = Attempted(**kept)
+            found = RowOutcome(**kept)
         except TypeError:  # no row yet, or of another version of this tool
-            return Attempted(row.digest, row.content)
+            return RowOutcome(row.digest, row.content)
         if found.digest != row.digest:
             again = "its row in the sheet has changed" if found.result == "passed" else ""
-            return Attempted(row.digest, row.content, again)
+            return RowOutcome(row.digest, row.content, again)
         if found.result == "passed":
             again = self._why_again(row, found)
             if again:
-                return Attempted(row.digest, row.content, again, uuid=found.uuid)
+                return RowOutcome(row.digest, row.content, again, uuid=found.uuid)
         return replace(found, content=row.content)
 
-    def _why_again(self, row: SheetRow, found: Attempted) -> str:
+    def _why_again(self, row: SheetRow, found: RowOutcome) -> str:
         """Return why a row that has passed is done once more, "" if it stays done."""
         if found.content is None:  # finished by an older version, which kept no digests
             same = found.uuid is not None and self._has_it(row, bytes.fromhex(found.uuid))
@@ -592,7 +592,7 @@ _STYLE: Final = (
 
 
 @dataclass(frozen=True)
-class About:
+class ReportHead:
     """Who made a report: the station with its key (64 hex digits), the operator, and with which software."""
 
     station: str
@@ -616,7 +616,7 @@ def check_report(path: Path | None) -> None:
         )
 
 
-def write_report(path: Path, progress: Progress, about: About) -> None:
+def write_report(path: Path, progress: Progress, about: ReportHead) -> None:
     """Write the report whole; raises what ``write_whole`` raises. CSV is for programs: rows and totals alone."""
     rows, totals, name = _rows(progress), progress.totals(), progress.sheet.path.name
     text = _csv(rows, totals) if path.suffix.lower() == ".csv" else _html(name, rows, totals, about)
@@ -660,7 +660,7 @@ def _tame(cell: str) -> str:
     return f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell
 
 
-def _html(name: str, rows: Sequence[Sequence[str]], totals: BatchTotals, about: About) -> str:
+def _html(name: str, rows: Sequence[Sequence[str]], totals: BatchTotals, about: ReportHead) -> str:
     head = "".join(f"<th>{html.escape(cell.replace('_', ' '))}</th>" for cell in _HEAD)
     body = "".join(
         f'<tr class="{html.escape(row[_RESULT])}">'

@@ -22,14 +22,14 @@ from teds_provision.protocol.operation.commands import (
     MOST_SAMPLE_CHANNELS,
     OPERATION,
     ChannelState,
-    Operate,
+    OperateCommand,
     OperationReply,
-    Sampled,
+    SampleReply,
     idle,
     sample,
 )
 from teds_provision.station.station import Station
-from teds_provision.steps.read import list_blocks, read_block
+from teds_provision.steps.teds_read import list_blocks, read_block
 from teds_provision.talk.conversation import Conversation, SessionLostError, is_busy
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import SampleForm
@@ -68,7 +68,7 @@ def refuse(uuid: bytes, differences: tuple[str, ...]) -> None:
     )
 
 
-class _Says(NamedTuple):
+class _ChannelStatement(NamedTuple):
     """What is said of one channel; None: nothing."""
 
     kind: int | None
@@ -77,13 +77,13 @@ class _Says(NamedTuple):
     calibrated: bool
 
     @classmethod
-    def of(cls, channel: Channel, blocks: Mapping[BlockId, bytes]) -> _Says:
+    def of(cls, channel: Channel, blocks: Mapping[BlockId, bytes]) -> _ChannelStatement:
         form = None if channel.sample is None else (channel.sample.model, channel.sample.octets)
         units = channel.units if channel.units_stated else None
         return cls(channel.kind, form, units, (channel.number, AccessCode.CALIBRATION) in blocks)
 
     @classmethod
-    def wanted(cls, channel: ChannelProfile) -> _Says:
+    def wanted(cls, channel: ChannelProfile) -> _ChannelStatement:
         taken = channel.fields.get("Sample")
         form: tuple[int, int] | None = None
         if isinstance(taken, Mapping) and isinstance(taken.get("DatModel"), int):
@@ -102,13 +102,13 @@ def differences(
     """
     if not _describes(has):
         return ()
-    own = {channel.number: _Says.of(channel, has) for channel in Sheet.of_blocks(has).channels}
+    own = {channel.number: _ChannelStatement.of(channel, has) for channel in Sheet.of_blocks(has).channels}
     if not own:
         return ()
     if isinstance(wanted, Image):
-        meant = {one.number: _Says.of(one, wanted.blocks) for one in Sheet.of(wanted).channels}
+        meant = {one.number: _ChannelStatement.of(one, wanted.blocks) for one in Sheet.of(wanted).channels}
     else:
-        meant = {one.number: _Says.wanted(one) for one in wanted.channels}
+        meant = {one.number: _ChannelStatement.wanted(one) for one in wanted.channels}
     meant |= {number: meant[number]._replace(calibrated=True) for number in calibrated if number in meant}
     return tuple(text for number in sorted(meant) for text in _between(number, own.get(number), meant[number]))
 
@@ -127,7 +127,7 @@ def further(has: Mapping[BlockId, bytes], wanted: Image) -> tuple[str, ...]:
     return (f"The board has more channels than the profile: {named}.",) if channels else ()
 
 
-def _between(number: int, own: _Says | None, wanted: _Says) -> Iterator[str]:
+def _between(number: int, own: _ChannelStatement | None, wanted: _ChannelStatement) -> Iterator[str]:
     if own is None:
         yield f"Channel {number} is missing."
         return
@@ -194,7 +194,7 @@ def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead
     named = f"channel {channel}" if channel else "any sensor"
     try:
         node.send(
-            Operate(channel, digest[:DIGEST_OCTETS], lease, dead_man).command(),
+            OperateCommand(channel, digest[:DIGEST_OCTETS], lease, dead_man).command(),
             f"to measure with {named}" if channel else "to measure",
         )
     except NodeRefusedError as refusal:
@@ -219,7 +219,7 @@ _OF_OPERATE: Final = {
 
 
 @dataclass(frozen=True)
-class Borne:
+class HardwareCheck:
     """What the firmware said of each channel: True bears its datasheet, None does not measure; and one reading."""
 
     channels: dict[int, bool | None]
@@ -232,7 +232,7 @@ class Borne:
         return any(self.channels.values())
 
 
-def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = None) -> Borne:
+def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = None) -> HardwareCheck:
     """Ask a node, in its session, whether each channel bears the datasheet ``image``, and its sensors for one reading.
 
     ``shown`` are the units in which people see the values of channels, where the profile names one. Nothing stays
@@ -252,20 +252,20 @@ def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = No
         raise lost.cause from lost
 
 
-def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) -> Borne:
+def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) -> HardwareCheck:
     described = Sheet.of(Image(image.uuid, image.unsigned_blocks()))  # what the Security TEDS says is judged already
     sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
     found = {one.number: _bears(node, one, digest) for one in sheet.channels}
     sensors = [one for one in sheet.channels if not one.actuator and found[one.number]]
     if not sensors:
-        return Borne(found)
+        return HardwareCheck(found)
     try:
         samples = tuple(_read(node, sheet, sensors, digest))
     except (NodeRefusedError, BadDataError) as error:  # busy, a fault: the datasheet stands, and a person is told
-        return Borne(found, warnings=(f"No reading was taken: {error.message}",))
+        return HardwareCheck(found, warnings=(f"No reading was taken: {error.message}",))
     bad = [str(one["channel"]) for one in samples if not one["valid"]]
     warnings = (f"The reading of channel {', '.join(bad)} is invalid.",) if bad else ()
-    return Borne(found, samples, warnings)
+    return HardwareCheck(found, samples, warnings)
 
 
 def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
@@ -294,7 +294,7 @@ def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: byte
             operate(node, number, digest, lease=_LEASE)
         for part in _parts(readers):
             width = sum(readers[number].octets for number in part)
-            reply = Sampled.decode(node.send(sample(part), "to sample"), width)
+            reply = SampleReply.decode(node.send(sample(part), "to sample"), width)
             at, raws = 0, {}
             for number in part:
                 one = readers[number]

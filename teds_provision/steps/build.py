@@ -20,11 +20,11 @@ from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
-from teds_provision.steps.adopting import brought_by
+from teds_provision.steps.adoption import brought_by
 from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse
-from teds_provision.steps.read import Survey
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
-from teds_provision.steps.verify import Known, Verified, verify_image
+from teds_provision.steps.teds_read import NodeSnapshot
+from teds_provision.steps.verify import FreshnessFloor, Verification, verify_image
 from teds_provision.store import Draft
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
@@ -82,7 +82,7 @@ class BuildOrder:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedOrder:
     """An order that was read and found good: its profile, and the calibrations of its file, fitted; None where unnamed.
 
     ``warnings`` are those of the guard, and what a person should know of the order.
@@ -97,7 +97,7 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class Composed:
+class ComposedTeds:
     """The TEDS that profile, calibration and name give; ``wanted`` is the profile as it was asked for."""
 
     profile: Profile
@@ -126,7 +126,7 @@ def for_several(order: BuildOrder) -> BuildOrder:
     return order
 
 
-def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> Prepared:
+def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> PreparedOrder:
     """Read, fit and guard what an order names; ``uuid`` is the node that is meant, None where any may come.
 
     Changes nothing. Raises UsageError (no profile known), NotFoundError, BadDataError, PolicyError (the guard).
@@ -138,25 +138,25 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
                 "--adopt signs the datasheet that the board brought, so it takes no profile or calibration.",
                 hint="Omit --profile and --calibration.",
             )
-        return Prepared(order)
+        return PreparedOrder(order)
     wanted = _absolute_profile(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
     if order.calibration is not None and not order.calibration.is_file():
         raise NotFoundError(f"There is no calibration file {order.calibration}.")
     if wanted is None:
         if uuid is not None and not order.names_nothing:
             raise no_profile(uuid)
-        return Prepared(order)
+        return PreparedOrder(order)
     profile, passed = _load(station, wanted), _passed_over(station, wanted)
     calibrations = _from_file(order, profile)
     if calibrations is None:
-        return Prepared(order, profile, passed=passed)
+        return PreparedOrder(order, profile, passed=passed)
     made = _built_of(profile, _NOBODY, calibrations, order.name, 2007)
     trial = Image(_NOBODY, dict(made.blocks))
     warnings = guard(station, trial, None, order.accept_calibration, calibrations, profile, record=False)
-    return Prepared(order, profile, calibrations, merged(warnings), passed)
+    return PreparedOrder(order, profile, calibrations, merged(warnings), passed)
 
 
-def named_for(station: Station, uuid: bytes, prepared: Prepared, *, keep: bool = False) -> Prepared:
+def named_for(station: Station, uuid: bytes, prepared: PreparedOrder, *, keep: bool = False) -> PreparedOrder:
     """The order with the name that this node gets; raises PolicyError where another node has it.
 
     ``keep``: a numbered name is kept for this node at once, as others may ask for theirs at the same time.
@@ -169,7 +169,7 @@ def named_for(station: Station, uuid: bytes, prepared: Prepared, *, keep: bool =
     return named
 
 
-def _named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
+def _named_for(station: Station, uuid: bytes, prepared: PreparedOrder) -> PreparedOrder:
     name = prepared.order.name
     if name is None:
         return prepared
@@ -213,13 +213,13 @@ def _numbered(station: Station, uuid: bytes, pattern: str) -> str:
 def compose(
     station: Station,
     uuid: bytes,
-    prepared: Prepared,
+    prepared: PreparedOrder,
     has: Image | None,
     *,
     name: str | None = None,
     as_known: bool = True,
     edition: int = 2007,
-) -> Composed:
+) -> ComposedTeds:
     """Compose a node's TEDS; ``has`` is where calibrations come from that the order does not bring or drop.
 
     ``name`` is the one to keep where the order names none; ``as_known``: else the one that this station knows.
@@ -243,7 +243,7 @@ def compose(
     if changed:
         warnings += (f"Profile {wanted} has changed since this node's datasheet was built.",)
     told = merged((*passed, *warnings, *made.warnings))
-    return Composed(profile, wanted, kept, calibrations, made.blocks, told, digest, changed)
+    return ComposedTeds(profile, wanted, kept, calibrations, made.blocks, told, digest, changed)
 
 
 def digest_of(profile: Profile) -> str:
@@ -254,7 +254,7 @@ def digest_of(profile: Profile) -> str:
     return profile.composed[place].hex()
 
 
-def content_digests(prepared: Prepared) -> tuple[str, str]:
+def content_digests(prepared: PreparedOrder) -> tuple[str, str]:
     """Return SHA-256 (hex) of the profile with all that it extends, and of the fitted calibrations; "" for none."""
     profile, calibrations = prepared.profile, prepared.calibrations
     if profile is None:
@@ -460,11 +460,11 @@ def _built_of(
     return profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
 
 
-__all__ = ["BuildOrder", "Built", "Proposal", "UnrequestedChangeError", "build", "propose"]
+__all__ = ["BuildOrder", "BuildResult", "Proposal", "UnrequestedChangeError", "build", "propose"]
 
 
 @dataclass(frozen=True)
-class Built:
+class BuildResult:
     """A built image (Security TEDS unsigned, or absent where the node's key is not known yet) and its warnings."""
 
     image: Image
@@ -507,7 +507,7 @@ def build(
     edition: int = 2007,
     keep_draft: bool = True,
     retype: Retype | None = None,
-) -> Built:
+) -> BuildResult:
     """Build a node's datasheet as a draft: a trial, which only ``sign``, ``write`` or a "yes" bring onto the node.
 
     Where the order brings no calibration, that of an earlier run that never came to write is taken, else the one that
@@ -534,7 +534,7 @@ def build(
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
     except NotFoundError:
         warnings += ("The node's key is not known yet: the Security TEDS is added once it is identified.",)
-    built = Built(image, plan.profile.name, merged(warnings), plan.calibrations)
+    built = BuildResult(image, plan.profile.name, merged(warnings), plan.calibrations)
     if not keep_draft:
         return built
     with station.durable("build"):
@@ -569,7 +569,7 @@ class Proposal:
             confirm(self.image.uuid, self.changes)
 
 
-def propose(station: Station, prepared: Prepared, present: Survey, *, record: bool = True) -> Proposal:
+def propose(station: Station, prepared: PreparedOrder, present: NodeSnapshot, *, record: bool = True) -> Proposal:
     """Say what a node that was just read is to have. ``record`` False: for a dry run, without a trace in the log.
 
     Raises UsageError (no profile known), NotFoundError, BadDataError, PolicyError (a calibration that the guard
@@ -600,7 +600,7 @@ def propose(station: Station, prepared: Prepared, present: Survey, *, record: bo
     )
 
 
-def _proposal(station: Station, prepared: Prepared, present: Survey) -> Proposal:
+def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
     """What the node is to have, by what it has now and what was ordered; not guarded yet."""
     has, order = present.image, prepared.order
     keep = {block: has.blocks[block] for block in present.read_only}
@@ -622,13 +622,13 @@ def _proposal(station: Station, prepared: Prepared, present: Survey) -> Proposal
     return _only_what_is_named(station, prepared, present, keep)
 
 
-def _intact(station: Station, present: Survey) -> bool:
+def _intact(station: Station, present: NodeSnapshot) -> bool:
     """Whether the node has a datasheet that this station would call authentic: what it says may be kept."""
-    checks = verify_image(station, present.image, known=Known(present.identity))
-    return Verified(present.image.uuid, tuple(checks)).verdict == "authentic"
+    checks = verify_image(station, present.image, known=FreshnessFloor(present.identity))
+    return Verification(present.image.uuid, tuple(checks)).verdict == "authentic"
 
 
-def _mended(station: Station, prepared: Prepared, present: Survey) -> Proposal | None:
+def _mended(station: Station, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal | None:
     """The very datasheet that the node was signed for, where it holds something else and nothing else is asked for."""
     octets, uuid = present.image.security, present.image.uuid
     try:
@@ -641,16 +641,18 @@ def _mended(station: Station, prepared: Prepared, present: Survey) -> Proposal |
         blocks = record.image.unsigned_blocks()
         if datasheet.digests(blocks) != shown.signed_blocks:
             continue
-        checks = verify_image(station, Image(uuid, {**blocks, SECURITY: octets}), known=Known(present.identity))
-        if Verified(uuid, tuple(checks)).verdict == "authentic":
+        checks = verify_image(
+            station, Image(uuid, {**blocks, SECURITY: octets}), known=FreshnessFloor(present.identity)
+        )
+        if Verification(uuid, tuple(checks)).verdict == "authentic":
             return Proposal(Image(uuid, blocks), (), named=True)
     return None
 
 
 def _composed(
     station: Station,
-    prepared: Prepared,
-    present: Survey,
+    prepared: PreparedOrder,
+    present: NodeSnapshot,
     keep: Mapping[BlockId, bytes],
     *,
     named: bool,
@@ -667,7 +669,7 @@ def _composed(
     return Proposal(image, (), named, plan.warnings, plan.wanted, plan.name, plan.calibrations, plan.digest)
 
 
-def _as_it_is(station: Station, present: Survey, keep: Mapping[BlockId, bytes]) -> Proposal:
+def _as_it_is(station: Station, present: NodeSnapshot, keep: Mapping[BlockId, bytes]) -> Proposal:
     """What the node has, unless something else was built or signed for it and never written."""
     uuid, has = present.image.uuid, present.image
     pending = pending_image(station, uuid, has)
@@ -680,14 +682,14 @@ def _as_it_is(station: Station, present: Survey, keep: Mapping[BlockId, bytes]) 
 
 
 def _only_what_is_named(
-    station: Station, prepared: Prepared, present: Survey, keep: Mapping[BlockId, bytes]
+    station: Station, prepared: PreparedOrder, present: NodeSnapshot, keep: Mapping[BlockId, bytes]
 ) -> Proposal:
     """What the node has, with those TEDS exchanged that differ by the named values alone."""
     uuid, has = present.image.uuid, present.image
     record = station.nodes.get(uuid)
     name = own_name(station, has, record.profile if record is not None else None)
     asked = compose(station, uuid, prepared, has, name=name, as_known=False)
-    unasked = compose(station, uuid, Prepared(BuildOrder(), asked.profile), has, name=name, as_known=False)
+    unasked = compose(station, uuid, PreparedOrder(BuildOrder(), asked.profile), has, name=name, as_known=False)
     blocks = dict(has.unsigned_blocks())
     for block in {*asked.blocks, *unasked.blocks} - set(keep):
         wanted = asked.blocks.get(block)

@@ -26,22 +26,22 @@ from teds_provision.errors import (
 )
 from teds_provision.files import read_limited
 from teds_provision.links import LINKS, LinkSettings, Notice
-from teds_provision.links.ports import OnABus
+from teds_provision.links.ports import MultiStationLink
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW, SignedNodeKey
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import Agreed, ResetReceipt, agree, open_session, require_session, reset_node
+from teds_provision.steps.agree import AgreeResult, ResetReceipt, agree, open_session, require_session, reset_node
 from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse, shown_by
 from teds_provision.steps.build import guard, own_name, require_free_name
-from teds_provision.steps.identify import Identified, describe, identify
+from teds_provision.steps.identify import IdentifiedNode, describe, identify
 from teds_provision.steps.provision import add_to_whitelist
-from teds_provision.steps.read import read_identity, read_image, survey
-from teds_provision.steps.reading import keep
-from teds_provision.steps.sign import Signed, known_image, known_node_keys, sign
-from teds_provision.steps.verify import Verified, known_of, require_authentic, session, unproven, verify_image
+from teds_provision.steps.readings import keep
+from teds_provision.steps.sign import SignResult, known_image, known_node_keys, sign
+from teds_provision.steps.teds_read import read_identity, read_image, survey
+from teds_provision.steps.verify import Verification, known_of, require_authentic, session, unproven, verify_image
 from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
-from teds_provision.steps.write import Low, Written, wait_for_charge, write
+from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
 from teds_provision.store import DatasheetRecord, Draft
 from teds_provision.talk.conversation import HEARD, Conversation, SessionLostError
 from teds_provision.talk.meeting import Arrival, meet, meet_everyone, watch_nodes
@@ -55,12 +55,12 @@ Unlock = Literal["always", "if held", "never"]
 
 
 @dataclass(frozen=True)
-class Visit:
+class NodeVisit:
     """A node that was met and proved its identity key, for as long as the meeting lasts."""
 
     station: Station
     node: Conversation
-    who: Identified
+    who: IdentifiedNode
 
     def session(self) -> None:
         """Open a session under the key that is held; raises PolicyError where there is none."""
@@ -76,7 +76,7 @@ def at_node(
     *,
     unlock: Unlock = "if held",
     writes: str = "",
-) -> Iterator[Visit]:
+) -> Iterator[NodeVisit]:
     """Meet node ``uuid`` on the chosen link and have it prove its key.
 
     The vault is opened before anyone is waited for: always, where a key of this node is held, or never. Another
@@ -94,7 +94,7 @@ def at_node(
         station.turn(uuid),
         station.released(uuid, writes) if writes else nullcontext(),
     ):
-        yield Visit(station, node, identify(station, node))
+        yield NodeVisit(station, node, identify(station, node))
 
 
 def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
@@ -138,7 +138,7 @@ def read_image_file(path: Path) -> Image:
 class ProvenNode:
     """A node that proved its key; ``identity`` is its plain Identify, a hint."""
 
-    who: Identified
+    who: IdentifiedNode
     identity: Identity
     whitelisted: bool
     channels: int
@@ -230,11 +230,11 @@ def _identified(station: Station, node: Conversation, add: bool) -> ProvenNode:
 
 
 @dataclass(frozen=True)
-class AgreeDone:
+class AgreeReport:
     """What ``agree`` did; for a dry run ``agreed`` is None, and ``plan`` says what it would do."""
 
     uuid: bytes
-    agreed: Agreed | None
+    agreed: AgreeResult | None
     plan: str = ""
     held: tuple[str, ...] = ()
 
@@ -248,7 +248,7 @@ def agree_at(
     rotate: bool = False,
     dry_run: bool = False,
     confirm: Callable[[str], object] | None = None,
-) -> AgreeDone:
+) -> AgreeReport:
     """Agree on a key with the node that ``node`` names (UUID, prefix, name), or rotate it; see :func:`agree`.
 
     ``confirm`` is asked where the key came back from a backup and nobody taps the node, and before a node is taken
@@ -258,16 +258,16 @@ def agree_at(
     station.policy.require_whitelisted(uuid)
     if dry_run:
         held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.of(uuid))
-        return AgreeDone(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
+        return AgreeReport(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
     if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
         confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
     links = replace(links, via_chosen=True)  # a first key is agreed on by a tap, unless a bus is named
     with at_node(station, links, uuid, reporter, unlock="always", writes="agree") as visit:
-        return AgreeDone(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=confirm))
+        return AgreeReport(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=confirm))
 
 
 @dataclass(frozen=True)
-class AddressDone:
+class AddressReport:
     """A node's CAN address; ``changed`` None for a dry run."""
 
     uuid: bytes
@@ -276,13 +276,13 @@ class AddressDone:
 
 def set_address_at(
     station: Station, links: LinkSettings, node: str, address: int, reporter: Reporter, *, dry_run: bool = False
-) -> AddressDone:
+) -> AddressReport:
     """Give the node that ``node`` names another CAN address; see :func:`set_address`."""
     uuid = station.nodes.resolve(node)
     if dry_run:
-        return AddressDone(uuid, None)
+        return AddressReport(uuid, None)
     with at_node(station, links, uuid, reporter, writes="address") as visit:
-        return AddressDone(uuid, set_address(station, visit.node, address))
+        return AddressReport(uuid, set_address(station, visit.node, address))
 
 
 def set_address(station: Station, node: Conversation, address: int) -> bool:
@@ -318,20 +318,20 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
 def _is_at(node: Conversation, address: int) -> bool:
     """Whether this node answers at the new address; what it says there is a hint, as every address is."""
     link = node.contact.link
-    there = link.there(address) if isinstance(link, OnABus) else None
+    there = link.there(address) if isinstance(link, MultiStationLink) else None
     return there is not None and there.uuid == node.uuid
 
 
 # -- read, reset, verify, write ----------------------------------------------------------------------------------------
 @dataclass(frozen=True)
-class ReadDone:
+class ReadReport:
     """Every TEDS of a node; ``error`` is UnprovenError where a key is held here and nothing shows who said it."""
 
     image: Image
     error: UnprovenError | None
 
 
-def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadDone:
+def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadReport:
     """Read every TEDS of the node that ``node`` names, in a session where this station holds its key."""
     uuid = station.nodes.resolve(node)
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
@@ -343,7 +343,7 @@ def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter
             known = known_of(station, uuid, visit.node.proven or read_identity(visit.node))
             with station.durable("read"):
                 keep(station, visit.node, image, by="read", known=known, c=c)
-        return ReadDone(image, unproven(uuid, check.why) if check.result == "failed" else None)
+        return ReadReport(image, unproven(uuid, check.why) if check.result == "failed" else None)
 
 
 def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter) -> ResetReceipt:
@@ -353,10 +353,10 @@ def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Repor
 
 
 @dataclass(frozen=True)
-class VerifyDone:
+class VerifyReport:
     """All checks of a node or an image, warnings, and the error that the verification ends with, None for none."""
 
-    verified: Verified
+    verified: Verification
     warnings: tuple[str, ...]
     error: TedsProvisionError | None
 
@@ -369,14 +369,14 @@ def verify_at(
     *,
     accept_calibration: str | None = None,
     node: bool = False,
-) -> VerifyDone:
+) -> VerifyReport:
     """Check the image file, or the node, that ``what`` names; with ``node`` a node's name goes first.
 
     ``error``: NotAuthenticError (4), UnprovenError (5), or PolicyError (6) for a calibration that would hurt.
     """
     found = node_or_image(station, what, node=node)
     if isinstance(found, Image):
-        image, verified = found, Verified(found.uuid, tuple(verify_image(station, found)), scope="image")
+        image, verified = found, Verification(found.uuid, tuple(verify_image(station, found)), scope="image")
     else:
         in_session = False
         try:
@@ -391,20 +391,20 @@ def verify_at(
                 raise
             station.audit("verify", found, "unproven", why=refusal.message)
             why = refusal.message.removeprefix(HEARD).rstrip(".")
-            image, verified = Image(found, {}), Verified(found, (session("", why),))
+            image, verified = Image(found, {}), Verification(found, (session("", why),))
     try:
         require_authentic(verified)
-        return VerifyDone(verified, guard(station, image, None, accept_calibration), None)
+        return VerifyReport(verified, guard(station, image, None, accept_calibration), None)
     except TedsProvisionError as error:
-        return VerifyDone(verified, (), error)
+        return VerifyReport(verified, (), error)
 
 
 @dataclass(frozen=True)
-class WriteDone:
+class WriteReport:
     """What ``write`` did; for a dry run ``written`` is None and ``image`` what would be written."""
 
     image: Image
-    written: Written | None
+    written: WriteResult | None
 
 
 def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, dict[str, object]]:
@@ -448,7 +448,7 @@ def write_at(
     low: Low = wait_for_charge,
     retype: Retype | None = None,
     retyped: bool = False,
-) -> WriteDone:
+) -> WriteReport:
     """Write a signed image to the node that ``node`` names: of a file, else the draft, else what it was read to have.
 
     ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
@@ -461,7 +461,7 @@ def write_at(
     station.policy.require_whitelisted(uuid)
     wanted, facts = _wanted(station, uuid, file)
     if dry_run:
-        return WriteDone(wanted, None)
+        return WriteReport(wanted, None)
     if jump is not None:
         jump("This uses up the node's sequence numbers up to that point, permanently. Write it?")
     with at_node(station, links.after_agreeing(), uuid, reporter, writes="write") as visit:
@@ -475,7 +475,7 @@ def write_at(
                 (retype or refuse)(uuid, told)
         far = jump is not None
         written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=far, low=low)
-        return WriteDone(wanted, written)
+        return WriteReport(wanted, written)
 
 
 # -- sign: which image, against what the node has; guarded, with the changes in physical terms -------------------------
@@ -492,10 +492,10 @@ class SignOrder:
 
 
 @dataclass(frozen=True)
-class SignDone:
+class SignReport:
     """The signed image (for a dry run: of the plan, unsigned), and what changes, a sentence each."""
 
-    signed: Signed
+    signed: SignResult
     changes: tuple[str, ...]
 
 
@@ -509,7 +509,7 @@ def sign_at(
     accept_calibration: str | None = None,
     dry_run: bool = False,
     output: Path | None = None,
-) -> SignDone:
+) -> SignReport:
     """Sign the draft of the node that ``what`` names, or an image file; ``read_node``: against the node itself.
 
     ``output`` is where the caller will write the image: an image file needs one. Raises UsageError, and what
@@ -530,7 +530,7 @@ def sign_at(
         return sign_image(station, order, node)
 
 
-def sign_image(station: Station, order: SignOrder, node: Conversation | None) -> SignDone:
+def sign_image(station: Station, order: SignOrder, node: Conversation | None) -> SignReport:
     """Sign the draft or image of one node; with ``node`` against what it has, in a session, else as last known.
 
     An image file that was built at another station brings the node's epoch and sequence in its Security TEDS, as that
@@ -555,7 +555,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     changes = diff_blocks(has.unsigned_blocks() if has else {}, image.unsigned_blocks())
     told = tuple(change.text for change in changes)
     if order.dry_run:
-        return SignDone(Signed(image, present.sequence, reused=False), told)
+        return SignReport(SignResult(image, present.sequence, reused=False), told)
     signed = sign(
         station,
         keys,
@@ -566,11 +566,11 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
         earlier=_signed_before(image, draft),
     )
     _keep(station, order, signed, draft)
-    return SignDone(signed, told)
+    return SignReport(signed, told)
 
 
 @dataclass(frozen=True)
-class _Present:
+class _PresentTeds:
     """What the node has: as last known, or (``read``) as it was read now. ``read_only`` blocks cannot be replaced."""
 
     image: Image | None
@@ -597,7 +597,7 @@ class _Present:
         return self.image.security
 
 
-def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image | None) -> _Present:
+def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image | None) -> _PresentTeds:
     """What the store knows of the node, or the image file that came, where it says more.
 
     A file is hearsay, so it does not use up the sequence of a node that this station knows: more than a node would take
@@ -606,28 +606,28 @@ def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image 
     record = station.nodes.get(uuid)
     epoch, sequence = station.keys.active_epoch(uuid) or (record.epoch if record else 0), _sequence_of(known)
     if file is None or SECURITY not in file.blocks:
-        return _Present(known, epoch, sequence)
+        return _PresentTeds(known, epoch, sequence)
     brought = security.decode(file.blocks[SECURITY])
     epoch = max(epoch, brought.key_epoch)
     if brought.signed and brought.station_key == station.point:
-        return _Present(known, epoch, sequence)  # this very sequence was given here: the signature may still hold
+        return _PresentTeds(known, epoch, sequence)  # this very sequence was given here: the signature may still hold
     highest = max(sequence, record.sequence if record else 0)
     if highest and brought.sequence > highest + SEQUENCE_WINDOW:
         raise PolicyError(
             f"The image has sequence {brought.sequence}; the last one known here is {highest}.",
             hint="That number is unverified. Check it against the node: sign IMAGE --read-node",
         )
-    return _Present(known, epoch, max(sequence, brought.sequence))
+    return _PresentTeds(known, epoch, max(sequence, brought.sequence))
 
 
-def _read_now(station: Station, node: Conversation, order: SignOrder) -> _Present:
+def _read_now(station: Station, node: Conversation, order: SignOrder) -> _PresentTeds:
     if not order.dry_run:  # opening a session may settle or rotate keys
         require_session(station, node)
     found = survey(node)
-    return _Present(found.image, found.identity.epoch, found.identity.sequence, found.read_only, read=True)
+    return _PresentTeds(found.image, found.identity.epoch, found.identity.sequence, found.read_only, read=True)
 
 
-def _keep(station: Station, order: SignOrder, signed: Signed, draft: Draft | None) -> None:
+def _keep(station: Station, order: SignOrder, signed: SignResult, draft: Draft | None) -> None:
     """Keep what was built here, or signed anew, until it is written; with the profile that it was built from.
 
     An image file that was not built here stays the caller's.
@@ -658,14 +658,14 @@ def _signed_before(image: Image, draft: Draft | None) -> list[bytes]:
 
 
 @dataclass(frozen=True)
-class Dropped:
+class DroppedDraft:
     """A draft that was dropped, or would be; None where there was none."""
 
     uuid: bytes
     draft: Draft | None
 
 
-def drop_draft(station: Station, node: str, *, dry_run: bool = False) -> Dropped:
+def drop_draft(station: Station, node: str, *, dry_run: bool = False) -> DroppedDraft:
     """Drop what was built for the node that ``node`` names and never written."""
     uuid = station.nodes.resolve(node)
     draft = station.nodes.draft(uuid)
@@ -673,7 +673,7 @@ def drop_draft(station: Station, node: str, *, dry_run: bool = False) -> Dropped
         with station.durable("draft"):
             station.nodes.drop_draft(uuid)
             station.audit("draft", uuid, "dropped", stage=draft.stage, profile=draft.profile)
-    return Dropped(uuid, draft)
+    return DroppedDraft(uuid, draft)
 
 
 def history_of(station: Station, node: str) -> tuple[bytes, list[DatasheetRecord]]:
@@ -683,13 +683,13 @@ def history_of(station: Station, node: str) -> tuple[bytes, list[DatasheetRecord
 
 
 @dataclass(frozen=True)
-class BroughtBack:
+class RestoredDatasheet:
     """An older datasheet, signed anew and written; for a dry run ``written`` is None."""
 
     uuid: bytes
     sequence: int
     changes: tuple[Change, ...]
-    written: Written | None
+    written: WriteResult | None
 
 
 def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
@@ -705,7 +705,7 @@ def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
 
 def bring_back(
     station: Station, links: LinkSettings, node: str, sequence: int, reporter: Reporter, *, dry_run: bool = False
-) -> BroughtBack:
+) -> RestoredDatasheet:
     """Write a datasheet that the node had under ``sequence``, signed anew; its content counts, not its number.
 
     Raises NotFoundError (no such datasheet), PolicyError, and what ``write`` raises.
@@ -716,7 +716,7 @@ def bring_back(
     if dry_run:
         now = station.nodes.datasheet(uuid)
         before = now.unsigned_blocks() if now is not None else {}
-        return BroughtBack(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
+        return RestoredDatasheet(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
     with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always", writes="write") as visit:
         visit.session()
         present = survey(visit.node)
@@ -736,4 +736,4 @@ def bring_back(
         )
         facts = {"profile": record.profile} if record.profile is not None else {}
         written = write(station, visit.node, signed.image, present=present, progress=reporter.written, facts=facts)
-        return BroughtBack(uuid, signed.sequence, changes, written)
+        return RestoredDatasheet(uuid, signed.sequence, changes, written)

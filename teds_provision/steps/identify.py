@@ -16,8 +16,8 @@ from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
-from teds_provision.steps.read import read_block
-from teds_provision.steps.reading import keep_shown
+from teds_provision.steps.readings import keep_shown
+from teds_provision.steps.teds_read import read_block
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
@@ -26,7 +26,7 @@ from teds_provision.teds.image import SECURITY
 
 
 @dataclass(frozen=True)
-class Identified:
+class IdentifiedNode:
     """A node that proved possession of the key that it shows."""
 
     uuid: bytes
@@ -56,8 +56,8 @@ def prove(node: Conversation, point: bytes) -> None:
 
 
 def identify(
-    station: Station, node: Conversation, *, expect: Callable[[Identified], object] = lambda who: None
-) -> Identified:
+    station: Station, node: Conversation, *, expect: Callable[[IdentifiedNode], object] = lambda who: None
+) -> IdentifiedNode:
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
     Raises KeyMismatchError (a known UUID with another key), NotAuthenticError, BadDataError, LinkError. A tap pins the
@@ -85,7 +85,7 @@ def identify(
     return who
 
 
-def _facts(station: Station, who: Identified, *, counts: bool) -> dict[str, object]:
+def _facts(station: Station, who: IdentifiedNode, *, counts: bool) -> dict[str, object]:
     """What is remembered of a node that proved its key; ``counts``: by tap, or under a key that is whitelisted."""
     facts: dict[str, object] = {"point": who.point} if counts else {}
     known = station.nodes.get(who.uuid)
@@ -100,7 +100,7 @@ def _charge(node: Conversation) -> dict[str, object]:
     return {} if charging is None else {"charging": json.dumps({**charging.to_json(), "at": utc_now()})}
 
 
-def _pinned_now(station: Station, who: Identified) -> WhitelistEntry | None:
+def _pinned_now(station: Station, who: IdentifiedNode) -> WhitelistEntry | None:
     """The node's entry with its whole fingerprint, None where it has that already, or nobody opens the vault.
 
     An entry that was made without one is pinned by its first tap (profile.md, "Keys and trust"); one that was made with
@@ -120,7 +120,7 @@ def _opened(station: Station) -> bool:
     return False
 
 
-def examine(station: Station, node: Conversation) -> Identified:
+def examine(station: Station, node: Conversation) -> IdentifiedNode:
     """What :func:`identify` finds out, without a trace in the store (but of a wrong key in the audit log)."""
     octets = read_block(node, SECURITY)
     shown = security.decode(octets)
@@ -132,7 +132,7 @@ def examine(station: Station, node: Conversation) -> Identified:
         station.pins.check(node.uuid, point)
         entry = station.pins.entry(node.uuid)
     identity = node.identity
-    return Identified(
+    return IdentifiedNode(
         uuid=node.uuid,
         point=point,
         key_signature=shown.node_key_signature,

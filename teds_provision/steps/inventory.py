@@ -18,11 +18,11 @@ from teds_provision.station.station import Station
 from teds_provision.store import NodeOverview, Search
 
 if TYPE_CHECKING:
-    from teds_provision.steps import reading
-    from teds_provision.steps.reading import NodeVerdict
+    from teds_provision.steps import readings
+    from teds_provision.steps.readings import NodeVerdict
     from teds_provision.teds.fits import Fit, Requirement
 else:  # cryptography: a list of nodes that nobody verified yet needs none
-    reading = late("teds_provision.steps.reading")
+    readings = late("teds_provision.steps.readings")
 
 PAGE = 256
 """Nodes that are judged together."""
@@ -66,7 +66,7 @@ def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[di
     known = station.nodes.overview(uuids)
     while page := list(islice(known, PAGE)):
         listed = [one.uuid for one in page]
-        judged = reading.verdicts_of(station, listed, [one.uuid for one in page if one.keys and one.moved is None])
+        judged = readings.verdicts_of(station, listed, [one.uuid for one in page if one.keys and one.moved is None])
         for one in page:
             found = judged.get(one.uuid)
             yield _described(one, found), found

@@ -16,10 +16,10 @@ from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
-from teds_provision.steps.adopting import Adopt, brought_by, nobody_adopts, require_a_reason
-from teds_provision.steps.agree import Agreed, TakeOver, agree
+from teds_provision.steps.adoption import Adopt, brought_by, nobody_adopts, require_a_reason
+from teds_provision.steps.agree import AgreeResult, TakeOver, agree
 from teds_provision.steps.board_type import (
-    Borne,
+    HardwareCheck,
     Retype,
     bears,
     differences,
@@ -31,7 +31,7 @@ from teds_provision.steps.board_type import (
 from teds_provision.steps.build import (
     BuildOrder,
     Confirm,
-    Prepared,
+    PreparedOrder,
     Proposal,
     merged,
     named_for,
@@ -40,12 +40,12 @@ from teds_provision.steps.build import (
     prepare,
     propose,
 )
-from teds_provision.steps.identify import Identified, identify
-from teds_provision.steps.read import Survey, survey
-from teds_provision.steps.sign import Signed, sign
-from teds_provision.steps.verify import Verified
+from teds_provision.steps.identify import IdentifiedNode, identify
+from teds_provision.steps.sign import SignResult, sign
+from teds_provision.steps.teds_read import NodeSnapshot, survey
+from teds_provision.steps.verify import Verification
 from teds_provision.steps.verify_node import look_at_node, verify_node
-from teds_provision.steps.write import Low, Written, wait_for_charge, write
+from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
 from teds_provision.store import WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation, SessionLostError
@@ -53,28 +53,28 @@ from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepR
 from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.image import SECURITY, Image
 
-Order = BuildOrder | Prepared | Callable[["Identified"], Prepared]
+Order = BuildOrder | PreparedOrder | Callable[["IdentifiedNode"], PreparedOrder]
 """What a node gets: as it was asked for, read already, or by who it is (which raises where it gets nothing)."""
 Onward = Callable[[Conversation], None]
 """Takes the conversation to another link; see ``talk/meeting.py``."""
-Accept = Callable[[Identified], None]
+Accept = Callable[[IdentifiedNode], None]
 """Asked before an unknown node is whitelisted; raises where the answer is no."""
 
 
 @dataclass(frozen=True)
-class Provisioned:
+class ProvisionResult:
     """The end of a run: its steps, what stands on the node, and the verdict."""
 
-    who: Identified
+    who: IdentifiedNode
     steps: tuple[StepResult, ...]
     image: Image
-    verified: Verified
+    verified: Verification
     warnings: tuple[str, ...]
     samples: tuple[dict[str, Any], ...] = ()
     """One reading of each sensor at the end: channel, name, value and unit (SI), valid."""
 
 
-def inspect(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> Provisioned:
+def inspect(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> ProvisionResult:
     """Test one board that another station made: identify, verify, check; nothing is written, proof is left.
 
     Raises what :func:`provision` raises; a board that is not authentic is told by its verdict.
@@ -96,9 +96,11 @@ def inspect(station: Station, node: Conversation, line: ProductionLine, reporter
                         refuse(who.uuid, told)
                 with steps.step("check") as step:
                     passed = looked.verified.verdict == "authentic" and node.sealed
-                    borne = bears(node, looked.image) if passed else Borne({})
+                    borne = bears(node, looked.image) if passed else HardwareCheck({})
                     step.result = DONE if borne.asked else SKIPPED
-                done = Provisioned(who, tuple(steps.done), looked.image, looked.verified, borne.warnings, borne.samples)
+                done = ProvisionResult(
+                    who, tuple(steps.done), looked.image, looked.verified, borne.warnings, borne.samples
+                )
                 unit.ended(node, done)
             except (TedsProvisionError, SessionLostError) as error:
                 cause = error.cause if isinstance(error, SessionLostError) else error
@@ -117,17 +119,19 @@ def inspect(station: Station, node: Conversation, line: ProductionLine, reporter
 class Unit(Protocol):
     """One board of a line, from before its key is agreed on until it is done."""
 
-    prepared: Prepared
+    prepared: PreparedOrder
     """What it gets, its name included."""
 
-    def sign(self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: Survey) -> Signed | None:
+    def sign(
+        self, node: Conversation, keys: SignedNodeKey, proposal: Proposal, present: NodeSnapshot
+    ) -> SignResult | None:
         """The datasheet signed elsewhere; None where this station signs."""
 
-    def ended(self, node: Conversation, done: Provisioned) -> None:
+    def ended(self, node: Conversation, done: ProvisionResult) -> None:
         """Leave proof, in the session that is open."""
 
     def failed(
-        self, node: Conversation, who: Identified, steps: Sequence[StepResult], step: str, error: TedsProvisionError
+        self, node: Conversation, who: IdentifiedNode, steps: Sequence[StepResult], step: str, error: TedsProvisionError
     ) -> None:
         """Leave proof of an attempt that ended with an error in ``step``, as far as the board still answers."""
 
@@ -147,7 +151,7 @@ class ProductionLine(Protocol):
     def base(self) -> BuildOrder:
         """What all boards get."""
 
-    def order(self, who: Identified) -> Prepared:
+    def order(self, who: IdentifiedNode) -> PreparedOrder:
         """What this board gets; raises PolicyError where it gets nothing."""
 
     @property
@@ -157,13 +161,15 @@ class ProductionLine(Protocol):
     def unit_to_json(self, uuid: bytes) -> dict[str, Any]:
         """What is told of a board beside its steps."""
 
-    def lists(self, who: Identified) -> bool:
+    def lists(self, who: IdentifiedNode) -> bool:
         """Whether the job names this very board, by UUID and key."""
 
     def is_listed(self, uuid: bytes) -> bool:
         """Whether the job names this UUID."""
 
-    def take(self, node: Conversation, who: Identified, prepared: Prepared, entry: WhitelistEntry | None) -> Unit:
+    def take(
+        self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
+    ) -> Unit:
         """Take a unit for this board, durably, or find the one that it has; ``entry`` is a newcomer's.
 
         Raises PolicyError, and then no unit was taken.
@@ -184,7 +190,7 @@ def provision(
     retype: Retype | None = None,
     line: ProductionLine | None = None,
     adopt: Adopt = nobody_adopts,
-) -> Provisioned:
+) -> ProvisionResult:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
     ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
@@ -227,7 +233,7 @@ class _Run:
         self.line = line
         self.unit: Unit | None = None
 
-    def proven(self) -> Provisioned:
+    def proven(self) -> ProvisionResult:
         """The run; what ends a board that has a unit leaves proof too, while the board may still be there."""
         who = self._identify()
         try:
@@ -241,7 +247,7 @@ class _Run:
             raise
         return done
 
-    def run(self, who: Identified) -> Provisioned:
+    def run(self, who: IdentifiedNode) -> ProvisionResult:
         prepared = self._prepared(who)
         # before it becomes ours, or costs a unit
         if prepared.profile is not None and (who.state == NodeState.FACTORY or self.line is not None):
@@ -262,9 +268,9 @@ class _Run:
         verified = self._verify(who, written)
         borne = self._check(prepared, written, verified)
         warnings = merged((*proposal.warnings, *further(present.image.blocks, proposal.image), *borne.warnings))
-        return Provisioned(who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples)
+        return ProvisionResult(who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples)
 
-    def _require_its_board(self, who: Identified, prepared: Prepared, told: tuple[str, ...]) -> None:
+    def _require_its_board(self, who: IdentifiedNode, prepared: PreparedOrder, told: tuple[str, ...]) -> None:
         """Ask, or refuse, where the board says that it is of another type; once, whoever of the two looks first."""
         wanted = prepared.order.profile
         if not told or prepared.order.retype or self._retyped:
@@ -274,21 +280,21 @@ class _Run:
         self.retype(who.uuid, told)
         self._retyped = True
 
-    def _identify(self) -> Identified:
+    def _identify(self) -> IdentifiedNode:
         with self.steps.step("identify") as step:
             who = identify(self.station, self.node, expect=self._choose)
             step.detail = f"{who.uuid.hex()}, key {who.fingerprint[:16]}"
         return who
 
-    def _choose(self, who: Identified) -> None:
+    def _choose(self, who: IdentifiedNode) -> None:
         if callable(self.order):
             self.order = self.order(who)
 
-    def _prepared(self, who: Identified) -> Prepared:
+    def _prepared(self, who: IdentifiedNode) -> PreparedOrder:
         """The order for this very node; what was read before the tap is not read again."""
         order = self.order
         prepared = prepare(self.station, order, who.uuid) if isinstance(order, BuildOrder) else order
-        assert isinstance(prepared, Prepared), "_choose() has asked"
+        assert isinstance(prepared, PreparedOrder), "_choose() has asked"
         if prepared.profile is None and prepared.order.calibration is not None:  # of the type that this node has
             prepared = prepare(self.station, prepared.order, who.uuid)
         known = self.station.nodes.get(who.uuid)
@@ -297,7 +303,7 @@ class _Run:
             raise no_profile(who.uuid)
         return named_for(self.station, who.uuid, prepared, keep=True)
 
-    def _whitelist(self, who: Identified) -> WhitelistEntry | None:
+    def _whitelist(self, who: IdentifiedNode) -> WhitelistEntry | None:
         """None for a node that is whitelisted; else its entry, which the key agreement makes durable with the key."""
         with self.steps.step("whitelist") as step:
             if who.whitelisted is not None:
@@ -307,14 +313,14 @@ class _Run:
             self.accept(who)
         return entry
 
-    def _agree(self, who: Identified, entry: WhitelistEntry | None) -> Agreed:
+    def _agree(self, who: IdentifiedNode, entry: WhitelistEntry | None) -> AgreeResult:
         with self.steps.step("agree") as step:
             agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.take_over)
             step.result = DONE if agreed.fresh else NOTHING
             step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
         return agreed
 
-    def _build(self, who: Identified, prepared: Prepared, present: Survey) -> Proposal:
+    def _build(self, who: IdentifiedNode, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
         with self.steps.step("build") as step:
             if prepared.profile is not None:  # before a calibration is held against a channel that it is not of
                 told = differences(present.image.blocks, prepared.profile, prepared.calibrations or ())
@@ -330,7 +336,7 @@ class _Run:
             step.detail = f"{kind}{len(proposal.image.blocks)} TEDS{fits}"
         return proposal
 
-    def _adopted(self, prepared: Prepared, present: Survey) -> Proposal:
+    def _adopted(self, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
         """What the board brought, judged and asked about; nothing of it changes but its name, where one is given."""
         brought = brought_by(self.station, present.image, name=prepared.order.name)
         reason = prepared.order.accept_calibration
@@ -341,7 +347,7 @@ class _Run:
         self.station.audit("adopt", brought.image.uuid, "accepted", teds=brought.image.digest(), name=brought.name)
         return Proposal(brought.image, (), True, brought.warnings, name=brought.name or None)
 
-    def _sign(self, who: Identified, proposal: Proposal, present: Survey) -> Signed:
+    def _sign(self, who: IdentifiedNode, proposal: Proposal, present: NodeSnapshot) -> SignResult:
         with self.steps.step("sign") as step:
             keys = SignedNodeKey(who.uuid, who.point, who.key_signature)
             elsewhere = None if self.unit is None else self.unit.sign(self.node, keys, proposal, present)
@@ -369,7 +375,7 @@ class _Run:
             step.detail = f"sequence {signed.sequence}"
         return signed
 
-    def _write(self, signed: Signed, proposal: Proposal, present: Survey) -> Written:
+    def _write(self, signed: SignResult, proposal: Proposal, present: NodeSnapshot) -> WriteResult:
         with self.steps.step("write") as step:
             facts = {"profile": proposal.profile, "name": proposal.name, "profile_digest": proposal.profile_digest}
             written = write(
@@ -385,12 +391,12 @@ class _Run:
             step.detail = f"{written.octets} octets" if written.octets else ""
         return written
 
-    def _check(self, prepared: Prepared, written: Written, verified: Verified) -> Borne:
+    def _check(self, prepared: PreparedOrder, written: WriteResult, verified: Verification) -> HardwareCheck:
         """Ask the hardware whether it bears the datasheet, and for one reading; nothing where it is not authentic."""
         with self.steps.step("check") as step:
             if verified.verdict != "authentic":
                 step.result = SKIPPED
-                return Borne({})
+                return HardwareCheck({})
             profile = prepared.profile
             units = shown_units(self.station, self.node.uuid) if profile is None else units_of(profile.channels)
             borne = bears(self.node, written.on_node, units)
@@ -401,14 +407,14 @@ class _Run:
             )
         return borne
 
-    def _verify(self, who: Identified, written: Written) -> Verified:
+    def _verify(self, who: IdentifiedNode, written: WriteResult) -> Verification:
         with self.steps.step("verify") as step:
             verified = verify_node(self.station, self.node, written.on_node, who.point, by="provision").verified
             step.detail = verified.verdict
         return verified
 
 
-def newcomer(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
+def newcomer(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
     """The whitelist entry of a node that was just identified, pinned to its key by tap, or by the bus of a new node.
 
     A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. Over the
@@ -424,7 +430,7 @@ def newcomer(station: Station, node: Conversation, who: Identified) -> Whitelist
     return WhitelistEntry(who.uuid, who.fingerprint if node.tapped or new else None, assurance=assurance)
 
 
-def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
+def add_to_whitelist(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
     """Whitelist a node as :func:`newcomer` says; an entry that another process made meanwhile stays."""
     entry = newcomer(station, node, who)
     with station.durable("whitelist"):

@@ -27,7 +27,7 @@ LAST_SEQUENCE = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
-class Signed:
+class SignResult:
     """A signed image, and whether its signature is the one that already existed."""
 
     image: Image
@@ -102,7 +102,7 @@ def sign(
     profile: str | None = None,
     unit: tuple[str, int] | None = None,
     write_follows: bool = False,
-) -> Signed:
+) -> SignResult:
     """Sign ``image`` for key epoch ``epoch``.
 
     ``node_sequence`` is the node's, as read in a session (or last known). ``on_node`` is the node's present Security
@@ -122,7 +122,7 @@ def sign(
         for octets in filter(None, (on_node, *earlier)):
             number = _sequence_if_the_same(station, keys, image, octets, epoch)
             if number is not None and (octets == on_node or number > node_sequence):
-                return Signed(image.with_block(SECURITY, octets), number, reused=True)
+                return SignResult(image.with_block(SECURITY, octets), number, reused=True)
     station.plant.require_role(
         "sign", "cannot sign datasheets", "Have a station sign it that has this role: sign --by OFFICE"
     )
@@ -153,7 +153,7 @@ def sign(
         station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
     if write_follows:
         station.behind(station.settle)
-    return Signed(made, number, reused=False)
+    return SignResult(made, number, reused=False)
 
 
 def _sequence_if_the_same(station: Station, keys: SignedNodeKey, image: Image, octets: bytes, epoch: int) -> int | None:

@@ -10,11 +10,11 @@ from typing import Final, Literal, NamedTuple, Protocol
 
 from teds_provision.errors import BadDataError, BadDatasheetError, NotAuthenticError, TedsProvisionError, UnprovenError
 from teds_provision.protocol import datasheet
-from teds_provision.protocol.agreement import other_key
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
-from teds_provision.protocol.plant.signer import Signing
+from teds_provision.protocol.plant.signer import SignerVerdict
+from teds_provision.protocol.wire_agreement import other_key
 from teds_provision.station.plant import SignerRules
 from teds_provision.station.station import Station
 from teds_provision.steps.sign import known_image
@@ -27,7 +27,7 @@ from teds_provision.teds.image import SECURITY, Image
 # -- what it is judged by: a station's keys, pins and deny list, asked one by one or remembered for many ---------------
 
 
-class PinsAsked(Protocol):
+class PinLookup(Protocol):
     """Which key a UUID is pinned to."""
 
     def check(self, uuid: bytes, point: bytes) -> None:
@@ -37,7 +37,7 @@ class PinsAsked(Protocol):
         """The whitelist entry of a node."""
 
 
-class PolicyAsked(Protocol):
+class TrustLookup(Protocol):
     """Whose signatures count, and who is denied."""
 
     def revocation(self, uuid: bytes) -> RevocationRecord | None:
@@ -49,11 +49,11 @@ class PolicyAsked(Protocol):
     def trusted_stations(self) -> list[bytes]:
         """Station keys that count."""
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> Signing | None:
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
         """What the plant says of who signed the datasheet of this digest; None where it has no say."""
 
 
-class Judging(Protocol):
+class TrustSource(Protocol):
     """A station, or what was remembered of one."""
 
     @property
@@ -61,16 +61,16 @@ class Judging(Protocol):
         """The station's own key."""
 
     @property
-    def pins(self) -> PinsAsked:
+    def pins(self) -> PinLookup:
         """Pinned keys."""
 
     @property
-    def policy(self) -> PolicyAsked:
+    def policy(self) -> TrustLookup:
         """Trust and denials."""
 
 
 @dataclass(frozen=True)
-class _Pins:
+class _PinSnapshot:
     by_uuid: Mapping[bytes, str]
     entries: Mapping[bytes, WhitelistEntry]
 
@@ -84,7 +84,7 @@ class _Pins:
 
 
 @dataclass(frozen=True)
-class _Policy:
+class _TrustSnapshot:
     denied: Mapping[bytes, RevocationRecord]
     cas: tuple[bytes, ...]
     cas_of_nodes: Mapping[bytes, bytes]
@@ -101,7 +101,7 @@ class _Policy:
     def trusted_stations(self) -> list[bytes]:
         return list(self.stations)
 
-    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> Signing | None:
+    def signing(self, certifier: bytes | None, station_key: bytes, digest: bytes) -> SignerVerdict | None:
         return None if self.rules is None else self.rules.signing(certifier, station_key, digest)
 
 
@@ -110,16 +110,16 @@ class StationSnapshot:
     """What a station said at one moment: plain data, so that other processes can judge by it too."""
 
     point: bytes
-    pins: _Pins
-    policy: _Policy
+    pins: _PinSnapshot
+    policy: _TrustSnapshot
 
 
 def remember(station: Station) -> StationSnapshot:
     """Take down everything that judging images asks a station for; raises StoreChangedError as the station does."""
     return StationSnapshot(
         station.point,
-        _Pins(station.pins.all(), {entry.uuid: entry for entry in station.pins.whitelist()}),
-        _Policy(
+        _PinSnapshot(station.pins.all(), {entry.uuid: entry for entry in station.pins.whitelist()}),
+        _TrustSnapshot(
             {revocation.uuid: revocation for revocation in station.policy.revocations()},
             tuple(station.policy.trusted_cas()),
             _counting(station, station.keys.cas_of_nodes()),
@@ -134,8 +134,8 @@ def remember_page(station: Station, uuids: Sequence[bytes]) -> StationSnapshot:
     entries = station.pins.of_page(uuids)
     return StationSnapshot(
         station.point,
-        _Pins(station.pins.among(station.nodes.of_page(uuids).values(), entries.values()), entries),
-        _Policy(
+        _PinSnapshot(station.pins.among(station.nodes.of_page(uuids).values(), entries.values()), entries),
+        _TrustSnapshot(
             station.policy.revocations_of(uuids),
             tuple(station.policy.trusted_cas()),
             _counting(station, station.keys.cas_of_page(uuids)),
@@ -180,7 +180,7 @@ class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand f
 
 
 @dataclass(frozen=True)
-class Verified:
+class Verification:
     """All checks and the one verdict. ``scope`` says what was judged: a node, or an image file alone.
 
     ``unsigned``: nothing is wrong but that nobody signed (all of) it. ``unproven``: a key of the node is held and no
@@ -205,7 +205,7 @@ class Verified:
 
 
 @dataclass(frozen=True)
-class Known:
+class FreshnessFloor:
     """What a node's datasheet must not be older than: the node's own values, and those of the last one checked here.
 
     ``identity`` was read in a session, None where there was none; ``sequence`` and ``key_epoch`` are fields 106 and
@@ -217,7 +217,7 @@ class Known:
     key_epoch: int = 0
 
 
-def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Known:
+def known_of(station: Station, uuid: bytes, identity: Identity | None) -> FreshnessFloor:
     """What this station knows of a node's datasheet. Signed values alone count: anyone could serve the others."""
     image = known_image(station, uuid)
     octets = image.security if image is not None else None
@@ -226,14 +226,14 @@ def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Known:
     except BadDataError:
         shown = None
     if image is None or octets is None or shown is None or not shown.signed:
-        return Known(identity)
+        return FreshnessFloor(identity)
     signers = Signers.of(shown)
     counts = _signer(station, signers, _certifier(station, uuid, signers), octets)[0].result == "passed"
     trusted = counts and datasheet.signature_good(shown, octets, uuid)
-    return Known(identity, shown.sequence, shown.key_epoch) if trusted else Known(identity)
+    return FreshnessFloor(identity, shown.sequence, shown.key_epoch) if trusted else FreshnessFloor(identity)
 
 
-def verify_image(station: Judging, image: Image, *, known: Known | None = None) -> list[Check]:
+def verify_image(station: TrustSource, image: Image, *, known: FreshnessFloor | None = None) -> list[Check]:
     """Check an image as far as octets and this station's trust go; ``known`` is None for a file judged alone.
 
     Never raises on any octets.
@@ -241,7 +241,7 @@ def verify_image(station: Judging, image: Image, *, known: Known | None = None) 
     return _checks(station, image, _proofs(image), known)
 
 
-def verify_images(station: Judging, images: Iterable[Image]) -> list[list[Check]]:
+def verify_images(station: TrustSource, images: Iterable[Image]) -> list[list[Check]]:
     """The checks of many files, as :func:`verify_image` makes them of each.
 
     All signatures are checked in a row. Between the other checks of its image, each one took half as long again: the
@@ -251,7 +251,7 @@ def verify_images(station: Judging, images: Iterable[Image]) -> list[list[Check]
     return [_checks(station, image, proofs, None) for image, proofs in proven]
 
 
-class _Proofs(NamedTuple):
+class _SecurityFields(NamedTuple):
     """What the Security TEDS of an image says, or why it cannot be read (None: there is none), and its signatures."""
 
     shown: SecurityTeds | NotCanonicalError | None
@@ -259,20 +259,20 @@ class _Proofs(NamedTuple):
     datasheet: bool = False
 
 
-def _proofs(image: Image) -> _Proofs:
+def _proofs(image: Image) -> _SecurityFields:
     """Read the Security TEDS of an image, and check what needs nobody's trust: fields 102 and 100."""
     octets = image.security
     if octets is None:
-        return _Proofs(None)
+        return _SecurityFields(None)
     try:
         shown = security.decode(octets)
     except NotCanonicalError as error:
-        return _Proofs(error)
+        return _SecurityFields(error)
     node_key = node_key_good(image.uuid, shown.node_key, shown.node_key_signature)
-    return _Proofs(shown, node_key, shown.signed and datasheet.signature_good(shown, octets, image.uuid))
+    return _SecurityFields(shown, node_key, shown.signed and datasheet.signature_good(shown, octets, image.uuid))
 
 
-def _checks(station: Judging, image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
+def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
     return judge(station, image.uuid, _octets(image, proofs, known), Signers.of(proofs.shown), image.security)
 
 
@@ -293,7 +293,7 @@ class Signers(NamedTuple):
         return cls(shown.node_key, shown.node_key_signature, *signed)
 
 
-def what_octets_say(image: Image, known: Known | None) -> tuple[list[Check], Signers]:
+def what_octets_say(image: Image, known: FreshnessFloor | None) -> tuple[list[Check], Signers]:
     """The checks that no later change of trust alters, and what :func:`judge` needs for the others.
 
     What an image says by itself is remembered for a moment: it is asked when a write is recorded, and at the verdict.
@@ -312,7 +312,7 @@ _SAID: Final[deque[tuple[Image, tuple[_Shown, tuple[Check, ...]]]]] = deque(maxl
 
 
 def judge(
-    station: Judging, uuid: bytes, octets: Iterable[Check], signers: Signers, security_teds: bytes | None
+    station: TrustSource, uuid: bytes, octets: Iterable[Check], signers: Signers, security_teds: bytes | None
 ) -> list[Check]:
     """All checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust.
 
@@ -340,16 +340,16 @@ ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed"
 """Checks of other TEDS than the Security TEDS."""
 
 
-def _octets(image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
+def _octets(image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
     return [*_by_itself(image, proofs), *_not_older(proofs.shown, known)]
 
 
-def _not_older(shown: _Shown, known: Known | None) -> list[Check]:
+def _not_older(shown: _Shown, known: FreshnessFloor | None) -> list[Check]:
     """Whether a datasheet is not older than what is known of its node."""
     return [_epoch(shown, known), _sequence(shown, known)] if isinstance(shown, SecurityTeds) else []
 
 
-def _by_itself(image: Image, proofs: _Proofs) -> tuple[Check, ...]:
+def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
     """The checks of an image for which nothing else has to be known."""
     checks, shown = [_form(image)], proofs.shown
     if shown is None:
@@ -403,7 +403,7 @@ def unproven(uuid: bytes, why: str) -> UnprovenError:
     )
 
 
-def require_authentic(verified: Verified) -> None:
+def require_authentic(verified: Verification) -> None:
     """Raise NotAuthenticError (exit 4), or UnprovenError (5), unless the verdict is ``authentic``.
 
     Names the first failure.
@@ -440,7 +440,7 @@ def _algorithms(shown: SecurityTeds) -> Check:
     return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
 
 
-def _pinned(station: Judging, uuid: bytes, node_key: bytes) -> Check:
+def _pinned(station: TrustSource, uuid: bytes, node_key: bytes) -> Check:
     name = "node key"
     try:
         station.pins.check(uuid, node_key)
@@ -454,7 +454,7 @@ def _pinned(station: Judging, uuid: bytes, node_key: bytes) -> Check:
 _FILE_ALONE = "a file does not show the node's current state"
 
 
-def _epoch(shown: SecurityTeds, known: Known | None) -> Check:
+def _epoch(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
     name = "key epoch"
     if known is None:
         return Check(name, "skipped", _FILE_ALONE)
@@ -465,7 +465,7 @@ def _epoch(shown: SecurityTeds, known: Known | None) -> Check:
     return _check(name, shown.key_epoch >= known.key_epoch, why, str(shown.key_epoch))
 
 
-def _sequence(shown: SecurityTeds, known: Known | None) -> Check:
+def _sequence(shown: SecurityTeds, known: FreshnessFloor | None) -> Check:
     name = "sequence"
     if known is None:
         return Check(name, "skipped", _FILE_ALONE)
@@ -477,12 +477,12 @@ def _sequence(shown: SecurityTeds, known: Known | None) -> Check:
     return _check(name, shown.sequence >= known.sequence, why, str(shown.sequence))
 
 
-def _not_revoked(station: Judging, uuid: bytes) -> Check:
+def _not_revoked(station: TrustSource, uuid: bytes) -> Check:
     revoked = station.policy.revocation(uuid)
     return _check("not revoked", revoked is None, f"revoked: {revoked.why}" if revoked else "")
 
 
-def _certifier(station: Judging, uuid: bytes, signers: Signers) -> bytes | None:
+def _certifier(station: TrustSource, uuid: bytes, signers: Signers) -> bytes | None:
     """The CA of those that count here which signed field 104, None where none did."""
     for ca in station.policy.trusted_cas(uuid):
         if datasheet.is_certified(ca, signers.station_key, signers.station_key_signature):
@@ -490,7 +490,7 @@ def _certifier(station: Judging, uuid: bytes, signers: Signers) -> bytes | None:
     return None
 
 
-def _station(station: Judging, signers: Signers, certifier: bytes | None) -> Check:
+def _station(station: TrustSource, signers: Signers, certifier: bytes | None) -> Check:
     key = signers.station_key or b""
     digits = fingerprint(key)[:16]
     return _check(
@@ -502,7 +502,7 @@ def _station(station: Judging, signers: Signers, certifier: bytes | None) -> Che
 
 
 def _signer(
-    station: Judging, signers: Signers, certifier: bytes | None, security_teds: bytes | None
+    station: TrustSource, signers: Signers, certifier: bytes | None, security_teds: bytes | None
 ) -> tuple[Check, ...]:
     """Whether the station that signed counts; in a plant by its roster and pages, which may not be here yet."""
     octets, key = security_teds or b"", signers.station_key or b""
@@ -517,7 +517,7 @@ def _signer(
     return (Check(name, said.result, why),)
 
 
-def _certificate(station: Judging, signers: Signers, certifier: bytes | None) -> Check:
+def _certificate(station: TrustSource, signers: Signers, certifier: bytes | None) -> Check:
     name = "station certificate"
     if certifier is not None:
         return Check(name, "passed", f"CA {fingerprint(certifier)[:16]}")

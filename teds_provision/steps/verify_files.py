@@ -15,7 +15,7 @@ from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
-from teds_provision.steps.verify import Check, Judging, Verified, remember, require_authentic, verify_images
+from teds_provision.steps.verify import Check, TrustSource, Verification, remember, require_authentic, verify_images
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
@@ -109,7 +109,7 @@ def verify_files(
 class _Work:
     """What a process needs to judge files and to tell of them."""
 
-    judging: Judging
+    judging: TrustSource
     tell: Tell
     files: Sequence[str]
 
@@ -158,7 +158,7 @@ def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
         yield some
 
 
-def _judged(judging: Judging, some: Sequence[_Read]) -> Iterator[FileVerdict]:
+def _judged(judging: TrustSource, some: Sequence[_Read]) -> Iterator[FileVerdict]:
     """The verdicts of files that were read, in their order."""
     checks = iter(verify_images(judging, (image for _, image in some if isinstance(image, Image))))
     for path, image in some:
@@ -169,7 +169,7 @@ def _judged(judging: Judging, some: Sequence[_Read]) -> Iterator[FileVerdict]:
 
 
 def _verdict(path: Path, image: Image, checks: Sequence[Check]) -> FileVerdict:
-    verified = Verified(image.uuid, tuple(checks), scope="image")
+    verified = Verification(image.uuid, tuple(checks), scope="image")
     result = FileVerdict(path, image.uuid.hex(), verified.verdict, verified.checks)
     try:
         require_authentic(verified)

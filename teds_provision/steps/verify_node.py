@@ -8,12 +8,12 @@ from hashlib import sha256
 from teds_provision.errors import LinkError, NodeRefusedError, NotAuthenticError
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps import reading
+from teds_provision.steps import readings
 from teds_provision.steps.agree import agreed_elsewhere, proof_of_reset, session_if_keyed
-from teds_provision.steps.identify import Identified, prove
-from teds_provision.steps.read import read_block, read_identity, read_image
-from teds_provision.steps.reading import NodeVerdict
-from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
+from teds_provision.steps.identify import IdentifiedNode, prove
+from teds_provision.steps.readings import NodeVerdict
+from teds_provision.steps.teds_read import read_block, read_identity, read_image
+from teds_provision.steps.verify import Check, Verification, known_of, possession, session, verify_image
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import HEARD, Conversation
 from teds_provision.teds.codec.model import AccessCode
@@ -21,14 +21,14 @@ from teds_provision.teds.image import SECURITY, Image
 
 
 @dataclass(frozen=True)
-class Looked:
+class NodeVerification:
     """A node's TEDS, and what they are worth."""
 
     image: Image
     judged: NodeVerdict
 
     @property
-    def verified(self) -> Verified:
+    def verified(self) -> Verification:
         """All checks, and the verdict."""
         return self.judged.verified
 
@@ -38,7 +38,7 @@ class Looked:
         return self.judged.origin == "kept"
 
 
-def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
+def look_at_node(station: Station, node: Conversation, who: IdentifiedNode) -> NodeVerification:
     """Open a session where a key is held, read every TEDS and judge them; raises LinkError and what a read raises.
 
     One in which the node answers nothing but that it is busy is as good as none: then all is read without it.
@@ -52,27 +52,27 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
             raise
         node.forget()
         why, image = _why(refusal), read_image(node)
-    return Looked(image, verify_node(station, node, image, who.point, why=why, c=c))
+    return NodeVerification(image, verify_node(station, node, image, who.point, why=why, c=c))
 
 
-def look_in_session(station: Station, node: Conversation, *, by: str) -> Looked:
+def look_in_session(station: Station, node: Conversation, *, by: str) -> NodeVerification:
     """Judge the TEDS of a node in the session that is open. Raises LinkError, NodeRefusedError.
 
     Where its Security TEDS is octet for octet the one that was read before, and nothing spoke against the rest then,
     the rest is not read again here: it names the digest of every other TEDS. c of the session tells whether the node
-    has started since; then what is said of the rest is ``kept``, until somebody reads it (:mod:`.reading`). Everything
+    has started since; then what is said of the rest is ``kept``, until somebody reads it (:mod:`.readings`). Everything
     is judged anew all the same: trust, bans and pins may have changed.
     """
     identity, c = read_identity(node), node.c
     octets = read_block(node, SECURITY)
     known = known_of(station, node.uuid, identity)
-    image = reading.stands(station, node, octets, known)
+    image = readings.stands(station, node, octets, known)
     if image is not None:
-        judged = reading.verdict_of(station, node.uuid)
+        judged = readings.verdict_of(station, node.uuid)
         assert judged is not None, "a reading that stands is there"
-        return Looked(image, judged)
+        return NodeVerification(image, judged)
     image = read_image(node)
-    return Looked(image, reading.keep(station, node, image, by=by, known=known, c=c))
+    return NodeVerification(image, readings.keep(station, node, image, by=by, known=known, c=c))
 
 
 def open_or_say_why(station: Station, node: Conversation) -> str:
@@ -116,17 +116,17 @@ def verify_node(
     known = known_of(station, node.uuid, identity)
     if vouch.result == "failed":
         with station.reading():
-            verified = Verified(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
+            verified = Verification(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
         station.audit("verify", node.uuid, verified.verdict, why=why)
         return NodeVerdict(verified, "plain", utc_now(), by)
     more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
     c = (c or node.c) if node.sealed else None
     with station.reading():
-        row, judged = reading.judge_reading(station, image, c, by=by, known=known, more=more)
+        row, judged = readings.judge_reading(station, image, c, by=by, known=known, more=more)
 
     def record() -> None:
         with station.durable("verify"):
-            reading.keep_judged(station, row, judged, image)
+            readings.keep_judged(station, row, judged, image)
             kept = station.nodes.reading(image.uuid)
             if identity is not None or (kept is not None and not kept.in_session):
                 station.nodes.remember(image.uuid, **_facts(image, identity))

@@ -57,7 +57,7 @@ class ListedNode:
 
 
 @dataclass
-class _Reading:
+class _WhitelistReader:
     """What has been read so far, and every mistake with its line and field."""
 
     file: str
@@ -126,8 +126,12 @@ def read_whitelist(path: Path, form: str | None = None) -> list[ListedNode]:
     if not text.strip():
         raise BadDataError(f"{path} is empty.", hint="Supported: XML, CSV (with column names in line 1) and JSON.")
     form = form or _form_of(path, text)
-    reading = _Reading(str(path))
-    readers: dict[str, Callable[[str, _Reading], None]] = {"xml": _read_xml, "csv": _read_csv, "json": _read_json}
+    reading = _WhitelistReader(str(path))
+    readers: dict[str, Callable[[str, _WhitelistReader], None]] = {
+        "xml": _read_xml,
+        "csv": _read_csv,
+        "json": _read_json,
+    }
     readers[form](text, reading)
     if reading.mistakes:
         shown = "; ".join(reading.mistakes[:_SHOWN_MISTAKES])
@@ -184,7 +188,7 @@ class _Element:
             self.fields[tag] = text
 
 
-def _read_xml(text: str, reading: _Reading) -> None:
+def _read_xml(text: str, reading: _WhitelistReader) -> None:
     from xml.sax import SAXException, SAXParseException
     from xml.sax.handler import ContentHandler
 
@@ -244,7 +248,7 @@ def _field_name(name: str) -> str:
     return _ALIASES.get(local, local)
 
 
-def _close_element(element: _Element, parent: _Element | None, reading: _Reading) -> None:
+def _close_element(element: _Element, parent: _Element | None, reading: _WhitelistReader) -> None:
     text = "".join(element.text).strip()
     leaf = not element.uuids and not element.entries
     if parent is not None and leaf and text and not element.fields and element.tag in FIELDS:
@@ -258,7 +262,7 @@ def _close_element(element: _Element, parent: _Element | None, reading: _Reading
         reading.wrong(element.line, element.tag, "there is no UUID in this document")
 
 
-def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _Reading) -> int:
+def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _WhitelistReader) -> int:
     """Take in what the element holds by itself; returns how many entries that were."""
     own = element.own
     if "uuid" in own:
@@ -277,7 +281,7 @@ def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _Re
     return 1
 
 
-def _add_several(element: _Element, own: dict[str, str], reading: _Reading) -> int:
+def _add_several(element: _Element, own: dict[str, str], reading: _WhitelistReader) -> int:
     if len(element.uuids) > 1 and "fingerprint" in own:
         reading.wrong(element.line, "fingerprint", "it stands beside several UUIDs and belongs to none")
     for line, uuid in element.uuids:
@@ -302,7 +306,7 @@ def _parts(text: str) -> list[str]:
 # -- CSV ---------------------------------------------------------------------------------------------------------------
 
 
-def _read_csv(text: str, reading: _Reading) -> None:
+def _read_csv(text: str, reading: _WhitelistReader) -> None:
     check_count(text.count("\n"), _MOST_LINES, f"lines in {reading.file}")
     _refuse_long(text, "\n", reading.file, "a line")
     first = next((line for line in text[:_MAX_TAG].splitlines() if line.strip() and not line.startswith("#")), "")
@@ -329,7 +333,7 @@ def _read_csv(text: str, reading: _Reading) -> None:
 # -- JSON --------------------------------------------------------------------------------------------------------------
 
 
-def _read_json(text: str, reading: _Reading) -> None:
+def _read_json(text: str, reading: _WhitelistReader) -> None:
     value = load_json(text, "the whitelist", octets=MAX_FILE_OCTETS, file=reading.file)
     listed = value.get("whitelist") if isinstance(value, dict) else value
     if not isinstance(listed, list):
@@ -343,7 +347,7 @@ def _read_json(text: str, reading: _Reading) -> None:
             _add_object(line, item, reading)
 
 
-def _add_object(line: int, item: dict[str, Any], reading: _Reading) -> None:
+def _add_object(line: int, item: dict[str, Any], reading: _WhitelistReader) -> None:
     values: dict[str, str] = {}
     for key, value in item.items():
         name = _field_name(key)

@@ -26,11 +26,11 @@ from teds_provision.errors import (
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
+from teds_provision.protocol.operation.commands import POWER, PowerFlag, PowerReply
 from teds_provision.station.station import Station
-from teds_provision.steps.read import Survey, read_block, read_identity, read_image
-from teds_provision.steps.reading import is_known, keep, keep_read
+from teds_provision.steps.readings import is_known, keep, keep_read
 from teds_provision.steps.sign import known_image, node_keys_of, sign
+from teds_provision.steps.teds_read import NodeSnapshot, read_block, read_identity, read_image
 from teds_provision.steps.verify import known_of
 from teds_provision.store import NodeRecord
 from teds_provision.talk.conversation import Conversation, SessionLostError
@@ -58,7 +58,7 @@ def wait_for_charge(question: str) -> None:
 
 
 @dataclass(frozen=True)
-class Written:
+class WriteResult:
     """What a write did: octets staged (0 where the node had it all), seconds, and what was read back."""
 
     octets: int
@@ -71,12 +71,12 @@ def write(
     node: Conversation,
     image: Image,
     *,
-    present: Survey | None = None,
+    present: NodeSnapshot | None = None,
     progress: Progress | None = None,
     facts: Mapping[str, object] = MappingProxyType({}),
     jump: bool = False,
     low: Low = wait_for_charge,
-) -> Written:
+) -> WriteResult:
     """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
 
     ``present`` is what the node was read to hold in this session: blocks that are the same are not sent again.
@@ -97,7 +97,7 @@ def write(
                 known = known_of(station, image.uuid, node.proven or read_identity(node))
                 with station.durable("write", more_follows=True):
                     keep(station, node, has, by="write", known=known)
-            return Written(0, time.monotonic() - started, has)
+            return WriteResult(0, time.monotonic() - started, has)
     identity = node.proven or read_identity(node)
     _require_newer(station, image.uuid, signed, identity, jump=jump)
     _require_charge(node, low)
@@ -112,7 +112,7 @@ def write(
     c = node.c
     back = read_image(node)
     _conclude(station, node, image, back, facts, c=c, octets=octets, sequence=signed.sequence)
-    return Written(octets, time.monotonic() - started, back)
+    return WriteResult(octets, time.monotonic() - started, back)
 
 
 def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: int) -> None:
@@ -188,7 +188,7 @@ def _percent(node: Conversation) -> int | None:
     if node.tapped or node.wired or not node.sealed:
         return None
     try:
-        power = Power.decode(node.ask(POWER, "to tell its charge"))
+        power = PowerReply.decode(node.ask(POWER, "to tell its charge"))
     except (NodeRefusedError, BadDataError):
         return None  # it has no battery, or does not measure
     return power.level if power.flags & PowerFlag.BATTERY else None

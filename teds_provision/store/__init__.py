@@ -5,19 +5,19 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict, Choice, is_failure
-    from teds_provision.store.lock import NodeTurn, StoreLock
+    from teds_provision.store.audit import AuditEntry, AuditFilter, AuditLog, AuditVerdict, is_failure
+    from teds_provision.store.lock import NodeLock, StoreLock
     from teds_provision.store.records import (
         DatasheetRecord,
         Draft,
-        ExportFacts,
+        ExportedNode,
+        ExportEligibility,
         Group,
-        Handed,
         Handover,
         Holder,
         KeptMeasurement,
+        KeyFlags,
         KeyRecord,
-        Marks,
         NodeReading,
         NodeRecord,
         RevocationRecord,
@@ -29,47 +29,47 @@ if TYPE_CHECKING:
     )
     from teds_provision.store.store import Store
     from teds_provision.store.tables.line import EvidenceRow, JobRow, LineTables, SignRequestRow, UnitRow
-    from teds_provision.store.tables.nodes import Batch, pages
+    from teds_provision.store.tables.nodes import BulkRows, pages
     from teds_provision.store.tables.overview import NodeOverview, Search
 else:
     __getattr__ = lazy(
         __name__,
         {
-            "audit": "AuditEntry AuditLog AuditVerdict Choice is_failure",
-            "lock": "NodeTurn StoreLock",
-            "records": "DatasheetRecord Draft ExportFacts Group Handed Handover Holder KeyRecord Marks"
+            "audit": "AuditEntry AuditLog AuditVerdict AuditFilter is_failure",
+            "lock": "NodeLock StoreLock",
+            "records": "DatasheetRecord Draft ExportEligibility Group ExportedNode Handover Holder KeyRecord KeyFlags"
             " KeptMeasurement NodeReading NodeRecord RevocationRecord"
             " StationRecord Tombstone TrustRecord WhitelistEntry utc_now",
             "store": "Store",
             "tables.overview": "NodeOverview Search",
             "tables.line": "EvidenceRow JobRow LineTables SignRequestRow UnitRow",
-            "tables.nodes": "Batch pages",
+            "tables.nodes": "BulkRows pages",
         },
     )
 
 __all__ = [
     "AuditEntry",
+    "AuditFilter",
     "AuditLog",
     "AuditVerdict",
-    "Batch",
-    "Choice",
+    "BulkRows",
     "DatasheetRecord",
     "Draft",
     "EvidenceRow",
-    "ExportFacts",
+    "ExportEligibility",
+    "ExportedNode",
     "Group",
-    "Handed",
     "Handover",
     "Holder",
     "JobRow",
     "KeptMeasurement",
+    "KeyFlags",
     "KeyRecord",
     "LineTables",
-    "Marks",
+    "NodeLock",
     "NodeOverview",
     "NodeReading",
     "NodeRecord",
-    "NodeTurn",
     "RevocationRecord",
     "Search",
     "SignRequestRow",

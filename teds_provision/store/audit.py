@@ -60,7 +60,7 @@ class AuditEntry:
 
 
 @dataclass(frozen=True)
-class Choice:
+class AuditFilter:
     """Which entries are meant; every field that is set has to fit."""
 
     uuid: bytes | None = None
@@ -124,7 +124,7 @@ class AuditLog:
         """Give the entries numbered above ``after``, oldest first; raises StoreError."""
         return self._database.stream(_entry, _PAGE_OF_ENTRIES, after)
 
-    def chosen(self, choice: Choice, after: int = 0) -> Iterator[AuditEntry]:
+    def chosen(self, choice: AuditFilter, after: int = 0) -> Iterator[AuditEntry]:
         """Give the entries numbered above ``after`` that are meant, oldest first; raises StoreError."""
         terms = _terms(choice)
         statement = f"SELECT * FROM audit WHERE seq > ?{terms} ORDER BY seq LIMIT ?"
@@ -143,7 +143,7 @@ class AuditLog:
         row = self._database.one("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
         return (int(row[0]), bytes(row[1]).hex()) if row is not None else (0, self._root.hex())
 
-    def before(self, choice: Choice, *, last: int | None = None) -> int:
+    def before(self, choice: AuditFilter, *, last: int | None = None) -> int:
         """Return the number of the entry before the first one to show: of the ``last`` chosen, or made ``since``.
 
         With ``last`` the search starts at the end. A time says nothing about the position, as clocks are set back, so
@@ -248,7 +248,7 @@ def _chained(previous: bytes, row: tuple[Any, ...]) -> bytes:
     return hashlib.sha256(previous + text.encode()).digest()
 
 
-def _terms(choice: Choice) -> str:
+def _terms(choice: AuditFilter) -> str:
     """SQL of a choice. Its values were written by this program, or are UUID digits, or are quoted here."""
     terms = ""
     if choice.uuid is not None:

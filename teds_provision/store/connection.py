@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from teds_provision.errors import BadDataError, StoreError, StoreLockedError, TedsProvisionError
 from teds_provision.lazy import late
-from teds_provision.store.behind import Behind
+from teds_provision.store.background_writer import BackgroundWriter
 
 if TYPE_CHECKING:
     import sqlite3
@@ -121,7 +121,7 @@ class Connection:
         self.later = 0
         """How many commits did not wait for the disk."""
         self._settled = 0
-        self.behind: dict[int, Behind] = {}
+        self.behind: dict[int, BackgroundWriter] = {}
         """By thread: the run that has a step taken behind its back, for which its next statement waits."""
         self.notice: Callable[[str], object] | None = None
         """Told, in a sentence, what a change of the store waits for."""

@@ -134,7 +134,7 @@ class StoreLock(_HeldFile):
             pause = min(2 * pause, _POLL_SECONDS if told else _LAST_QUIET_POLL_SECONDS)
 
 
-class Mark(_HeldFile):
+class UsageLock(_HeldFile):
     """``with Mark(path, command="measure hand") as mark:`` something is taken, for as long as this process lives.
 
     Does not wait: raises :class:`UsageLockTakenError`, which names the holder. Several may hold it together where each
@@ -188,7 +188,7 @@ class Mark(_HeldFile):
 
 
 class UsageLockTakenError(StoreLockedError):
-    """Somebody else holds a :class:`Mark`; ``holder`` names the process."""
+    """Somebody else holds a :class:`UsageLock`; ``holder`` names the process."""
 
     def __init__(self, message: str, holder: str) -> None:
         super().__init__(message, hint="Wait for it to finish, or stop it.")
@@ -267,8 +267,8 @@ class _LockedOctet(_HeldFile):
         return True
 
 
-class NodeTurn(_LockedOctet):
-    """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
+class NodeLock(_LockedOctet):
+    """``with NodeLock(home, uuid):`` one command works on this node of the store, the next one waits for it.
 
     Two nodes may share an octet: then they take turns, no more. Waits up to a minute; raises NodeBusyError after that,
     StoreError where the file cannot be made.

@@ -130,7 +130,7 @@ class NodeReading:
         return (int.from_bytes(c, "big") - int.from_bytes(self.c, "big")) % (1 << 64) < 1 << 32
 
 
-class ExportFacts(NamedTuple):
+class ExportEligibility(NamedTuple):
     """Of one node, what says whether it may leave: its identity key with its seal, and whether it was retired."""
 
     uuid: bytes
@@ -139,7 +139,7 @@ class ExportFacts(NamedTuple):
     retired: str | None
 
 
-class Handed(NamedTuple):
+class ExportedNode(NamedTuple):
     """Of one node, what a bundle says beside its link key; as in :class:`NodeRecord`, with the groups that it is in."""
 
     uuid: bytes
@@ -221,7 +221,7 @@ class StationRecord:
 
 
 @dataclass(frozen=True)
-class Marks:
+class KeyFlags:
     """What holds for the keys of one node until something ends it.
 
     ``ca``: P(CA) that it keeps, where that is not the owner's; ``next_ca`` the one that it keeps if the pending key

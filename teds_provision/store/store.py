@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from teds_provision.errors import BadDataError, StoreError
 from teds_provision.store.audit import AuditLog
-from teds_provision.store.behind import Behind
+from teds_provision.store.background_writer import BackgroundWriter
 from teds_provision.store.database import FILE_NAME, Database
 from teds_provision.store.tables.datasheets import DatasheetTables
 from teds_provision.store.tables.facts import FactTables
@@ -130,9 +130,9 @@ class Store(
         """Wait until everything that was committed is on the disk, or what was when :attr:`later` was ``through``."""
         self._database.settle(through)
 
-    def behind(self) -> Behind:
+    def behind(self) -> BackgroundWriter:
         """For a run of this thread: what takes its steps behind its back, which its next statement here waits for."""
-        return Behind(self._database.behind)
+        return BackgroundWriter(self._database.behind)
 
     def in_order(self) -> None:
         """Wait for what this thread has done behind its back; before it takes a lock that such a step takes too."""

@@ -10,7 +10,7 @@ from types import TracebackType
 
 from teds_provision.errors import GarbledError, LinkError, NodeRefusedError, NodeSilentError, TedsProvisionError
 from teds_provision.links import Contact, Notice
-from teds_provision.links.ports import Link, NoticeSink, Prompt
+from teds_provision.links.ports import DeadlineLink, Link, NoticeSink
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
     Command,
@@ -329,7 +329,7 @@ class Conversation:
 
 
 def _carry(link: Link, frame: bytes, within: float | None) -> bytes:
-    if within is not None and isinstance(link, Prompt):
+    if within is not None and isinstance(link, DeadlineLink):
         return link.exchange_within(frame, within)
     return link.exchange(frame)
 

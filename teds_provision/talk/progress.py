@@ -45,7 +45,7 @@ class Reporter(Protocol):
         """So many octets of the datasheet are staged."""
 
 
-class Silent:
+class SilentReporter:
     """A reporter that tells nothing."""
 
     def started(self, step: str) -> None:
@@ -61,7 +61,7 @@ class Silent:
         """Say nothing."""
 
 
-class OfNode:
+class NodeReporter:
     """A reporter for one of several nodes that are worked on at once: what it tells names that node."""
 
     def __init__(self, inner: Reporter, label: str) -> None:

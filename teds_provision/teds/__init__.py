@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     )
     from teds_provision.teds.codec.composer import compose, convert, encode, recompose
     from teds_provision.teds.codec.decode import decode
-    from teds_provision.teds.codec.keyforms import ReadKey, read_key
+    from teds_provision.teds.codec.keyforms import ParsedKey, read_key
     from teds_provision.teds.codec.model import (
         AccessCode,
         Conformity,
-        Decoded,
+        DecodedTeds,
         Edition,
         Field,
         Finding,
@@ -48,12 +48,12 @@ if TYPE_CHECKING:
 __all__ = [
     "AccessCode",
     "Conformity",
-    "Decoded",
+    "DecodedTeds",
     "Edition",
     "Field",
     "FieldSpec",
     "Finding",
-    "ReadKey",
+    "ParsedKey",
     "Severity",
     "Sheet",
     "Table",
@@ -79,8 +79,8 @@ if not TYPE_CHECKING:
         {
             "codec.composer": "compose convert encode recompose",
             "codec.decode": "decode",
-            "codec.keyforms": "ReadKey read_key",
-            "codec.model": "AccessCode Conformity Decoded Edition Field Finding Severity TimeInstance Units Value",
+            "codec.keyforms": "ParsedKey read_key",
+            "codec.model": "AccessCode Conformity DecodedTeds Edition Field Finding Severity TimeInstance Units Value",
             "codec.tables": "FieldSpec Table name_of table",
             "codec.uuid": "UuidParts pack_uuid unpack_uuid",
             "sheet": "Sheet",

@@ -16,7 +16,7 @@ from teds_provision.lazy import late
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Decoded, Units
+from teds_provision.teds.codec.model import AccessCode, DecodedTeds, Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.units import (
     ARBITRARY,
@@ -224,12 +224,12 @@ def described(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
     return read_channel(number, "", decode(octets) if octets is not None else None)
 
 
-def channel_from(decoded: Decoded) -> Channel:
+def channel_from(decoded: DecodedTeds) -> Channel:
     """What a decoded TransducerChannel TEDS alone says of its channel."""
     return read_channel(0, "", decoded)
 
 
-def read_channel(number: int, name: str, teds: Decoded | None) -> Channel:
+def read_channel(number: int, name: str, teds: DecodedTeds | None) -> Channel:
     """Channel of that number and name as its decoded TransducerChannel TEDS describes it, None for none."""
     if teds is None:
         return Channel(number, name)
@@ -255,13 +255,13 @@ def read_channel(number: int, name: str, teds: Decoded | None) -> Channel:
     )
 
 
-def number_of(teds: Decoded, name: str) -> float:
+def number_of(teds: DecodedTeds, name: str) -> float:
     """Number of a field, NaN where it is not stated."""
     value = teds.get(name)
     return float(value) if isinstance(value, (int, float)) else NOT_STATED
 
 
-def integer_of(teds: Decoded, name: str) -> int | None:
+def integer_of(teds: DecodedTeds, name: str) -> int | None:
     """Integer of a field, None where it is not stated."""
     value = teds.get(name)
     return value if isinstance(value, int) else None

@@ -11,7 +11,7 @@ from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import kind_of
 from teds_provision.teds.calibration.model import Calibration, from_decoded, is_sound
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Decoded, Field, Units
+from teds_provision.teds.codec.model import AccessCode, DecodedTeds, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId
@@ -137,7 +137,7 @@ def _differing(
             yield path, one, other
 
 
-def _flat(decoded: Decoded) -> dict[_Path, Field]:
+def _flat(decoded: DecodedTeds) -> dict[_Path, Field]:
     """Leaves by path of (name, number among fields of that name)."""
     out: dict[_Path, Field] = {}
 

@@ -20,7 +20,7 @@ from teds_provision.teds.calibration.model import Calibration, from_decoded
 from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN, Channel
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Decoded
+from teds_provision.teds.codec.model import AccessCode, DecodedTeds
 from teds_provision.teds.curve import FLOAT32_STEP, Curve, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 
@@ -398,7 +398,7 @@ class _Judge:
             for text in calibration.date_warnings(self.now):
                 yield GuardFinding(self.number, "overdue", text, "warning")
 
-    def _not_understood(self, decoded: Decoded, error: BadDataError) -> GuardFinding:
+    def _not_understood(self, decoded: DecodedTeds, error: BadDataError) -> GuardFinding:
         """An error where the fields are ours; else somebody else's form, of which nothing can be said."""
         text = f"{error.message} It was not checked."
         if decoded.field("CalInput") is None and decoded.field("Coefs") is None:
@@ -408,7 +408,7 @@ class _Judge:
     def _error(self, code: str, message: str) -> GuardFinding:
         return GuardFinding(self.number, code, message)
 
-    def _calibration(self, decoded: Decoded, blocks: Mapping[BlockId, bytes]) -> Calibration:
+    def _calibration(self, decoded: DecodedTeds, blocks: Mapping[BlockId, bytes]) -> Calibration:
         channel = self._channel(self.number, blocks)
         return from_decoded(decoded, channel=self.number, units=channel.units, actuator=channel.actuator)
 

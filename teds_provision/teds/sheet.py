@@ -27,7 +27,7 @@ from teds_provision.teds.channel import (
     read_channel,
 )
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import AccessCode, Conformity, Decoded, Severity
+from teds_provision.teds.codec.model import AccessCode, Conformity, DecodedTeds, Severity
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
 
@@ -136,7 +136,7 @@ def name_among(number: int, blocks: Mapping[BlockId, bytes]) -> str:
     return node_name(decode(octets) if octets is not None else None)
 
 
-def node_name(decoded: Decoded | None) -> str:
+def node_name(decoded: DecodedTeds | None) -> str:
     """TCName of a decoded name TEDS, "" where it has none that can be printed."""
     name = decoded.get("TCName") if decoded is not None else None
     return name if isinstance(name, str) and name.isprintable() else ""
@@ -152,10 +152,10 @@ class _Reader:
 
     def __init__(self, uuid: bytes, blocks: Mapping[BlockId, bytes]) -> None:
         self.uuid, self.blocks = uuid, blocks
-        self.seen: dict[BlockId, Decoded] = {}
+        self.seen: dict[BlockId, DecodedTeds] = {}
         self.understood: dict[int, Calibration] = {}
 
-    def decoded(self, channel: int, access_code: int) -> Decoded | None:
+    def decoded(self, channel: int, access_code: int) -> DecodedTeds | None:
         """One TEDS decoded, None where it is not there."""
         key = (channel, access_code)
         if key not in self.seen:
@@ -219,7 +219,7 @@ class _Reader:
                 yield SheetFinding(channel, code, "error", "class", message)
 
 
-def _vectors(meta: Decoded) -> Iterator[tuple[int, ...]]:
+def _vectors(meta: DecodedTeds) -> Iterator[tuple[int, ...]]:
     """Members of every VGroup that can be read."""
     for group in meta.fields:
         for part in group.children if group.name == "VGroup" else ():

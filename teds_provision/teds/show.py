@@ -15,7 +15,7 @@ from teds_provision.teds.calibration.model import calibrated_unit, from_decoded
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.keyforms import read_key
-from teds_provision.teds.codec.model import AccessCode, Decoded, Field, Finding, TimeInstance, Units
+from teds_provision.teds.codec.model import AccessCode, DecodedTeds, Field, Finding, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.codec.uuid import unpack_uuid
 from teds_provision.teds.formats import TedsBlock
@@ -174,7 +174,7 @@ _PROFILE_VERSION = "ProfileVersion"
 Line = tuple[str, str]
 
 
-def summary_of(decoded: Decoded, context: Context, now: datetime) -> tuple[Line, ...]:
+def summary_of(decoded: DecodedTeds, context: Context, now: datetime) -> tuple[Line, ...]:
     """Lines of (label, text) for people."""
     match decoded.access_code:
         case AccessCode.META:
@@ -189,7 +189,7 @@ def summary_of(decoded: Decoded, context: Context, now: datetime) -> tuple[Line,
             return ()
 
 
-def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
+def _uuid(decoded: DecodedTeds, _context: Context) -> Iterator[Line]:
     value = decoded.get("UUID")
     parts = unpack_uuid(value) if isinstance(value, bytes) else None
     if parts is None:
@@ -206,7 +206,7 @@ def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
         yield "maker's number", str(parts.manufacturer)
 
 
-def _range(decoded: Decoded, context: Context) -> Iterator[Line]:
+def _range(decoded: DecodedTeds, context: Context) -> Iterator[Line]:
     channel = channel_from(decoded)
     if context.unit is None or not channel.has_range:
         return
@@ -216,7 +216,7 @@ def _range(decoded: Decoded, context: Context) -> Iterator[Line]:
     yield "range", text
 
 
-def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[Line]:
+def _calibration(decoded: DecodedTeds, context: Context, now: datetime) -> Iterator[Line]:
     own = described(context.channel or 1, context.beside)
     try:
         calibration = from_decoded(decoded, channel=context.channel, units=own.units, actuator=own.actuator)
@@ -232,7 +232,7 @@ def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[
         yield "due", f"{calibration.due:%Y-%m-%d}{' (overdue)' if calibration.overdue(now) else ''}"
 
 
-def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
+def _security(decoded: DecodedTeds, context: Context) -> Iterator[Line]:
     ours = decoded.field(_PROFILE_VERSION) is not None
     if not ours:
         yield "kind", "somebody else's Security TEDS (no field 105): shown, never trusted"
@@ -252,7 +252,7 @@ def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
             yield "form", f"not canonical, so never authentic: {error.message}"
 
 
-def _keys(decoded: Decoded) -> Iterator[Line]:
+def _keys(decoded: DecodedTeds) -> Iterator[Line]:
     for name, label in (("NodePublicKey", "node"), ("BaseStationPublicKey", "station")):
         field = decoded.field(name)
         point = read_key(field.raw).point if field is not None else None
@@ -261,7 +261,7 @@ def _keys(decoded: Decoded) -> Iterator[Line]:
             yield f"{label} key", f"fingerprint {digits} (a hint, not an anchor of trust)"
 
 
-__all__ = ["Shown", "ShownField", "describe", "finding_to_json", "shown_to_json"]
+__all__ = ["ShownField", "ShownTeds", "describe", "finding_to_json", "shown_to_json"]
 
 
 @dataclass(frozen=True)
@@ -278,11 +278,11 @@ class ShownField:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownTeds:
     """One TEDS for people; ``summary`` holds (label, text) lines about the whole."""
 
     block: TedsBlock
-    decoded: Decoded
+    decoded: DecodedTeds
     fields: tuple[ShownField, ...]
     summary: tuple[Line, ...]
 
@@ -298,7 +298,7 @@ class Shown:
 
 def describe(
     block: TedsBlock, beside: Mapping[tuple[int, int], bytes] | None = None, *, now: datetime | None = None
-) -> Shown:
+) -> ShownTeds:
     """Decode a block and put it into words; ``beside`` are the framed TEDS that lie in the same image.
 
     Never raises, whatever the octets.
@@ -308,7 +308,7 @@ def describe(
     rows = table(decoded.access_code) if decoded.access_code is not None else None
     known: Mapping[int, FieldSpec] = {} if rows is None else {**rows.inner, **rows.aliases, **rows.by_type}
     fields = tuple(_field(field, known, context) for field in decoded.fields)
-    return Shown(block, decoded, fields, summary_of(decoded, context, now or datetime.now(UTC)))
+    return ShownTeds(block, decoded, fields, summary_of(decoded, context, now or datetime.now(UTC)))
 
 
 def _field(field: Field, known: Mapping[int, FieldSpec], context: Context) -> ShownField:
@@ -322,7 +322,7 @@ def _field(field: Field, known: Mapping[int, FieldSpec], context: Context) -> Sh
     return ShownField(field.type, field.name or f"type {field.type}", text, meaning, weak, field.offset, children)
 
 
-def _context(block: TedsBlock, decoded: Decoded, beside: dict[tuple[int, int], bytes]) -> Context:
+def _context(block: TedsBlock, decoded: DecodedTeds, beside: dict[tuple[int, int], bytes]) -> Context:
     series = decoded.get("SUnits")
     return Context(
         _unit(block, decoded, beside),
@@ -333,7 +333,7 @@ def _context(block: TedsBlock, decoded: Decoded, beside: dict[tuple[int, int], b
     )
 
 
-def _unit(block: TedsBlock, decoded: Decoded, beside: Mapping[tuple[int, int], bytes]) -> WrittenUnit | None:
+def _unit(block: TedsBlock, decoded: DecodedTeds, beside: Mapping[tuple[int, int], bytes]) -> WrittenUnit | None:
     """Unit of LowLimit, HiLimit and OError: the channel's, or the calibrated one; None where nothing names one."""
     if decoded.access_code == AccessCode.CHANNEL:
         channel = channel_from(decoded)
@@ -352,7 +352,7 @@ def finding_to_json(finding: Finding) -> dict[str, Any]:
     return out | {key: value for key, value in extra.items() if value not in {"", None}}
 
 
-def shown_to_json(shown: Shown) -> dict[str, Any]:
+def shown_to_json(shown: ShownTeds) -> dict[str, Any]:
     """One TEDS as a JSON object: the field tree of format ``teds/1``, and edition, verdict, findings, meaning."""
     decoded = shown.decoded
     out = {"edition": decoded.edition, **teds_to_json(shown.block)}

@@ -17,10 +17,11 @@ if TYPE_CHECKING:
         pkcs11_uri,
     )
     from teds_provision.vault.base import Ask, Vault, node_key_context
-    from teds_provision.vault.choose import asked_first, create_vault, forget_vaults, open_vault
+    from teds_provision.vault.selection import asked_first, create_vault, forget_vaults, open_vault
 else:
     __getattr__ = lazy(
-        __name__, {"base": "Ask Vault node_key_context", "choose": "asked_first create_vault forget_vaults open_vault"}
+        __name__,
+        {"base": "Ask Vault node_key_context", "selection": "asked_first create_vault forget_vaults open_vault"},
     )
 
 __all__ = ["Ask", "Vault", "asked_first", "create_vault", "forget_vaults", "node_key_context", "open_vault"]

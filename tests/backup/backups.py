@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from teds_provision.backup.backup import BackedUp, backup
+from teds_provision.backup.backup import BackupResult, backup
 from teds_provision.backup.content import Content
-from teds_provision.backup.restore import Restored, rebuild
+from teds_provision.backup.restore import RestoreResult, rebuild
 from teds_provision.backup.sealed_file import SealedFile
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
@@ -38,7 +38,7 @@ def keys_of(station: Station, uuid: bytes) -> list[tuple[int, str, bytes]]:
     return [(held.record.epoch, held.record.state, held.key) for held in station.keys.unwrapped(uuid)]
 
 
-def back_up(station: Station, path: Path, recovery: bytes | None = None) -> BackedUp:
+def back_up(station: Station, path: Path, recovery: bytes | None = None) -> BackupResult:
     return backup(station, path, ask, recovery=recovery, costs=THROWAWAY)
 
 
@@ -57,6 +57,6 @@ def copy_of(station: Station, folder: Path) -> Content:
     return opened(folder / "copy.backup")
 
 
-def restored_into(home: Path, content: Content) -> Restored:
+def restored_into(home: Path, content: Content) -> RestoreResult:
     forget_vaults()
     return rebuild(home, content, ask, costs=THROWAWAY)

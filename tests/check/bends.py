@@ -19,16 +19,16 @@ from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.protocol import datasheet
-from teds_provision.protocol.agreement import NodeAgreement, RequestPayload
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER, PrivateKey, SoftwareKey, normalise_signature, verify
 from teds_provision.protocol.messages.frames import Command, CommandRefusedError, Function, Reason, Reply
 from teds_provision.protocol.operation import role
 from teds_provision.protocol.session import NodeSession, SessionKeys, pad
-from teds_provision.protocol.tim import agreeing, node, sessions, teds_access
-from teds_provision.protocol.tim.agreeing import Agreeing
+from teds_provision.protocol.tim import node, node_agreement, node_sessions, teds_access
 from teds_provision.protocol.tim.node import Tim
-from teds_provision.protocol.tim.sessions import Sessions
+from teds_provision.protocol.tim.node_agreement import AgreementSlot
+from teds_provision.protocol.tim.node_sessions import Sessions
+from teds_provision.protocol.wire_agreement import NodeAgreement, RequestPayload
 from teds_provision.teds.codec import security
 from tests import bench
 
@@ -103,7 +103,7 @@ def only_confirm(tag: Callable[[bytes, bytes], bytes]) -> Bend:
             seen["tag"] = tag(okm[16:], script)
             return kept(shared, nonce, script)
 
-        from teds_provision.protocol import agreement as protocol_agreement
+        from teds_provision.protocol import wire_agreement as protocol_agreement
 
         kept = protocol_agreement.derive
 
@@ -151,40 +151,40 @@ def same_one_time_key(patch: Patch) -> None:
 
 
 def nonce_twice(patch: Patch) -> None:
-    original = Agreeing.request
+    original = AgreementSlot.request
 
-    def request(self: Agreeing, *args: Any) -> bytes:
+    def request(self: AgreementSlot, *args: Any) -> bytes:
         self._random = bytes
         return original(self, *args)
 
-    patch.setattr(Agreeing, "request", request)
+    patch.setattr(AgreementSlot, "request", request)
 
 
-def _confirmed_as(change: Callable[[Agreeing, Any], None]) -> Bend:
+def _confirmed_as(change: Callable[[AgreementSlot, Any], None]) -> Bend:
     def bend(patch: Patch) -> None:
-        original = Agreeing.confirm
+        original = AgreementSlot.confirm
 
-        def confirm(self: Agreeing, payload: bytes, origin: Any, flash: Flash) -> Flash:
+        def confirm(self: AgreementSlot, payload: bytes, origin: Any, flash: Flash) -> Flash:
             if self._pending is not None:
                 change(self, origin)
             return original(self, payload, origin, flash)
 
-        patch.setattr(Agreeing, "confirm", confirm)
+        patch.setattr(AgreementSlot, "confirm", confirm)
 
     return bend
 
 
-def _from_anywhere(self: Agreeing, origin: Any) -> None:
+def _from_anywhere(self: AgreementSlot, origin: Any) -> None:
     assert self._pending is not None
     self._pending.link, self._pending.session = origin.link, origin.session
 
 
-def _from_any_session(self: Agreeing, origin: Any) -> None:
+def _from_any_session(self: AgreementSlot, origin: Any) -> None:
     assert self._pending is not None
     self._pending.session = origin.session if origin.session and self._pending.session else self._pending.session
 
 
-def _from_any_link(self: Agreeing, origin: Any) -> None:
+def _from_any_link(self: AgreementSlot, origin: Any) -> None:
     assert self._pending is not None
     self._pending.link = origin.link
 
@@ -195,14 +195,14 @@ confirm_from_any_link = _confirmed_as(_from_any_link)
 
 
 def the_first_request_stays(patch: Patch) -> None:
-    original = Agreeing.request
+    original = AgreementSlot.request
 
-    def request(self: Agreeing, *args: Any) -> bytes:
+    def request(self: AgreementSlot, *args: Any) -> bytes:
         before, reply = self._pending, original(self, *args)
         self._pending = before or self._pending
         return reply
 
-    patch.setattr(Agreeing, "request", request)
+    patch.setattr(AgreementSlot, "request", request)
 
 
 def reset_leaves_the_request(patch: Patch) -> None:
@@ -234,43 +234,43 @@ def _lenient(verified: Any) -> Any:
 
 
 def any_s_in_a_request(patch: Patch) -> None:
-    original = Agreeing.request
+    original = AgreementSlot.request
 
-    def request(self: Agreeing, *args: Any) -> bytes:
+    def request(self: AgreementSlot, *args: Any) -> bytes:
         self._verify = _lenient(verify)
         return original(self, *args)
 
-    patch.setattr(Agreeing, "request", request)
+    patch.setattr(AgreementSlot, "request", request)
 
 
 def station_signed_as(message: Callable[[bytes], bytes]) -> Bend:
     """A node that looks for SIG104 over another message."""
-    return lambda patch: patch.setattr(agreeing, "station_key_message", message)
+    return lambda patch: patch.setattr(node_agreement, "station_key_message", message)
 
 
 def static_keys_are_good(patch: Patch) -> None:
     """One's own point is looked for, the station's static one is not."""
 
     def good(point: bytes, own: bytes, *_others: bytes) -> bool:
-        from teds_provision.protocol.agreement import good_point
+        from teds_provision.protocol.wire_agreement import good_point
 
         return good_point(point, own)
 
-    patch.setattr(agreeing, "good_one_time", good)
-    patch.setattr(sessions, "good_one_time", good)
+    patch.setattr(node_agreement, "good_one_time", good)
+    patch.setattr(node_sessions, "good_one_time", good)
 
 
 def signature_before_points(patch: Patch) -> None:
-    original = Agreeing.request
+    original = AgreementSlot.request
 
-    def request(self: Agreeing, payload: bytes, origin: Any, flash: Flash) -> bytes:
+    def request(self: AgreementSlot, payload: bytes, origin: Any, flash: Flash) -> bytes:
         if len(payload) == 259:
             said = RequestPayload.decode(payload)
             if not verify(said.ca, b"TEDS1 station key\0" + said.station, said.station_signature):
                 raise CommandRefusedError(Reason.BAD_SIGNATURE)
         return original(self, payload, origin, flash)
 
-    patch.setattr(Agreeing, "request", request)
+    patch.setattr(AgreementSlot, "request", request)
 
 
 # -- the node's half of Open and Sealed --------------------------------------------------------------------------------
@@ -361,12 +361,12 @@ def any_padding(patch: Patch) -> None:
 
 def keys_known_as(identifier: Callable[[bytes], bytes]) -> Bend:
     """A node that makes keyId otherwise where it looks for it."""
-    return lambda patch: patch.setattr(sessions, "key_id", identifier)
+    return lambda patch: patch.setattr(node_sessions, "key_id", identifier)
 
 
 def opened_by(made: Callable[[bytes, bytes, bytes, bytes], bytes]) -> Bend:
     """A node that waits for another mac of Open."""
-    return lambda patch: patch.setattr(sessions, "open_mac", made)
+    return lambda patch: patch.setattr(node_sessions, "open_mac", made)
 
 
 def one_time_key_twice(patch: Patch) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from teds_provision.errors import LinkError
 from teds_provision.links.can import isotp
-from teds_provision.node.can import seat
+from teds_provision.node.can import endpoint
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.nfc import tags
 from teds_provision.node.nfc import tnep as tnep_of_node
@@ -41,13 +41,13 @@ def _runs_again(patch: pytest.MonkeyPatch) -> None:
 
 def _padded_with(octet: int) -> Bend:
     def bend(patch: pytest.MonkeyPatch) -> None:
-        original = seat.Pair.__init__
+        original = endpoint.Pair.__init__
 
         def init(self: isotp.Pair, *args: object, **more: object) -> None:
             original(self, *args, **more)  # type: ignore[arg-type]
             self._logic.params.tx_padding = octet
 
-        patch.setattr(seat.Pair, "__init__", init)
+        patch.setattr(endpoint.Pair, "__init__", init)
         patch.setattr(isotp, "PADDING", octet)
 
     return bend
@@ -55,13 +55,13 @@ def _padded_with(octet: int) -> Bend:
 
 def _block_of(size: int, gap: int) -> Bend:
     def bend(patch: pytest.MonkeyPatch) -> None:
-        original = seat.Pair.__init__
+        original = endpoint.Pair.__init__
 
         def init(self: isotp.Pair, *args: object, **more: object) -> None:
             original(self, *args, **more)  # type: ignore[arg-type]
             self._logic.params.blocksize, self._logic.params.stmin = size, gap
 
-        patch.setattr(seat.Pair, "__init__", init)
+        patch.setattr(endpoint.Pair, "__init__", init)
 
     return bend
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from teds_provision.check.probe import Probe
-from teds_provision.check.rule import Checked
+from teds_provision.check.rule import RuleResult
 from teds_provision.check.run import CheckReport, check_node
 from teds_provision.protocol.tim import Tim
 from teds_provision.station.station import Station
@@ -55,7 +55,7 @@ def checked(
     return check_node(station, talk(board, line), factory=factory, explained=explained)
 
 
-def failed(report: CheckReport) -> dict[str, Checked]:
+def failed(report: CheckReport) -> dict[str, RuleResult]:
     """The rules that the node breaks."""
     return {check.rule: check for check in report.checks if check.result == "failed"}
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.check import sessions
+from teds_provision.check import session_rules
 from teds_provision.check.run import CheckReport, check_at
 from teds_provision.links import LinkSettings
 from teds_provision.station.station import Station
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.check.board import ADDRESS_SECONDS
 from tests.cli.shell import clean_environment
 from tests.pace import PATIENCE
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(autouse=True)
 def _as_quick_as_the_board(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sessions, "_ADDRESS_SECONDS", ADDRESS_SECONDS)
+    monkeypatch.setattr(session_rules, "_ADDRESS_SECONDS", ADDRESS_SECONDS)
 
 
 @contextmanager
@@ -49,7 +49,7 @@ def board(fault: str, link: str, *options: str) -> Iterator[LinkSettings]:
 
 def checked(station: Station, fault: str, link: str, *options: str, factory: bool = False) -> CheckReport:
     with board(fault, link, *options) as links:
-        return check_at(station, links, Silent(), factory=factory)
+        return check_at(station, links, SilentReporter(), factory=factory)
 
 
 def results(report: CheckReport) -> dict[str, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.check.agreement import Explained
+from teds_provision.check.agreement_rules import ExplainedRequest
 from teds_provision.check.rule import RULES, Stage
 from teds_provision.check.run import CheckReport, check_node
 from teds_provision.errors import GarbledError, MessageTooLongError, NodeSilentError, PolicyError
@@ -236,7 +236,7 @@ def test_explain_tells_an_agreement_that_is_never_confirmed(
     board = nodes.made(over)
     before = board.state
     told = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
-    assert isinstance(told, Explained)
+    assert isinstance(told, ExplainedRequest)
     assert (len(told.transcript), len(told.okm), len(told.confirmation_key)) == (32, 48, 32)
     assert told.tag_due == told.reply[85:101]
     assert not told.problem
@@ -247,7 +247,7 @@ def test_explain_tells_an_agreement_that_is_never_confirmed(
 def test_explain_shows_what_is_due_beside_what_came(station: Station, patch: pytest.MonkeyPatch) -> None:
     agreeing_so(label=b"TEDS1 transcript")(patch)
     told = nodes.checked(station, patch, factory=False, explained=True).explained
-    assert isinstance(told, Explained)
+    assert isinstance(told, ExplainedRequest)
     assert told.slip == "transcript-label-without-00"
     assert told.tag_due != told.reply[85:101]
     assert "tagN is wrong" in told.problem
@@ -259,7 +259,7 @@ def test_explain_of_a_node_of_ours_never_tells_its_key(station: Station, patch: 
     agreed(station, board)
     held = board.state.key
     told = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
-    assert isinstance(told, Explained)
+    assert isinstance(told, ExplainedRequest)
     assert board.state.key == held
     assert held is not None
     assert told.okm[:16] != held

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.check import agreement, link_rules, plain, sessions, writing
+from teds_provision.check import agreement_rules, link_rules, plain_rules, session_rules, write_rules
 from teds_provision.check.rule import RULES
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, spawn
@@ -25,7 +25,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
     made.clear()
 
 
-ROOMS = (agreement, link_rules, plain, sessions, writing)
+ROOMS = (agreement_rules, link_rules, plain_rules, session_rules, write_rules)
 """Rules are registered when these are imported."""
 
 

@@ -11,8 +11,8 @@ from rich.console import Console
 from teds_provision.cli.provision import BoardReporter, OperatorScreen
 from teds_provision.errors import NodeSilentError, TedsProvisionError
 from teds_provision.steps.batch_sheet import BoardResult, DeclinedError, SheetRow
-from teds_provision.steps.build import BuildOrder, Prepared
-from teds_provision.talk.progress import Silent
+from teds_provision.steps.build import BuildOrder, PreparedOrder
+from teds_provision.talk.progress import SilentReporter
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 LONG = "the left knee of the third robot in hall B, at the very end of the row, behind the crane, and then to the right"
@@ -38,7 +38,7 @@ class Batch:
 
 
 def row(number: int, *, name: str = LONG, uuid: bytes | None = None, fingerprint: str | None = None) -> SheetRow:
-    return SheetRow(number, number + 1, uuid, fingerprint, Prepared(BuildOrder(name=name)), "")
+    return SheetRow(number, number + 1, uuid, fingerprint, PreparedOrder(BuildOrder(name=name)), "")
 
 
 class Terminal:
@@ -89,7 +89,7 @@ def test_a_board_that_did_not_pass_is_asked_for_by_its_uuid() -> None:
 def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> None:
     """Else an operator takes the board away: the large letters were those of the last one."""
     terminal = Terminal(Batch(next_row=row(1)))
-    reporter = BoardReporter(Silent())
+    reporter = BoardReporter(SilentReporter())
     reporter.begun = terminal.screen.begun
     terminal.screen.ended(failed(1, NodeSilentError("It is silent.")))
     ended = terminal.lines

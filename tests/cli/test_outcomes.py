@@ -22,7 +22,7 @@ from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import provision
 from teds_provision.store import StoreLock, WhitelistEntry
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 
 from ..bench import PASSPHRASE, Board, make_station, talk
 from .shell import call, clean_environment, spawn
@@ -73,7 +73,9 @@ def test_the_store_is_free_while_a_person_is_asked(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(App, "interactive", True)
     questions = _questions(App(home=home, quiet=True), False)
     with talk(board) as node:
-        done = provision(station, node, ANGLE, accept=questions.accept, reporter=Silent(), confirm=questions.confirm)
+        done = provision(
+            station, node, ANGLE, accept=questions.accept, reporter=SilentReporter(), confirm=questions.confirm
+        )
     assert done.verified.verdict == "authentic"
     assert len(asked) == 1
 

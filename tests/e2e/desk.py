@@ -20,7 +20,7 @@ from typing import Any, cast
 
 import pytest
 
-from teds_provision.node.described import create
+from teds_provision.node.node_template import create
 from teds_provision.store import Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import PROGRAM, ROOT, Outcome, begin

@@ -16,10 +16,10 @@ from teds_provision.errors import LinkError
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import port
 from teds_provision.station.station import Station as BaseStation
-from teds_provision.steps.batch import Boards, ProvisionRequest, Questions
+from teds_provision.steps.batch import BatchRun, ProvisionRequest, Questions
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.inventory import inventory
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.bench import PASSPHRASE
 from tests.links.nfc.field import Field
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.link
 POINTS = ("agree", "build", "write", "half written", "verify")
 
 
-class Pulling(Silent):
+class Pulling(SilentReporter):
     """Lifts the board off when the step that is named begins, once."""
 
     def __init__(self, field: Field) -> None:
@@ -55,7 +55,7 @@ def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str
     station = BaseStation.open(home, ask=lambda prompt, confirm: PASSPHRASE)
     pulling = Pulling(field)
     request = ProvisionRequest(order=BuildOrder(ANGLE), watch=True)
-    run = Boards(station, LinkSettings("nfc", path, timeout=30.0), request, pulling)
+    run = BatchRun(station, LinkSettings("nfc", path, timeout=30.0), request, pulling)
     came = run.many(Questions(accept=lambda who: None, confirm=None))
     (other, other_path), *others = lying
     try:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from teds_provision.node.ble.address import StaticAddress
-from teds_provision.node.ble.peripheral import BleLine, Peripheral
+from teds_provision.node.ble.peripheral import CentralState, Peripheral
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.node.handler import InTheAir
+from teds_provision.node.handler import BleHandler
 from teds_provision.node.hardware.board import Board
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
@@ -40,7 +40,7 @@ class CPeripheral(Peripheral):
         self._turn = threading.Lock()
         self.pieces = 0
         self._beats: asyncio.Task[None] | None = None
-        super().__init__(cast(InTheAir, self), StaticAddress(folder, factory=False))
+        super().__init__(cast(BleHandler, self), StaticAddress(folder, factory=False))
 
     def _draw(self, kind: str, size: int) -> bytes:
         return self._secret if kind == "i" else b"\x01" + os.urandom(size - 1)
@@ -117,7 +117,7 @@ class CPeripheral(Peripheral):
         if due:
             asyncio.get_running_loop().create_task(self._notified(line, due))
 
-    async def _notified(self, line: BleLine, due: list[bytes]) -> None:
+    async def _notified(self, line: CentralState, due: list[bytes]) -> None:
         for value in due:
             with suppress(Exception):  # the connection is gone
                 await self._device.notify_subscriber(line.connection, self._notify, value)

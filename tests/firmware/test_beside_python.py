@@ -13,18 +13,18 @@ from dataclasses import dataclass, field
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.protocol.messages.frames import Command, Function, decode_reply, security_command
 from teds_provision.protocol.operation.can_frames import cut
-from teds_provision.protocol.operation.commands import Power
+from teds_provision.protocol.operation.commands import PowerReply
 from teds_provision.protocol.operation.datagram import DatagramSealer, Layout, drive_key
 from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading, SessionPort, port_of
-from teds_provision.protocol.operation.stream_commands import Action, Driven
+from teds_provision.protocol.operation.stream_commands import Action, DriveReply
 from teds_provision.protocol.operation.timing import TriggerToken
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim import Tim
+from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.teds.image import SECURITY
 from teds_provision.teds.sheet import ChannelKind
 from tests.firmware.memory_node import MemoryNode
@@ -90,8 +90,8 @@ class Hardware:
     def fault(self, channel: int) -> bool:
         return False
 
-    def power(self) -> Power:
-        return Power()
+    def power(self) -> PowerReply:
+        return PowerReply()
 
 
 class Twins:
@@ -392,7 +392,7 @@ class Station:
         self.twins.hold()
         if ok and asked.function == Function.DRIVE and asked.command_class == 128:
             layout = Layout(tuple(asked.payload), tuple(CHANNELS[number].octets for number in asked.payload))
-            key = drive_key(self.sessions[link].message_key, Driven.decode(payload).run)
+            key = drive_key(self.sessions[link].message_key, DriveReply.decode(payload).run)
             self.driven[link] = (layout, DatagramSealer(key))
             self.counter = 0
 

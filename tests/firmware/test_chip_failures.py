@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import Function, Reason, Reply, security_command
 from teds_provision.protocol.operation.stream_commands import CLOCK, drive
 from teds_provision.protocol.session import StationSession
+from teds_provision.protocol.wire_agreement import StationAgreement
 from tests.firmware.bench import CBench
 from tests.firmware.desk import CDesk
 from tests.protocol.desk import CREDENTIALS, UUID

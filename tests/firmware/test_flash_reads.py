@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, query_teds, security_command
+from teds_provision.protocol.wire_agreement import StationAgreement
 from tests.firmware.desk import CDesk
 from tests.firmware.test_power_cuts import address, by_hand, commit, confirm, provisioned, reset
 from tests.protocol.desk import CREDENTIALS, UUID

@@ -12,10 +12,10 @@ from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, room
 from teds_provision.node.nfc.tags import ATS, IsoDepTag, NdefApplication, Type4Memory
-from teds_provision.node.nfc.tnep import Extras, TnepTag, charge_records, out_of_band_record
-from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.node.nfc.tnep import ExtraRecords, TnepTag, charge_records, out_of_band_record
 from teds_provision.protocol.messages.frames import Command, Function, security_command
-from teds_provision.protocol.operation.commands import Power
+from teds_provision.protocol.operation.commands import PowerReply
+from teds_provision.protocol.wire_agreement import StationAgreement
 from tests.firmware.memory_node import MemoryNode
 from tests.firmware.test_beside_python import Twins
 from tests.protocol.desk import CREDENTIALS, NODE, UUID
@@ -188,8 +188,8 @@ def test_both_show_their_charge_and_where_they_are_in_the_air(
     if address is not None:
         node.is_in_the_air(address)
     assert node.start() == 0
-    charge = charge_records(Power(flags or 0, None if level == 0xFF else level))
-    extras = Extras(
+    charge = charge_records(PowerReply(flags or 0, None if level == 0xFF else level))
+    extras = ExtraRecords(
         before=lambda: charge,
         after=lambda: (out_of_band_record(address, random=True),) if address is not None else (),
     )

@@ -12,8 +12,8 @@ from teds_provision.protocol.messages.frames import Command, Function, Reason, s
 from teds_provision.protocol.operation.can_frames import cut
 from teds_provision.protocol.operation.commands import (
     ChannelState,
-    Power,
     PowerFlag,
+    PowerReply,
     read_data_set,
     run_self_test,
     sample,
@@ -223,7 +223,7 @@ def test_every_end_of_a_claim_is_safe_and_leaves_nothing(end: str) -> None:
             assert not safe(bench), "a half-open Open ends nothing"
             bench.send(IDENTIFY)
         case "power":
-            bench.hardware.charge = Power(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
+            bench.hardware.charge = PowerReply(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
             node(bench).poll()
         case "last counter":
             bench.sessions["can:f1"]._counter = 0xFFFFFFFE

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
+from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.teds.image import SECURITY
 from tests.firmware.desk import CDesk
 from tests.protocol.desk import CREDENTIALS, META, NAME, NODE, UUID

@@ -196,11 +196,11 @@ def check_operation(data: bytes) -> None:
     from teds_provision.protocol.operation import can_frames, commands, datagram
 
     for read in (
-        lambda: commands.Operate.decode(1, data, actuator=True),
-        lambda: commands.Operate.decode(1, data, actuator=False),
+        lambda: commands.OperateCommand.decode(1, data, actuator=True),
+        lambda: commands.OperateCommand.decode(1, data, actuator=False),
         lambda: commands.OperationReply.decode(data),
-        lambda: commands.Sampled.decode(data, 4),
-        lambda: commands.Power.decode(data),
+        lambda: commands.SampleReply.decode(data, 4),
+        lambda: commands.PowerReply.decode(data),
         lambda: commands.decode_data_set(data, 2),
         lambda: commands.channel_list(data, 16),
         lambda: datagram.DatagramSealer(bytes(16)).open(data),
@@ -261,10 +261,10 @@ def check_can(data: bytes) -> None:
     """ISO-TP as a stranger drives it: pieces ``kind u8 ‖ length u8 ‖ data``, to a gathering and to a pair."""
     from teds_provision.links.can import isotp
     from teds_provision.links.can.bus import Frame
-    from teds_provision.links.can.shared import Gathering
+    from teds_provision.links.can.bus_multiplexer import BroadcastReplies
 
     logging.getLogger("isotp").setLevel(logging.CRITICAL)
-    gathering, sent = Gathering(0xF1, 7), []
+    gathering, sent = BroadcastReplies(0xF1, 7), []
     pair = isotp.Pair(0xF1, 0x21, sent.append)
     at = 0
     while at + 2 <= len(data):
@@ -418,7 +418,7 @@ def check_whitelist(data: bytes) -> None:
     if not data:
         return
     readers = (whitelist._read_xml, whitelist._read_csv, whitelist._read_json)
-    reads(lambda: readers[data[0] % 3](as_text(data[1:]), whitelist._Reading("list")))
+    reads(lambda: readers[data[0] % 3](as_text(data[1:]), whitelist._WhitelistReader("list")))
 
 
 def whitelist_seeds() -> Iterable[bytes]:
@@ -556,7 +556,7 @@ def check_plant(data: bytes) -> None:
         if kind is document.ROSTER:
             read = roster.open_roster(octets, key.point)
             assert roster.taking(read, None, read.registry)[0] == "taken"
-            assert fold.view(read, {}, fold.Own("f" * 64)).key_it
+            assert fold.view(read, {}, fold.LocalState("f" * 64)).key_it
         elif kind is document.PAGE:
             opened = page.open_page(octets, "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29", lambda kid: key.point)
             gathered = claim.Claim()

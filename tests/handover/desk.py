@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from teds_provision.handover.incoming import Imported, ImportPlan, import_bundle, plan_import
-from teds_provision.handover.outgoing import Exported, ExportOrder, export_bundle, plan_export
-from teds_provision.protocol.agreement import key_id
+from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, ExportResult, export_bundle, plan_export
 from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.store import Handover, TrustRecord, WhitelistEntry
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, MemoryLink, make_station, talk
 
 
@@ -38,10 +38,10 @@ def key_up(station: Station, board: Board, *, name: str | None = None) -> None:
         station.groups.add("left hand", [board.uuid])
 
 
-def provisioned(station: Station, board: Board, profile: str = "temperature-sensor") -> Provisioned:
+def provisioned(station: Station, board: Board, profile: str = "temperature-sensor") -> ProvisionResult:
     """All steps on one board."""
     with talk(board) as node:
-        return provision(station, node, BuildOrder(profile), accept=lambda who: None, reporter=Silent())
+        return provision(station, node, BuildOrder(profile), accept=lambda who: None, reporter=SilentReporter())
 
 
 def session(station: Station, board: Board, *, via: str = "can") -> int:
@@ -83,13 +83,13 @@ class Pair:
         return self.boards[0]
 
     def export(self, mode: Mode = "copy", *, to: tuple[str, ...] = ("south",), nodes: tuple[bytes, ...] | None = None,
-               output: Path | None = None) -> tuple[Path, Exported]:  # fmt: skip
+               output: Path | None = None) -> tuple[Path, ExportResult]:  # fmt: skip
         self.files += 1
         path = output or self.folder / f"bundle{self.files}.jwe"
         plan = plan_export(self.north, ExportOrder(to, nodes, mode))
         return path, export_bundle(self.north, plan, path)
 
-    def take(self, path: Path, station: Station | None = None) -> Imported:
+    def take(self, path: Path, station: Station | None = None) -> ImportResult:
         station = station or self.south
         plan = plan_import(station, path.read_bytes())
         return import_bundle(station, plan) if isinstance(plan, ImportPlan) else plan

@@ -28,7 +28,7 @@ from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
-from teds_provision.steps.verify import Verified, verify_image
+from teds_provision.steps.verify import Verification, verify_image
 from teds_provision.steps.verify_node import look_at_node
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
@@ -45,7 +45,7 @@ def ask(prompt: str, confirm: bool) -> str:
 
 @pytest.fixture(autouse=True)
 def cheap(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr("teds_provision.vault.choose.PRODUCT", passphrase.THROWAWAY)
+    monkeypatch.setattr("teds_provision.vault.selection.PRODUCT", passphrase.THROWAWAY)
     monkeypatch.setattr("teds_provision.vault.file_vault.PRODUCT", passphrase.THROWAWAY)
     yield
     forget_vaults()
@@ -100,7 +100,7 @@ def test_they_verify_each_others_datasheets(pair: tuple[Station, Station], direc
     board = Board()
     done = provisioned(one, board)
     image = Image(board.uuid, done.image.blocks)
-    assert Verified(board.uuid, tuple(verify_image(other, image))).verdict == "authentic"
+    assert Verification(board.uuid, tuple(verify_image(other, image))).verdict == "authentic"
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -273,7 +273,7 @@ def test_a_stranger_verifies_nothing_of_theirs(pair: tuple[Station, Station], tm
     board = Board()
     done = provisioned(pair[0], board)
     stranger = make_station(tmp_path / "stranger", "stranger")
-    verified = Verified(board.uuid, tuple(verify_image(stranger, Image(board.uuid, done.image.blocks))))
+    verified = Verification(board.uuid, tuple(verify_image(stranger, Image(board.uuid, done.image.blocks))))
     assert verified.verdict == "not authentic"
     stranger.close()
 

@@ -16,7 +16,7 @@ import pytest
 from teds_provision.errors import PolicyError, UsageError
 from teds_provision.files import new_file
 from teds_provision.handover.deny import lift
-from teds_provision.handover.incoming import Imported, ImportPlan, import_bundle, plan_import
+from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
 from teds_provision.handover.life import revoke
 from teds_provision.handover.outgoing import ExportOrder, export_all, export_bundle, outputs_of, plan_exports
 from teds_provision.handover.pending import close, find_handover, undo
@@ -78,7 +78,7 @@ def forged(
     return seal_bundle(bundle, sender.vault.identity(), [receiver.point])
 
 
-def taken(station: Station, octets: bytes) -> Imported:
+def taken(station: Station, octets: bytes) -> ImportResult:
     plan = plan_import(station, octets)
     return import_bundle(station, plan) if isinstance(plan, ImportPlan) else plan
 

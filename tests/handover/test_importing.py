@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NodeRefusedError, NotAuthenticError, PolicyError
-from teds_provision.handover.incoming import Imported, ImportPlan, import_bundle, plan_import
+from teds_provision.handover.incoming import ImportPlan, ImportResult, import_bundle, plan_import
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
-from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.steps.agree import agree, reset_node
 from teds_provision.steps.identify import identify
 from tests.bench import Board, make_station, talk
@@ -31,7 +31,7 @@ def test_an_expired_bundle_is_refused_but_its_receipt_can_be_had(pair: Pair) -> 
         plan_import(pair.south, path.read_bytes(), later)
     taken = pair.take(path)
     again = plan_import(pair.south, path.read_bytes(), later)
-    assert isinstance(again, Imported)
+    assert isinstance(again, ImportResult)
     assert again.receipt == taken.receipt
 
 

@@ -165,14 +165,14 @@ def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
 def calibrated(pair: Pair, tmp_path: Path) -> Board:
     from teds_provision.steps.build import BuildOrder
     from teds_provision.steps.provision import provision
-    from teds_provision.talk.progress import Silent
+    from teds_provision.talk.progress import SilentReporter
 
     board = Board(uuid=bytes.fromhex("8d4d9da65281f700aaaa"))
     calibration = tmp_path / "calibration.csv"
     calibration.write_text("# channel: 1\nraw,value\n0,-40\n21120,125\n")
     with talk(board) as node:
         order = BuildOrder("temperature-sensor", calibration=calibration, name="thermo")
-        provision(pair.north, node, order, accept=lambda who: None, reporter=Silent())
+        provision(pair.north, node, order, accept=lambda who: None, reporter=SilentReporter())
     return board
 
 

@@ -15,7 +15,7 @@ from teds_provision.handover.pending import content_digest
 from teds_provision.steps.agree import agree, open_session
 from teds_provision.steps.commands import set_address
 from teds_provision.steps.identify import identify
-from teds_provision.steps.read import read_image
+from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.store import RevocationRecord
 from tests.bench import MemoryLink, make_station, talk

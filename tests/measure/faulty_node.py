@@ -18,16 +18,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from teds_provision.node.can.seat import link_name
+from teds_provision.node.can.endpoint import link_name
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board
-from teds_provision.node.pulse import Pulse
+from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.frames import CommandRefusedError, Reason
 from teds_provision.protocol.operation.commands import EITHER, OPERATE_FUNCTION
 from teds_provision.protocol.operation.hardware import RawReading
-from teds_provision.protocol.operation.stream_commands import Clock, Subscribed
+from teds_provision.protocol.operation.stream_commands import ClockReply, SubscribeReply
 from teds_provision.protocol.operation.streams import DataFrame, Stream
 from teds_provision.talk.meeting import IdleStop
 from teds_provision.teds.image import SECURITY, Image
@@ -41,7 +41,7 @@ SECOND = 10**9
 class Faulty(VirtualNode):
     """A node whose data frames go through ``bend``, and whose firmware was spoilt by ``spoil``."""
 
-    def __init__(self, folder: Path, pulse: Pulse) -> None:
+    def __init__(self, folder: Path, pulse: RealtimeLoop) -> None:
         super().__init__(folder, board=_board, pulse=pulse)
         self.began: float | None = None
 
@@ -170,16 +170,16 @@ def _after_subscribe(node: Faulty, change: Callable[[Stream], None]) -> None:
     node.role.subscribe = subscribe
 
 
-def _clock(node: Faulty, lie: Callable[[Clock], Clock]) -> None:
+def _clock(node: Faulty, lie: Callable[[ClockReply], ClockReply]) -> None:
     real = node.role.clock
-    node.role.clock = lambda *words: lie(Clock.decode(real(*words))).encode()
+    node.role.clock = lambda *words: lie(ClockReply.decode(real(*words))).encode()
 
 
 def jumping_clock(node: Faulty) -> None:
     """Its clock says another time at every question."""
     jumps = itertools.cycle((0, 200_000_000, -150_000_000))
 
-    def lie(told: Clock) -> Clock:
+    def lie(told: ClockReply) -> ClockReply:
         jump = next(jumps)
         return replace(told, received=max(0, told.received + jump), sent=max(0, told.sent + jump))
 
@@ -196,9 +196,9 @@ def clock_of_tomorrow(node: Faulty) -> None:
     _clock(node, lambda told: replace(told, received=told.received + 3600 * SECOND, sent=told.sent + 3600 * SECOND))
 
 
-def _subscribed(node: Faulty, lie: Callable[[Subscribed], Subscribed]) -> None:
+def _subscribed(node: Faulty, lie: Callable[[SubscribeReply], SubscribeReply]) -> None:
     real = node.role.subscribe
-    node.role.subscribe = lambda *words: lie(Subscribed.decode(real(*words))).encode()
+    node.role.subscribe = lambda *words: lie(SubscribeReply.decode(real(*words))).encode()
 
 
 def wrong_length(node: Faulty) -> None:
@@ -271,7 +271,7 @@ FAULTS: dict[str, Callable[..., None]] = {one.__name__: one for one in (*BENDING
 
 def main() -> None:
     can, *given = sys.argv[1:]
-    pulse, server = Pulse(), CanServer(can, tell=lambda text: print(text, file=sys.stderr, flush=True))
+    pulse, server = RealtimeLoop(), CanServer(can, tell=lambda text: print(text, file=sys.stderr, flush=True))
     boards = []
     for word in given:
         fault, _, folder = word.partition("=")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from teds_provision.node.described import create
+from teds_provision.node.node_template import create
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
@@ -20,7 +20,7 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import provision
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import ANGLE, Desk, Running
 from tests.e2e.desk import Station as Commands
@@ -45,7 +45,7 @@ def provisioned(station: Station, folder: Path, type_: str, name: str, uuid: byt
             who = identify(station, talk)
             agree(station, talk, who, newcomer=WhitelistEntry(talk.uuid, who.fingerprint, utc_now(), "tap", name))
             return talk.uuid.hex()
-        done = provision(station, talk, order, accept=lambda _who: None, reporter=Silent())
+        done = provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter())
     assert done.verified.verdict == "authentic"
     return node.tim.flash.uuid.hex()
 

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from teds_provision.measure.planning import BusShare, BusTime, Plans, plan_node
+from teds_provision.measure.planning import BusShare, BusTime, NodePlans, plan_node
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.teds.channel import Channel, ChannelKind, SampleForm, Timing
 
@@ -17,8 +17,8 @@ FAST, SLOW = (
 )
 
 
-def measure(share: BusShare, order: list[tuple[bytes, Channel]]) -> dict[bytes, Plans]:
-    """Each node says what it wants, then plans in this order, as NodeKeeper does."""
+def measure(share: BusShare, order: list[tuple[bytes, Channel]]) -> dict[bytes, NodePlans]:
+    """Each node says what it wants, then plans in this order, as NodeSupervisor does."""
     for uuid, channel in order:
         share.wanted[uuid] = plan_node([channel], share.time).load
     plans = {}

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.measure.clock import AT_FIRST, ClockMap, Exchange, Monotone, Wall
+from teds_provision.measure.clock import AT_FIRST, ClockMap, Exchange, MonotonicStamps, WallClock
 from teds_provision.measure.running.streams import NodeStreams
-from teds_provision.measure.trusting import exchange_clock
-from teds_provision.protocol.operation.stream_commands import Clock
+from teds_provision.measure.verified_session import exchange_clock
+from teds_provision.protocol.operation.stream_commands import ClockReply
 from tests.pace import best_of
 
 SECOND = 1_000_000_000
@@ -87,7 +87,7 @@ def test_the_bound_holds_whatever_the_link_does(ppm: int, seed: int, slowest: in
 
 
 def test_stamps_of_a_stream_never_go_back_and_a_refit_does_not_step() -> None:
-    node, clock, monotone = Node(80, slowest=30_000_000), ClockMap(), Monotone()
+    node, clock, monotone = Node(80, slowest=30_000_000), ClockMap(), MonotonicStamps()
     stamps = []
     for k in range(3000):
         taken = BOOT + SECOND + k * SECOND // 100
@@ -133,7 +133,7 @@ def test_of_an_exchange_the_link_knows_when_it_left_and_came() -> None:
             if isinstance(link, Link):
                 assert (link.left, link.came) == (0.0, 0.0), "they are asked of this exchange alone"
                 link.left, link.came = left, came
-            return Clock(SECOND, SECOND + 1000, 0, 1, 20, 0).encode()
+            return ClockReply(SECOND, SECOND + 1000, 0, 1, 20, 0).encode()
 
         clock = ClockMap()
         node = SimpleNamespace(contact=SimpleNamespace(link=link), send=send)
@@ -150,9 +150,9 @@ def test_of_an_exchange_the_link_knows_when_it_left_and_came() -> None:
 
 def test_streams_of_a_clock_that_always_lies_have_the_time_of_their_arrival() -> None:
     """Not that of the node's start, hours ago, until a hull of arrivals stands."""
-    streams = NodeStreams(Wall.now(), lambda _block: None)
+    streams = NodeStreams(WallClock.now(), lambda _block: None)
     sent = 10 * 3600 * SECOND  # its tick
-    lying = Clock(sent + 1, sent, 0, 1, 20, 0).encode()
+    lying = ClockReply(sent + 1, sent, 0, 1, 20, 0).encode()
     node = SimpleNamespace(contact=SimpleNamespace(link=object()), send=lambda *_: lying)
     streams.tell_time(SimpleNamespace(node=node))  # type: ignore[arg-type]  # what it asks of a conversation
     assert "before it received" in streams.clock.lie
@@ -238,6 +238,6 @@ def test_the_present_tick_is_the_inverse_of_the_map() -> None:
 
 def test_wall_time_is_read_once() -> None:
     def off() -> float:
-        return float(abs(Wall.now().unix(np.array([time.monotonic()]))[0] - time.time()))
+        return float(abs(WallClock.now().unix(np.array([time.monotonic()]))[0] - time.time()))
 
     best_of(5, 0.5, off)

@@ -14,7 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from teds_provision.measure.blocks import ClockSet, GroupRows
-from teds_provision.measure.clock import STEP, HostClock, Wall
+from teds_provision.measure.clock import STEP, HostClock, WallClock
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Running
 from tests.measure.hall import Hall, events, of
@@ -147,11 +147,11 @@ def test_the_daemon_follows_it_too(hall: Hall, clock: SystemClock, tmp_path: Pat
 
 
 def test_a_small_difference_is_no_step_and_widens_the_bound() -> None:
-    now = Wall.now()
-    kept = HostClock(Wall(now.offset - STEP / 2))
+    now = WallClock.now()
+    kept = HostClock(WallClock(now.offset - STEP / 2))
     assert not kept.was_set()
     assert kept.apart == pytest.approx(STEP / 2, abs=1e-4)
-    kept = HostClock(Wall(now.offset - 2 * STEP))
+    kept = HostClock(WallClock(now.offset - 2 * STEP))
     assert kept.was_set()
     assert kept.set_anew() == pytest.approx(2 * STEP, abs=1e-4)
     assert kept.apart == 0.0

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
-from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone, Wall
-from teds_provision.measure.hearing import GATHER, CanHearing, HeardStream
+from teds_provision.measure.clock import ClockMap, Exchange, HostClock, MonotonicStamps, WallClock
 from teds_provision.measure.interpreter import StreamInterpreter
+from teds_provision.measure.stream_receiver import GATHER, CanStreamReceiver, ReceivedStream
 from teds_provision.protocol.operation.can_frames import DataAddress, StreamAssembly, cut
 from teds_provision.protocol.operation.datagram import DatagramSealer, stream_key
-from teds_provision.protocol.operation.stream_commands import StreamKind, Subscribed
+from teds_provision.protocol.operation.stream_commands import StreamKind, SubscribeReply
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.teds.calibration import fit
 from tests.teds.test_interpreter import sheet_of
@@ -33,7 +33,7 @@ CURVES = {
     2: fit([(0, 0.0), (30000, 5.0), (65535, 10.0)], "table", channel=2),
 }
 SHEET = sheet_of("tactile-finger-sensor", CURVES)
-WALL = Wall(1.8e9)
+WALL = WallClock(1.8e9)
 HOST = HostClock(WALL)
 
 
@@ -55,10 +55,10 @@ class Scene:
         clock = ClockMap()
         clock.exchange(Exchange(self.base, self.base + 2000, SECOND + 500, SECOND + 1500, 1, 20))
         self.clock, self.blocks = clock, list[Block]()
-        receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
-        interpreter = StreamInterpreter(SHEET, self.plan, 1, clock, HOST, Monotone())
+        receiver = Receiver(self.plan, SubscribeReply(1, self.plan.length, SECOND), KEY)
+        interpreter = StreamInterpreter(SHEET, self.plan, 1, clock, HOST, MonotonicStamps())
         assembly = StreamAssembly(self.plan.length, fd=fd)
-        self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
+        self.heard = ReceivedStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
         self._sealer = DatagramSealer(stream_key(KEY, 1))
 
     def message(self, counter: int, flags: int = 0) -> bytes:
@@ -173,7 +173,7 @@ def test_a_period_of_the_block_is_one_of_the_nodes_clock_mapped() -> None:
         assert block.time == pytest.approx(WALL.unix(scene.clock.host(block.tick)), abs=1e-6)
 
 
-class Silent(CanHearing):
+class Silent(CanStreamReceiver):
     """A bus on which nothing comes but what the test hands over."""
 
     def _hear(self) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.clock import HostClock
-from teds_provision.measure.keeper import NodeKeeper
+from teds_provision.measure.node_supervisor import NodeSupervisor
 from teds_provision.measure.request import Events, MeasurementRequest
 from teds_provision.measure.running.common_start import CommonStart
 
@@ -21,7 +21,7 @@ def test_a_foreign_exception_ends_the_node_with_an_error(monkeypatch: pytest.Mon
     events = Events(lambda _block: None, lambda _facts: None, reports.append)
     buses: Any = SimpleNamespace(all=list)
     host = HostClock()
-    keeper = NodeKeeper(None, buses, UUID, MeasurementRequest(), host, events, CommonStart([UUID]))  # type: ignore[arg-type]
+    keeper = NodeSupervisor(None, buses, UUID, MeasurementRequest(), host, events, CommonStart([UUID]))  # type: ignore[arg-type]
 
     def broken() -> None:
         raise ValueError("cannot convert float NaN to integer")

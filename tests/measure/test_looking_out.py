@@ -16,9 +16,9 @@ import pytest
 from teds_provision.errors import AddressConflictError, LinkError
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.lookout import BELIEVED, LEAST, SOON, Lookout, Pace
-from teds_provision.measure.sightings import Sighting, Sightings
-from teds_provision.ncap.nodes.watching import CHECK, MAX_PARALLEL, StillThere
+from teds_provision.measure.discovery import BELIEVED, LEAST, SOON, BroadcastPace, CanDiscovery
+from teds_provision.measure.presence import Presence, Sighting
+from teds_provision.ncap.nodes.link_watch import CHECK, MAX_PARALLEL, PresenceCheck
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.conftest import hub, nodes  # noqa: F401  fixtures
@@ -43,10 +43,10 @@ def asked(bus: Hub) -> Counter[int]:
 
 
 @pytest.fixture
-def lookout(hub: Hub, nodes: Start) -> Iterator[Lookout]:  # noqa: F811
+def lookout(hub: Hub, nodes: Start) -> Iterator[CanDiscovery]:  # noqa: F811
     nodes(hub.spec, *ADDRESSES)
     port = CanPort(hub.spec)
-    made = Lookout(port, Sightings(), poll=30.0)
+    made = CanDiscovery(port, Presence(), poll=30.0)
     made.discover()
     yield made
     made.close()
@@ -58,7 +58,7 @@ def announce(bus: Hub, address: int, crc: bytes = b"\xaa\xbb\xcc\xdd") -> None:
 
 
 def test_who_announces_itself_is_asked_once_in_ten_seconds_and_five_a_second_over_all(
-    lookout: Lookout,
+    lookout: CanDiscovery,
     hub: Hub,  # noqa: F811
 ) -> None:
     hub.frames.clear()
@@ -76,7 +76,7 @@ def test_who_announces_itself_is_asked_once_in_ten_seconds_and_five_a_second_ove
 
 
 @pytest.mark.realtime
-def test_a_node_that_somebody_waits_for_is_looked_for_at_once(lookout: Lookout, hub: Hub) -> None:  # noqa: F811
+def test_a_node_that_somebody_waits_for_is_looked_for_at_once(lookout: CanDiscovery, hub: Hub) -> None:  # noqa: F811
     with looked_for(lookout):
         until(lambda: asked(hub)[0] >= 4, "somebody is missing: at the start, at once, after 1 s, after 2 s")
         hub.frames.clear()
@@ -88,7 +88,7 @@ def test_a_node_that_somebody_waits_for_is_looked_for_at_once(lookout: Lookout, 
 
 @pytest.mark.realtime
 def test_a_question_that_the_missing_node_did_not_hear_is_asked_again_at_once(
-    lookout: Lookout,
+    lookout: CanDiscovery,
     hub: Hub,  # noqa: F811
 ) -> None:
     """The second one came a second later, and in a measurement of many nodes all others waited for it."""
@@ -104,13 +104,13 @@ def test_a_question_that_the_missing_node_did_not_hear_is_asked_again_at_once(
     with looked_for(lookout):
         until(lambda: asked(hub)[0] >= 3)
         best_of(BELIEVED - 1, LEAST, pause)
-    pace = Pace(time.monotonic(), first=SOON)
+    pace = BroadcastPace(time.monotonic(), first=SOON)
     until(lambda: pace.is_due(wanted=False, missing=True, poll=None))
     pace.asked = time.monotonic()
     assert not pace.is_due(wanted=False, missing=True, poll=None), "from there on after 1 s, doubling"
 
 
-def test_who_goes_on_announcing_a_missing_node_does_not_have_everybody_asked_on_and_on(lookout: Lookout) -> None:
+def test_who_goes_on_announcing_a_missing_node_does_not_have_everybody_asked_on_and_on(lookout: CanDiscovery) -> None:
     words = Announce(0x21, NodeState.PROVISIONED, uuid_crc(ONE))
     frame = Frame(words.identifier, words.encode())
     with looked_for(lookout):
@@ -119,7 +119,7 @@ def test_who_goes_on_announcing_a_missing_node_does_not_have_everybody_asked_on_
 
 @pytest.mark.realtime
 def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_for_long(
-    lookout: Lookout,
+    lookout: CanDiscovery,
     hub: Hub,  # noqa: F811
 ) -> None:
     """The pause had grown with the absence of the other one, to 30 s."""
@@ -143,7 +143,7 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
 
 
 def test_everybody_is_asked_now_and_then_so_that_a_node_is_found_whose_announce_nobody_heard(
-    lookout: Lookout,
+    lookout: CanDiscovery,
     hub: Hub,  # noqa: F811
 ) -> None:
     hub.frames.clear()
@@ -154,7 +154,7 @@ def test_everybody_is_asked_now_and_then_so_that_a_node_is_found_whose_announce_
 
 
 @contextmanager
-def looked_for(lookout: Lookout) -> Iterator[None]:
+def looked_for(lookout: CanDiscovery) -> Iterator[None]:
     """Somebody waits for a node that is not there."""
     stop = threading.Event()
 
@@ -198,7 +198,7 @@ def last_heard(uuid: bytes, address: int, ago: float) -> Sighting:
 
 def asks(bus: Bus, known: dict[str, Sighting], held: str = "") -> dict[str, bool]:
     port: Any = bus
-    found = StillThere(port, lambda uuid: uuid == held).look(known)
+    found = PresenceCheck(port, lambda uuid: uuid == held).look(known)
     return {uuid: sighting is not None for uuid, sighting in found}
 
 

@@ -14,15 +14,15 @@ import pytest
 from teds_provision.errors import AddressConflictError, NodeRefusedError, NoNodeError, PolicyError
 from teds_provision.links.ports import Contact
 from teds_provision.measure.clock import ClockMap, Exchange
-from teds_provision.measure.lookout import AirLookout
+from teds_provision.measure.discovery import BleDiscovery
+from teds_provision.measure.presence import MOST, TWIN, Presence, Sighting
 from teds_provision.measure.request import Requirements
 from teds_provision.measure.running.common_start import CommonStart
-from teds_provision.measure.running.patience import Patience
-from teds_provision.measure.sightings import MOST, TWIN, Sighting, Sightings
+from teds_provision.measure.running.retry_policy import RetryPolicy
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
-from teds_provision.store.lock import Mark, UsageLockTakenError
+from teds_provision.store.lock import UsageLock, UsageLockTakenError
 from teds_provision.teds.fits import parse_require
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
@@ -46,12 +46,12 @@ def seen(uuid: bytes, address: int, *, place: str = "can:x", at: float | None = 
     return Sighting(identity, address, port, time.monotonic() if at is None else at)
 
 
-def find(sightings: Sightings, uuid: bytes, **more: Any) -> Sighting:
+def find(sightings: Presence, uuid: bytes, **more: Any) -> Sighting:
     return sightings.find(uuid, seconds=more.pop("seconds", 0.05), stop=threading.Event(), **more)
 
 
 def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile() -> None:
-    sightings = Sightings()
+    sightings = Presence()
     sightings.saw(seen(ONE, 7))
     assert find(sightings, ONE).address == 7
     with pytest.raises(NoNodeError):
@@ -81,7 +81,7 @@ class EmptyAir:
 
 def test_who_asks_a_look_out_that_has_nothing_to_do_waits_for_one_round_alone() -> None:
     air: Any = EmptyAir()
-    lookout = AirLookout(air, Sightings())
+    lookout = BleDiscovery(air, Presence())
     began = time.monotonic()
     lookout.discover()
     lookout.discover()
@@ -92,7 +92,7 @@ def test_who_asks_a_look_out_that_has_nothing_to_do_waits_for_one_round_alone() 
 
 
 def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
-    sightings = Sightings()
+    sightings = Presence()
     forged, true = seen(ONE, 7), seen(ONE, 8)
     sightings.saw(forged)
     sightings.wrong(forged)
@@ -105,8 +105,8 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Who answers at once was taken again and again, and the node, after its random wait, never."""
-    monkeypatch.setattr("teds_provision.measure.sightings.TWIN", 5.0)
-    sightings = Sightings()
+    monkeypatch.setattr("teds_provision.measure.presence.TWIN", 5.0)
+    sightings = Presence()
     copy, true = seen(ONE, 7), seen(ONE, 8)
     sightings.saw(copy)
     sightings.saw(true)
@@ -120,37 +120,37 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     sightings.wrong(seen(ONE, 8))
     alone = time.monotonic()
     sightings.saw(seen(ONE, 7))
-    monkeypatch.setattr("teds_provision.measure.sightings.TWIN", TWIN)
+    monkeypatch.setattr("teds_provision.measure.presence.TWIN", TWIN)
     assert find(sightings, ONE, seconds=PATIENCE, fresh=alone).address == 7, "nobody else answers: it is tried again"
 
 
 def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhere() -> None:
     """Who gave himself a node's UUID, and said that he knows no key, ended its measurement before it began."""
-    sightings, unknown = Sightings(), PolicyError("It knows none of the keys.")
+    sightings, unknown = Presence(), PolicyError("It knows none of the keys.")
     copy = seen(ONE, 7)
     sightings.saw(copy)
     sightings.wrong(copy)
     look = functools.partial(sightings.elsewhere, ONE)
-    assert Patience(60.0).gives_up(unknown, proven=False, elsewhere=look), "nobody else answers"
+    assert RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look), "nobody else answers"
     threading.Timer(TWIN / 5, sightings.saw, [seen(ONE, 8)]).start()
-    assert not Patience(60.0).gives_up(unknown, proven=False, elsewhere=look)
-    assert Patience(60.0).gives_up(unknown, proven=True, elsewhere=look), "said in a session it is the node's word"
-    assert not Patience(None).gives_up(unknown, proven=True, elsewhere=look)
-    assert not Patience(60.0).gives_up(NodeRefusedError("busy", reason=17), proven=True, elsewhere=look)
-    assert Patience(0.0).gives_up(NodeRefusedError("busy", reason=17), proven=True, elsewhere=look)
+    assert not RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look)
+    assert RetryPolicy(60.0).gives_up(unknown, proven=True, elsewhere=look), "said in a session it is the node's word"
+    assert not RetryPolicy(None).gives_up(unknown, proven=True, elsewhere=look)
+    assert not RetryPolicy(60.0).gives_up(NodeRefusedError("busy", reason=17), proven=True, elsewhere=look)
+    assert RetryPolicy(0.0).gives_up(NodeRefusedError("busy", reason=17), proven=True, elsewhere=look)
 
 
 def test_a_copy_that_refuses_while_the_node_is_silent_for_a_moment_is_no_reason_either() -> None:
-    sightings, unknown = Sightings(), PolicyError("It knows none of the keys.")
+    sightings, unknown = Presence(), PolicyError("It knows none of the keys.")
     for silent_then_copy in (8, 7):
         sightings.saw(seen(ONE, silent_then_copy))
         sightings.wrong(seen(ONE, silent_then_copy))
     look = functools.partial(sightings.elsewhere, ONE)
-    assert not Patience(60.0).gives_up(unknown, proven=False, elsewhere=look)
+    assert not RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look)
 
 
 def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
-    sightings = Sightings()
+    sightings = Presence()
     announced = seen(TWO, 8)
     sightings.saw(announced)
     sightings.on_announce(announced, lambda: None)
@@ -163,7 +163,7 @@ def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
 
 
 def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
-    sightings = Sightings()
+    sightings = Presence()
     sightings.saw(seen(ONE, 7))
     with pytest.raises(NoNodeError):
         find(sightings, ONE, fresh=time.monotonic())
@@ -171,7 +171,7 @@ def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
 
 def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
     told: list[str] = []
-    sightings = Sightings(note=told.append)
+    sightings = Presence(note=told.append)
     sightings.saw(seen(ONE, 7))
     sightings.conflict("can:x", 7)
     with pytest.raises(AddressConflictError):
@@ -180,7 +180,7 @@ def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
 
 
 def test_an_announce_is_told_to_whom_it_concerns_by_address_or_by_uuid() -> None:
-    sightings, heard = Sightings(), list[str]()
+    sightings, heard = Presence(), list[str]()
     for name, uuid, address in (("one", ONE, 7), ("two", TWO, 8)):
         sightings.on_announce(seen(uuid, address), lambda name=name: heard.append(name))
     sightings.announced("can:x", Announce(7, 2, 0))
@@ -259,23 +259,23 @@ def test_datasheets_are_judged_once_all_are_there_and_one_that_is_gone_is_not_wa
 
 def test_a_mark_names_its_holder_and_tells_of_one_that_was_killed(tmp_path: Path) -> None:
     place = tmp_path / "marks" / "bus.lock"
-    with Mark(place, command="measure crane") as held:
+    with UsageLock(place, command="measure crane") as held:
         assert not held.left_behind
-        assert Mark(place, command="").is_taken
-        with pytest.raises(UsageLockTakenError, match="measure crane"), Mark(place, command="set"):
+        assert UsageLock(place, command="").is_taken
+        with pytest.raises(UsageLockTakenError, match="measure crane"), UsageLock(place, command="set"):
             pass
-        with pytest.raises(UsageLockTakenError), Mark(place, command="set", shared=True):
+        with pytest.raises(UsageLockTakenError), UsageLock(place, command="set", shared=True):
             pass
-    assert not Mark(place, command="").is_taken
+    assert not UsageLock(place, command="").is_taken
     with (
-        Mark(place, command="set a", shared=True),
-        Mark(place, command="set b", shared=True),
+        UsageLock(place, command="set a", shared=True),
+        UsageLock(place, command="set b", shared=True),
         pytest.raises(UsageLockTakenError, match="set b"),
-        Mark(place, command="measure"),
+        UsageLock(place, command="measure"),
     ):
         pass
-    with Mark(place, command="measure") as free:
+    with UsageLock(place, command="measure") as free:
         assert not free.left_behind, "whoever leaves in order puts the mark away"
     place.write_text("{}")  # what a process leaves that was killed
-    with Mark(place, command="measure") as again:
+    with UsageLock(place, command="measure") as again:
         assert again.left_behind

@@ -6,17 +6,17 @@ import pytest
 
 from teds_provision.errors import NoRoomError, UsageError
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
-from teds_provision.measure.matching import Load, Match
+from teds_provision.measure.matching import NodeLoad, NodeMatch
 from teds_provision.measure.planning import BusShare, BusTime
 from teds_provision.measure.sinks.names import Topics
 
 
 def test_an_expression_is_terms_that_must_all_hold() -> None:
-    one = Match.parse("type:angle-sensor, name:arm-*,group:left,right, angle >= 360 deg, rate >= 1 kHz")
+    one = NodeMatch.parse("type:angle-sensor, name:arm-*,group:left,right, angle >= 360 deg, rate >= 1 kHz")
     assert (one.types, one.names, one.groups) == (("angle-sensor",), ("arm-*",), ("left", "right"))
     assert one.fits is not None
     assert [term.text for term in one.fits.terms] == ["angle >= 360 deg", "rate >= 1 kHz"]
-    assert Match.parse("all") == Match("all")
+    assert NodeMatch.parse("all") == NodeMatch("all")
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ def test_an_expression_is_terms_that_must_all_hold() -> None:
 )
 def test_what_says_no_nodes_is_refused_with_its_term(text: str) -> None:
     with pytest.raises(UsageError) as refused:
-        Match.parse(text)
+        NodeMatch.parse(text)
     assert repr(text) in refused.value.message
 
 
@@ -62,8 +62,8 @@ def test_those_that_come_together_share_and_those_that_run_keep_what_they_have()
 
 
 def test_a_node_costs_the_topics_its_values_and_two_messages_for_each_row() -> None:
-    assert Load(0.1, channels=3, rate=50.0).messages(10.0, rows=True) == 3 * 10 + 2 * 50
-    assert Load(0.1, channels=1, rate=5.0).messages(10.0, rows=True) == 5 + 10
-    assert Load(0.1, channels=3, rate=50.0).messages(10.0, rows=False) == 3 * 10, "MQTT carries no rows"
+    assert NodeLoad(0.1, channels=3, rate=50.0).messages(10.0, rows=True) == 3 * 10 + 2 * 50
+    assert NodeLoad(0.1, channels=1, rate=5.0).messages(10.0, rows=True) == 5 + 10
+    assert NodeLoad(0.1, channels=3, rate=50.0).messages(10.0, rows=False) == 3 * 10, "MQTT carries no rows"
     assert issubclass(NoRoomError, Exception)
     assert NoRoomError("x").exit_code == 6

@@ -22,9 +22,9 @@ from tests.measure.hall import Hall, events
 
 pytestmark = pytest.mark.link
 NOTHING_ASKED = (
-    "import runpy, sys, teds_provision.measure.trusting as trusting;"
+    "import runpy, sys, teds_provision.measure.verified_session as trusting;"
     "trusting.LEASE = 60;"
-    "import teds_provision.measure.rest as rest;"
+    "import teds_provision.measure.background_reread as rest;"
     "rest.FIRST = 600.0;"
     "sys.argv[0] = 'teds-provision'; runpy.run_module('teds_provision', run_name='__main__')"
 )

@@ -9,7 +9,7 @@ import pytest
 
 from teds_provision.errors import BadDatasheetError, PolicyError, TedsProvisionError
 from teds_provision.measure.standing import NodeStanding, require_measurable
-from teds_provision.measure.trusting import open_trusted
+from teds_provision.measure.verified_session import open_trusted
 from teds_provision.station.station import Station
 from teds_provision.store import RevocationRecord
 from tests.bench import PASSPHRASE, MemoryLink, talk

@@ -12,7 +12,7 @@ import pytest
 from teds_provision.errors import NodeRefusedError
 from teds_provision.measure.blocks import Block, SetPointCommand
 from teds_provision.measure.topic_actuators import WATCHED, TopicActuators
-from teds_provision.measure.trusting import Trusted
+from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.protocol.messages.frames import Command, Function, Reason
 from teds_provision.teds.calibration import fit
 from tests.measure.test_lookout import clock
@@ -46,7 +46,8 @@ class Scene:
         node: Any = self.node
         self.turn = threading.Lock()
         self.actuators = TopicActuators(
-            Trusted(node, SHEET, "00" * 32, "g"), self.messages.append, (1,), dead_man=dead_man, clock=clock(10**9),
+            VerifiedSession(node, SHEET, "00" * 32, "g"), self.messages.append, (1,), dead_man=dead_man,
+            clock=clock(10**9),
             turn=self.turn, mapping=threading.Lock(), echo=self.applied.append, tell=self.told.append,
         )  # fmt: skip
 

@@ -24,7 +24,7 @@ PATTERNS = (
     ),
     Pattern(
         "a lost-out station never agrees by itself",
-        "_Word.require",
+        "_TakeoverConsent.require",
         "station.keys.held(node.uuid) and not self.rotate",
         "False",
     ),
@@ -108,18 +108,24 @@ PATTERNS = (
         "station.keys.demand_rotation(uuid, f'the move {row.id} did not happen')",
         "None",
     ),
-    Pattern("a reset forgets the pending agreement's key", "Agreeing.forget", "self._pending.link == link", "False"),
+    Pattern(
+        "a reset forgets the pending agreement's key", "AgreementSlot.forget", "self._pending.link == link", "False"
+    ),
     # the node
-    Pattern("a Request dies after 60 s", "Agreeing.confirm", "self._clock() - pending.at >= PENDING_SECONDS", "False"),
+    Pattern(
+        "a Request dies after 60 s", "AgreementSlot.confirm", "self._clock() - pending.at >= PENDING_SECONDS", "False"
+    ),
     Pattern(
         "Confirm comes by its link",
-        "Agreeing.confirm",
+        "AgreementSlot.confirm",
         "pending.link != origin.link",
         "False",
         "tests/protocol/test_tim_agreement.py",
     ),
-    Pattern("Confirm comes in its session", "Agreeing.confirm", "pending.session is not origin.session", "False"),
-    Pattern("the node keeps one CA", "Agreeing.request", "flash.ca is not None and request.ca != flash.ca", "False"),
+    Pattern("Confirm comes in its session", "AgreementSlot.confirm", "pending.session is not origin.session", "False"),
+    Pattern(
+        "the node keeps one CA", "AgreementSlot.request", "flash.ca is not None and request.ca != flash.ca", "False"
+    ),
     Pattern(
         "a sequence grows",
         "verified_commit",
@@ -202,7 +208,7 @@ PATTERNS = (
     Pattern("a sequence seen before", "_sequence", "shown.sequence >= known.sequence", "True"),
     Pattern("an epoch of the future", "_epoch", "shown.key_epoch > known.identity.epoch", "False"),
     Pattern("only good signatures are floors", "known_of", "datasheet.signature_good(shown, octets, uuid)", "True"),
-    Pattern("no session, no verdict", "Verified.verdict", "_SESSION in failed", "False"),
+    Pattern("no session, no verdict", "Verification.verdict", "_SESSION in failed", "False"),
     Pattern(
         "write refuses another epoch",
         "_require_newer",

@@ -22,9 +22,9 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from teds_provision import client
-from teds_provision.store.lock import NodeTurn
+from teds_provision.store.lock import NodeLock
 home, uuid = Path(sys.argv[1]), sys.argv[2]
-with NodeTurn(home, bytes.fromhex(uuid)), client.connect(home=home).released(uuid, "write") as had:
+with NodeLock(home, bytes.fromhex(uuid)), client.connect(home=home).released(uuid, "write") as had:
     print(had, flush=True)
     sys.stdin.read()
 """

@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision.errors import NotFoundError
 from teds_provision.measure.blocks import Block
-from teds_provision.ncap.past import HOUR, Past
+from teds_provision.ncap.history import HOUR, History
 
 NODE = "8d4d9da65281f7000000"
 NOW = float(int(time.time()))
@@ -34,7 +34,7 @@ def block(
     return Block(NODE, 1, channels, index, at, ticks, value, np.where(good, value, np.nan), good, run=run)
 
 
-def ramp(past: Past, first: float, seconds: int, *, rate: float = 100.0, start: int = 0) -> None:
+def ramp(past: History, first: float, seconds: int, *, rate: float = 100.0, start: int = 0) -> None:
     """One channel that counts its samples, a second a block."""
     each = int(rate)
     for second in range(seconds):
@@ -44,7 +44,7 @@ def ramp(past: Past, first: float, seconds: int, *, rate: float = 100.0, start: 
 
 def test_a_second_has_its_least_its_greatest_and_its_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.time", lambda: NOW)  # which is when this module was loaded
-    past = Past()
+    past = History()
     ramp(past, NOW - 10, 10)
     said = past.of(NODE, 1, NOW - 600, NOW, points=3600)
     assert said["bin"] == 1.0
@@ -56,7 +56,7 @@ def test_a_second_has_its_least_its_greatest_and_its_count(monkeypatch: pytest.M
 
 
 def test_the_last_minute_is_fine_and_what_is_older_is_not() -> None:
-    past = Past()
+    past = History()
     ramp(past, NOW - 100, 100, rate=1000.0)
     fine = past.of(NODE, 1, NOW - 2, NOW, points=3600)
     assert fine["bin"] == pytest.approx(0.01)
@@ -70,7 +70,7 @@ def test_the_last_minute_is_fine_and_what_is_older_is_not() -> None:
 
 
 def test_gaps_invalid_and_lost_samples_are_told_apart() -> None:
-    past = Past()
+    past = History()
     past.block(block(NOW - 8, [[1.0, 5.0]] * 100, index=0))
     past.block(block(NOW - 5, [[1.0, 5.0]] * 100, index=300, valid=[[False, True]] * 100))  # 200 were lost before it
     past.block(block(NOW - 4, [[1.0, 5.0]] * 100, index=0, run=1))  # begun anew: nothing was lost
@@ -89,7 +89,7 @@ def test_gaps_invalid_and_lost_samples_are_told_apart() -> None:
 
 
 def test_a_clock_that_is_set_back_writes_that_time_anew_and_one_set_forward_leaves_a_gap() -> None:
-    past = Past()
+    past = History()
     ramp(past, NOW - 300, 100)
     past.block(block(NOW - 250, [[7.0]] * 100, run=1))  # put back by 150 s
     said = past.of(NODE, 1, NOW - 3000, NOW, points=3600)
@@ -107,7 +107,7 @@ def test_a_clock_that_is_set_back_writes_that_time_anew_and_one_set_forward_leav
 
 
 def test_samples_that_come_a_little_late_belong_where_they_are_dated() -> None:
-    past = Past()
+    past = History()
     ramp(past, NOW - 10, 5)
     past.block(block(NOW - 6.5, [[-1.0]], index=500))
     said = past.of(NODE, 1, NOW - 3000, NOW, points=3600)
@@ -115,7 +115,7 @@ def test_samples_that_come_a_little_late_belong_where_they_are_dated() -> None:
 
 
 def test_the_ring_of_an_hour_forgets_what_is_older() -> None:
-    past = Past()
+    past = History()
     for minute in range(70):
         past.block(block(NOW + 60 * minute, [[float(minute)]]))
     said = past.of(NODE, 1, NOW, NOW + 4200, points=3600)
@@ -123,7 +123,7 @@ def test_the_ring_of_an_hour_forgets_what_is_older() -> None:
 
 
 def test_a_channel_takes_less_than_a_hundred_thousand_octets() -> None:
-    past = Past()
+    past = History()
     ramp(past, NOW - 70, 70)
     past.of(NODE, 1)
     channel = past._channels[NODE, 1]

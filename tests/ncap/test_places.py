@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.web import app
-from teds_provision.ncap.web.app import MOST_LISTENERS, OF_ONE_TOKEN, Places
+from teds_provision.ncap.web.app import MOST_LISTENERS, OF_ONE_TOKEN, LiveSlots
 from teds_provision.ncap.web.tokens import Tokens, digest_of
 from teds_provision.store import StoreLock
 from tests.ncap.service import Service
@@ -25,14 +25,14 @@ from tests.pace import PATIENCE, until
 
 
 def test_one_token_never_takes_all_places() -> None:
-    places = Places()
+    places = LiveSlots()
     assert sum(places.take("greedy", lambda: None) for _ in range(3 * MOST_LISTENERS)) == OF_ONE_TOKEN
     assert OF_ONE_TOKEN < MOST_LISTENERS
     assert places.take("other", lambda: None)
 
 
 def test_where_all_are_taken_the_one_that_has_most_gives_its_newest_up() -> None:
-    places, left = Places(most=6, of_one=3), list[str]()
+    places, left = LiveSlots(most=6, of_one=3), list[str]()
 
     def leaves(name: str) -> Any:
         return lambda: left.append(name)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError
-from teds_provision.ncap.nodes.desk import Errand
+from teds_provision.ncap.nodes.node_jobs import NodeJob
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk
 from tests.ncap.service import Service, verdict
@@ -113,7 +113,7 @@ def test_whoever_waits_for_an_errand_learns_of_any_failure(error: Exception, cod
     def work(_node: Any) -> None:
         raise error
 
-    errand = Errand("ab" * 10, "provision", work, 0.0)
+    errand = NodeJob("ab" * 10, "provision", work, 0.0)
     with pytest.raises(type(error)):
         errand.run(node)
     assert errand.done.is_set()

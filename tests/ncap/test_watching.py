@@ -13,11 +13,11 @@ import pytest
 
 from teds_provision.errors import LinkError
 from teds_provision.measure.blocks import NodeReport
-from teds_provision.ncap.measuring import Measuring, Running
-from teds_provision.ncap.nodes import watching
-from teds_provision.ncap.nodes.desk import Turns
+from teds_provision.ncap.measurement_supervisor import MeasurementSupervisor, RunningMeasurement
+from teds_provision.ncap.nodes import link_watch
 from teds_provision.ncap.nodes.directory import MOST_GONE, NodeDirectory
-from teds_provision.ncap.nodes.watching import MOST_KNOWN, Watch
+from teds_provision.ncap.nodes.link_watch import MOST_KNOWN, LinkWatch
+from teds_provision.ncap.nodes.node_jobs import NodeLocks
 from tests.pace import until
 
 
@@ -40,17 +40,17 @@ def sighting(number: int) -> Any:
 
 
 @pytest.fixture
-def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+def watch(monkeypatch: pytest.MonkeyPatch) -> LinkWatch:
     nothing: Any = None
     silence: Any = Silence()
-    monkeypatch.setattr(watching, "is_listed", lambda _station, _uuid: False)
+    monkeypatch.setattr(link_watch, "is_listed", lambda _station, _uuid: False)
     roster = NodeDirectory(nothing, silence)
     monkeypatch.setattr(roster, "refresh", lambda _uuids=None: None)
-    return Watch("can:x", nothing, roster, silence, Turns(), nothing, lambda: True, nothing)
+    return LinkWatch("can:x", nothing, roster, silence, NodeLocks(), nothing, lambda: True, nothing)
 
 
 @pytest.fixture
-def reader(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> Iterator[Watch]:
+def reader(watch: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> Iterator[LinkWatch]:
     """A watch on a reader that runs; ``open_place`` is to be given before it starts."""
     watch.place = "nfc:x"
     monkeypatch.setattr(watch._roster, "forget_place", lambda _place: None)
@@ -72,11 +72,11 @@ class Reader:
         self.closed = True
 
 
-def present(watch: Watch) -> int:
+def present(watch: LinkWatch) -> int:
     return watch._roster.present(watch.place)
 
 
-def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch: Watch) -> None:
+def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch: LinkWatch) -> None:
     """What was known was forgotten at POST /discover, so nobody ever saw that it did not answer."""
     looked: list[str] = []
     watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
@@ -94,7 +94,7 @@ def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch
     assert watch._roster.seen(stays.uuid.hex()).present
 
 
-def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that were being looked at when others came in their place stayed present for ever: 1,127 of them."""
     count, most = 3 * MOST_KNOWN, 0
 
@@ -118,7 +118,9 @@ def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: Watch, monke
     assert len(watch._roster._seen) <= MOST_KNOWN + MOST_GONE + 3
 
 
-def test_what_was_looked_at_while_others_took_its_place_leaves(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_looked_at_while_others_took_its_place_leaves(
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one = sighting(7)
 
     def serve(contact: Any) -> None:
@@ -134,7 +136,7 @@ def test_what_was_looked_at_while_others_took_its_place_leaves(watch: Watch, mon
 
 @pytest.mark.parametrize("set_by", [-86_400.0, 86_400.0], ids=["back", "forward"])
 def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
-    watch: Watch, monkeypatch: pytest.MonkeyPatch, set_by: float
+    watch: LinkWatch, monkeypatch: pytest.MonkeyPatch, set_by: float
 ) -> None:
     looked: list[str] = []
     watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
@@ -145,12 +147,12 @@ def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
     watch.saw(sighting(3))
     assert len(looked) == 1, "not at once"
     now = time.time() + set_by
-    monkeypatch.setattr(watching.time, "time", lambda: now)
+    monkeypatch.setattr(link_watch.time, "time", lambda: now)
     watch.saw(sighting(3))
     assert len(looked) == 2
 
 
-def test_a_reader_is_lent_again_while_it_is_being_opened(reader: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_is_lent_again_while_it_is_being_opened(reader: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second command of a script waited ten seconds, and then met a reader that the station had not closed."""
     opened: list[Reader] = []
     first, second = object(), object()
@@ -162,7 +164,7 @@ def test_a_reader_is_lent_again_while_it_is_being_opened(reader: Watch, monkeypa
         opened.append(Reader())
         return opened[-1]
 
-    monkeypatch.setattr(watching, "open_place", open_place)
+    monkeypatch.setattr(link_watch, "open_place", open_place)
     reader.start()
     reader.borrow(first)
     reader.give_back(first)
@@ -172,29 +174,31 @@ def test_a_reader_is_lent_again_while_it_is_being_opened(reader: Watch, monkeypa
     reader.give_back(second)
 
 
-def test_a_reader_that_is_not_there_keeps_no_command_waiting(reader: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_that_is_not_there_keeps_no_command_waiting(
+    reader: LinkWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def open_place(*_words: Any) -> Reader:
         raise LinkError("No reader there.")
 
-    monkeypatch.setattr(watching, "open_place", open_place)
-    monkeypatch.setattr(watching, "FIRST_PAUSE", 20.0)
+    monkeypatch.setattr(link_watch, "open_place", open_place)
+    monkeypatch.setattr(link_watch, "FIRST_PAUSE", 20.0)
     reader.start()
     until(lambda: reader.state.state == "down")
     began = time.monotonic()
     for _ in range(3):
         assert reader.borrow(reader)
         reader.give_back(reader)
-    assert time.monotonic() - began < watching.LENDING / 2
+    assert time.monotonic() - began < link_watch.LENDING / 2
 
 
-def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(watch: Watch) -> None:
+def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(watch: LinkWatch) -> None:
     """Each reports once a second: an adopted node was measured, and shown with "Its datasheet is signed now"."""
     nothing: Any = None
     uuid, roster = "ab" * 10, watch._roster
-    measuring = Measuring(nothing, roster, watch._live, Turns(), nothing, nothing, nothing)
+    measuring = MeasurementSupervisor(nothing, roster, watch._live, NodeLocks(), nothing, nothing, nothing)
     newcomers: Any = object()
     left, has = (
-        Running(SimpleNamespace(id=name), uuids, newcomers)  # type: ignore[arg-type]
+        RunningMeasurement(SimpleNamespace(id=name), uuids, newcomers)  # type: ignore[arg-type]
         for name, uuids in (("unverified", ()), ("adopted", (uuid,)))
     )
     measuring._running = {"unverified": left, "adopted": has}

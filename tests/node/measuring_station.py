@@ -9,15 +9,15 @@ from pathlib import Path
 
 from teds_provision.errors import NodeRefusedError
 from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.bus_multiplexer import Listener
 from teds_provision.links.can.port import CanPort
-from teds_provision.links.can.shared import Listener
 from teds_provision.links.ports import Link
-from teds_provision.node import described
+from teds_provision.node import node_template
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
 from teds_provision.protocol.operation.can_frames import StreamAssembly, cut, data_address, trigger_identifier
-from teds_provision.protocol.operation.commands import Operate, OperationReply
-from teds_provision.protocol.operation.stream_commands import CLOCK, Clock, Subscribed
+from teds_provision.protocol.operation.commands import OperateCommand, OperationReply
+from teds_provision.protocol.operation.stream_commands import CLOCK, ClockReply, SubscribeReply
 from teds_provision.protocol.operation.subscription import Receiver, StreamMessage, StreamPlan, TickBounds
 from teds_provision.protocol.operation.timing import ClockSample
 from teds_provision.protocol.session import StationSession
@@ -28,7 +28,7 @@ KEY = bytes(range(16))
 
 def keyed_node(folder: Path, **order: object) -> FlashFile:
     """A node made from a datasheet that has a link key already; nothing is signed."""
-    made = described.create(folder, **order)  # type: ignore[arg-type]
+    made = node_template.create(folder, **order)  # type: ignore[arg-type]
     flash = made.load()
     made.commit(replace(flash, key=KEY, epoch=1))
     return made
@@ -59,7 +59,7 @@ class SealedLine:
         return self._plain(Command(0, 1, 2, b"\x80" + bytes(4))).payload[4:]
 
     def operate(self, channel: int = 0, *, lease: int = 10, dead_man: int | None = None) -> None:
-        self.send(Operate(channel, self.digest, lease, dead_man).command())
+        self.send(OperateCommand(channel, self.digest, lease, dead_man).command())
 
     def states(self) -> OperationReply:
         return OperationReply.decode(self.send(security_command(Function.OPERATION)))
@@ -80,14 +80,14 @@ class MeasuringStation(SealedLine):
 
     def read_clock(self) -> ClockSample:
         left = time.monotonic_ns()
-        reply = Clock.decode(self.send(CLOCK))
+        reply = ClockReply.decode(self.send(CLOCK))
         self.last_clock = reply
         return ClockSample(left, time.monotonic_ns(), reply)
 
     def now(self) -> TickBounds:
         return self.clock.tick(time.monotonic_ns())
 
-    def subscribe(self, plan: StreamPlan) -> tuple[Receiver, Subscribed]:
+    def subscribe(self, plan: StreamPlan) -> tuple[Receiver, SubscribeReply]:
         reply = plan.accept(self.send(plan.command()), self.now())
         return Receiver(plan, reply, self.session.message_key), reply
 

@@ -9,15 +9,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from teds_provision.node.can import seat
-from teds_provision.node.handler import Crew
+from teds_provision.node.can import endpoint
+from teds_provision.node.handler import WorkerPool
 from teds_provision.protocol.repetition import KEEP_SECONDS
 
 _SECONDS = 30.0
 
 
 def test_jobs_of_a_line_run_in_order_and_one_at_a_time() -> None:
-    crew = Crew(8)
+    crew = WorkerPool(8)
     turns, done, running, all_done = crew.turns(), [], threading.Semaphore(1), threading.Event()
 
     def job(number: int) -> Callable[[], None]:
@@ -38,7 +38,7 @@ def test_jobs_of_a_line_run_in_order_and_one_at_a_time() -> None:
 
 
 def test_lines_run_side_by_side_as_far_as_there_are_threads() -> None:
-    crew, most = Crew(4), 4
+    crew, most = WorkerPool(4), 4
     together = threading.Barrier(most)
     met = threading.Semaphore(0)
 
@@ -55,7 +55,7 @@ def test_lines_run_side_by_side_as_far_as_there_are_threads() -> None:
 
 
 def test_more_lines_than_threads_all_get_their_turn() -> None:
-    crew, lines = Crew(2), 20
+    crew, lines = WorkerPool(2), 20
     go, ran = threading.Event(), threading.Semaphore(0)
     threads: set[str] = set()
 
@@ -74,7 +74,7 @@ def test_more_lines_than_threads_all_get_their_turn() -> None:
 
 
 def test_a_job_that_fails_costs_no_thread_and_no_line(caplog: pytest.LogCaptureFixture) -> None:
-    crew, ran = Crew(1), threading.Event()
+    crew, ran = WorkerPool(1), threading.Event()
     turns = crew.turns()
     turns.put(lambda: {}[0])
     turns.put(ran.set)
@@ -84,7 +84,7 @@ def test_a_job_that_fails_costs_no_thread_and_no_line(caplog: pytest.LogCaptureF
 
 
 def test_the_end_waits_for_what_runs_and_drops_the_rest() -> None:
-    crew, began, go = Crew(1), threading.Event(), threading.Event()
+    crew, began, go = WorkerPool(1), threading.Event(), threading.Event()
     ended: list[str] = []
 
     def slow() -> None:
@@ -110,7 +110,7 @@ def test_the_end_waits_for_what_runs_and_drops_the_rest() -> None:
 def test_a_stored_reply_is_kept_from_its_end_however_long_the_command_ran(monkeypatch: pytest.MonkeyPatch) -> None:
     """A commit takes seconds: counted from the request's arrival the repetition of a slow one was run again."""
     now = [100.0]
-    monkeypatch.setattr(seat, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(endpoint, "time", SimpleNamespace(monotonic=lambda: now[0]))
     ran = []
 
     def slow(_link: str, frame: bytes, *, tapped: bool) -> bytes:
@@ -120,8 +120,8 @@ def test_a_stored_reply_is_kept_from_its_end_however_long_the_command_ran(monkey
 
     handler = SimpleNamespace(request=slow)
     node = SimpleNamespace(measuring=None, handler=handler, counts_as_tapped=lambda: False)
-    line = seat.StationLine(node, 0xF1, SimpleNamespace(put=lambda job: job()))  # type: ignore[arg-type]
-    request = seat.SeatRequest(bytes.fromhex("01 8010 0000".replace(" ", "")), fd=False, received=0)
+    line = endpoint.StationState(node, 0xF1, SimpleNamespace(put=lambda job: job()))  # type: ignore[arg-type]
+    request = endpoint.EndpointRequest(bytes.fromhex("01 8010 0000".replace(" ", "")), fd=False, received=0)
     first = line.answer(request)
     now[0] += 4  # its last frame is taken
     line.reply_left()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import BadDataError, NotFoundError, UsageError
-from teds_provision.node import described
+from teds_provision.node import node_template
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds import compose
 from teds_provision.teds.codec.model import AccessCode
@@ -38,7 +38,7 @@ def files(folder: Path, image: Image) -> dict[str, Path]:
 
 def test_every_format_makes_the_same_node(tmp_path: Path, image: Image) -> None:
     for form, path in files(tmp_path, image).items():
-        made = described.create(tmp_path / form / "node", teds=path)
+        made = node_template.create(tmp_path / form / "node", teds=path)
         assert (made.load().uuid, made.hardware, dict(made.load().blocks)) == (UUID, image.blocks, image.blocks), form
         assert not made.load().provisioned
 
@@ -46,13 +46,13 @@ def test_every_format_makes_the_same_node(tmp_path: Path, image: Image) -> None:
 def test_the_security_teds_of_a_file_is_left_out(tmp_path: Path, image: Image) -> None:
     path = tmp_path / "node.json"
     path.write_text(image.with_block(SECURITY, image.blocks[0, AccessCode.META]).to_json())
-    assert SECURITY not in described.create(tmp_path / "node", teds=path).load().blocks
+    assert SECURITY not in node_template.create(tmp_path / "node", teds=path).load().blocks
 
 
 def test_another_uuid_stands_in_its_meta_teds_too(tmp_path: Path, image: Image) -> None:
     path = tmp_path / "node.json"
     path.write_text(image.to_json())
-    made = described.create(tmp_path / "node", teds=path, uuid=OTHER)
+    made = node_template.create(tmp_path / "node", teds=path, uuid=OTHER)
     sheet = Sheet.of(Image(OTHER, made.hardware))
     assert (made.load().uuid, sheet.meta.uuid, sheet.errors) == (OTHER, OTHER, ())
 
@@ -62,14 +62,14 @@ def test_the_same_command_again_changes_nothing_and_another_is_refused(tmp_path:
     path.write_text(image.to_json())
     for order in ({"teds": path}, {"profile": "gripper"}, {}):
         folder = tmp_path / ("node" + "".join(order))
-        first = described.create(folder, **order).path.read_bytes()  # type: ignore[arg-type]
-        assert described.create(folder, **order).path.read_bytes() == first  # type: ignore[arg-type]
+        first = node_template.create(folder, **order).path.read_bytes()  # type: ignore[arg-type]
+        assert node_template.create(folder, **order).path.read_bytes() == first  # type: ignore[arg-type]
         with pytest.raises(UsageError, match="another node"):
-            described.create(folder, profile="limit-switch")
+            node_template.create(folder, profile="limit-switch")
 
 
 def test_a_profile_gives_its_channels_and_a_random_uuid(tmp_path: Path) -> None:
-    made = [described.create(tmp_path / name, profile="gripper", name=name) for name in ("left", "right")]
+    made = [node_template.create(tmp_path / name, profile="gripper", name=name) for name in ("left", "right")]
     assert made[0].load().uuid != made[1].load().uuid
     sheet = Sheet.of(Image(made[0].load().uuid, made[0].hardware))
     assert sheet.meta.name == "left"
@@ -86,23 +86,23 @@ def test_what_no_node_can_be_made_of_is_told(tmp_path: Path, image: Image) -> No
     ):
         path.write_text(Image(UUID, blocks).to_json())
         with pytest.raises(BadDataError, match=match):
-            described.create(tmp_path / "node", teds=path)
+            node_template.create(tmp_path / "node", teds=path)
     silent = compose(AccessCode.CHANNEL, {"ChanType": 0, "LowLimit": 0.0, "HiLimit": 1.0})
     path.write_text(Image(UUID, {(1, AccessCode.CHANNEL): silent}).to_json())
     with pytest.raises(BadDataError, match="how a sample of channel 1 is coded"):
-        described.create(tmp_path / "node", teds=path)
+        node_template.create(tmp_path / "node", teds=path)
     path.write_text("junk")
     with pytest.raises(BadDataError, match=r"node\.json"):
-        described.create(tmp_path / "node", teds=path)
+        node_template.create(tmp_path / "node", teds=path)
     with pytest.raises(NotFoundError):
-        described.create(tmp_path / "node", teds=tmp_path / "nothing")
+        node_template.create(tmp_path / "node", teds=tmp_path / "nothing")
     with pytest.raises(NotFoundError):
-        described.create(tmp_path / "node", profile="nothing")
+        node_template.create(tmp_path / "node", profile="nothing")
     assert not (tmp_path / "node").exists()
 
 
 def test_hardware_stays_when_the_datasheet_changes(tmp_path: Path) -> None:
-    made = described.create(tmp_path / "node", profile="gripper")
+    made = node_template.create(tmp_path / "node", profile="gripper")
     before = made.hardware
     made.commit(made.load().__class__(**{**made.load().__dict__, "blocks": {}}))
     assert FlashFile(tmp_path / "node").hardware == before

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import UsageError
-from teds_provision.node.nfc.server import ETU, Air, answer_seconds, command_seconds
+from teds_provision.node.nfc.server import ETU, AirTime, answer_seconds, command_seconds
 from teds_provision.node.nfc.tags import IsoDepTag, NdefApplication, Type2Memory, Type4Memory
 from tests.node.tag_talk import Handler
 from tests.pace import best_of
@@ -166,7 +166,7 @@ def test_frames_take_what_a_data_sheet_says() -> None:
 
 
 def test_a_paced_exchange_lasts_as_long_as_on_air() -> None:
-    air = Air()
+    air = AirTime()
 
     def ten() -> float:
         began = time.perf_counter()

@@ -19,11 +19,11 @@ from teds_provision.files import whole_file
 from teds_provision.node import flash_file
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import Delays, VirtualNode
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.flash import FlashError
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import StationSession
+from teds_provision.protocol.wire_agreement import StationAgreement
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 

@@ -25,15 +25,23 @@ from teds_provision.node.hardware.converter import Converter
 from teds_provision.node.sources import make_source
 from teds_provision.node.sources.base import Reading
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
-from teds_provision.protocol.operation.commands import ChannelState, Power, PowerFlag, Sampled, idle, sample, set_values
+from teds_provision.protocol.operation.commands import (
+    ChannelState,
+    PowerFlag,
+    PowerReply,
+    SampleReply,
+    idle,
+    sample,
+    set_values,
+)
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
 from teds_provision.protocol.operation.stream_commands import (
     WAITS,
     Action,
-    Driven,
+    DriveReply,
     StreamKind,
-    Subscribed,
+    SubscribeReply,
     decode_stopped,
     drive,
     stop,
@@ -127,7 +135,7 @@ def test_a_stream_brings_the_source_sample_for_sample(scene: Scene, form: str) -
         right(messages, reply)
         return receiver.counts.lost + receiver.counts.late + abs(messages[-1].counter - 11)
 
-    def right(messages: list[StreamMessage], reply: Subscribed) -> None:
+    def right(messages: list[StreamMessage], reply: SubscribeReply) -> None:
         for message in messages:
             assert message.valid
             assert message.tick == reply.start + message.index * 4 * MS
@@ -246,7 +254,7 @@ def test_drive_messages_move_an_actuator(scene: Scene) -> None:
     station = scene.station("gripper")
     station.operate(1, dead_man=10_000)
     layout = Layout((1,), (2,))
-    driver = Driver(layout, Driven.decode(station.send(drive([1]))), station.session.message_key, dead_man=10_000)
+    driver = Driver(layout, DriveReply.decode(station.send(drive([1]))), station.session.message_key, dead_man=10_000)
     for raw in (100, 200, 300):  # each within its time, which is the dead-man's
         station.drive(driver.seal((raw.to_bytes(2, "big"),), station.now()))
         time.sleep(0.08)
@@ -298,7 +306,7 @@ def test_a_simulation_brings_its_own_time_and_its_end_is_survived(scene: Scene, 
     station.operate()
     station.read_clock()
     assert wait_for(lambda: station.read_clock() and station.last_clock.step >= 19 * MS)
-    sampled = Sampled.decode(station.send(sample([1])), 2)
+    sampled = SampleReply.decode(station.send(sample([1])), 2)
     assert sampled.valid
     degrees = converter.value(sampled.data)
     assert degrees is not None
@@ -310,7 +318,7 @@ def test_a_simulation_brings_its_own_time_and_its_end_is_survived(scene: Scene, 
     pid = next(iter(_children(process.process.pid)))
     os.kill(pid, signal.SIGTERM)
     process.wait_for("all values are invalid")
-    assert not Sampled.decode(station.send(sample([1])), 2).valid
+    assert not SampleReply.decode(station.send(sample([1])), 2).valid
 
 
 def _children(pid: int) -> list[int]:
@@ -320,7 +328,7 @@ def _children(pid: int) -> list[int]:
 def test_a_battery_tells_its_level_and_too_low_does_not_measure(scene: Scene) -> None:
     scene.run("angle", "--battery", "3")
     station = scene.station("angle")
-    power = Power.decode(station.send(security_command(Function.POWER)))
+    power = PowerReply.decode(station.send(security_command(Function.POWER)))
     assert power.level == 3
     with pytest.raises(NodeRefusedError) as refused:
         station.operate()
@@ -337,8 +345,8 @@ def test_values_on_demand_over_nfc_and_a_battery_that_the_field_charges(scene: S
         contact = port.find(lambda identity: True, seconds=20, notice=lambda told: None)
         line = SealedLine(contact.link, contact.identity.uuid)
         line.operate()
-        assert Sampled.decode(line.send(sample([1])), 2).valid
-        power = Power.decode(line.send(security_command(Function.POWER)))
+        assert SampleReply.decode(line.send(sample([1])), 2).valid
+        power = PowerReply.decode(line.send(security_command(Function.POWER)))
         assert power.flags & PowerFlag.CHARGING
         assert power.current is not None
         assert power.current > 0

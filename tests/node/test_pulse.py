@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from teds_provision.node.pulse import Pulse
+from teds_provision.node.realtime_loop import RealtimeLoop
 
 
 class Node:
@@ -20,7 +20,7 @@ class Node:
 
 
 def test_nodes_are_called_when_they_want_to_be() -> None:
-    pulse = Pulse()
+    pulse = RealtimeLoop()
     quick, slow = Node(lambda n: 0.01), Node(lambda n: 0.05 if n < 3 else None)
     began = time.monotonic()
     for node in (quick, slow):
@@ -39,7 +39,7 @@ def test_nodes_are_called_when_they_want_to_be() -> None:
 
 
 def test_a_node_that_rests_is_woken_and_a_faulty_one_harms_none() -> None:
-    pulse, resting = Pulse(), Node(lambda n: None)
+    pulse, resting = RealtimeLoop(), Node(lambda n: None)
 
     def fails(n: int) -> float | None:
         raise ValueError
@@ -59,7 +59,7 @@ def test_a_node_that_rests_is_woken_and_a_faulty_one_harms_none() -> None:
 
 
 def test_a_wake_during_a_beat_is_not_lost() -> None:
-    pulse = Pulse()
+    pulse = RealtimeLoop()
     again = threading.Event()
 
     class Waking(Node):

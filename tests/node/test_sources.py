@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadDataError, NoReaderError, NotFoundError, TedsProvisionError, UsageError
 from teds_provision.node.sources import SOURCES, make_source
-from teds_provision.node.sources.base import Place, Reading
-from teds_provision.node.sources.lines import Lines, StandardInput
+from teds_provision.node.sources.base import Reading, SourceChannel
+from teds_provision.node.sources.lines import LineSource, StandardInput
 
-ANGLE, FORCE = Place(1, "angle", -180.0, 180.0), Place(2, "force", 0.0, 5.0)
-PLACES = (ANGLE, FORCE, Place(3, "bare"))
+ANGLE, FORCE = SourceChannel(1, "angle", -180.0, 180.0), SourceChannel(2, "force", 0.0, 5.0)
+PLACES = (ANGLE, FORCE, SourceChannel(3, "bare"))
 
 
 class Clock:
@@ -125,8 +125,8 @@ def test_a_bad_file_is_told_with_its_line(tmp_path: Path, text: str, place: str)
         make_source(f"file:{path}", PLACES, print)
 
 
-def lines(told: list[str], *, needs_time: bool = True) -> tuple[Lines, Clock]:
-    source, clock = Lines(PLACES, told.append, needs_time=needs_time), Clock()
+def lines(told: list[str], *, needs_time: bool = True) -> tuple[LineSource, Clock]:
+    source, clock = LineSource(PLACES, told.append, needs_time=needs_time), Clock()
     source.begin(clock)
     return source, clock
 

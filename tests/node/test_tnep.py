@@ -15,7 +15,7 @@ from teds_provision.links.nfc.poller import Poller
 from teds_provision.node.nfc import tnep as charging
 from teds_provision.node.nfc.tags import Type4Memory
 from teds_provision.node.nfc.tnep import TnepTag
-from teds_provision.protocol.operation.commands import Power, PowerFlag
+from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from tests.node.tag_talk import Handler, request, select
 
 
@@ -152,14 +152,14 @@ def test_no_message_is_longer_than_announced(frame: bytes, max_ndef: int) -> Non
 
 @pytest.mark.parametrize("max_ndef", [300, 499])
 def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(max_ndef: int) -> None:
-    power = [Power(PowerFlag.BATTERY, 80)]
+    power = [PowerReply(PowerFlag.BATTERY, 80)]
     tag = Type4Memory(max_ndef)
     node = TnepTag(
         tag,
         Handler(),
         wt_int=4,
         n_wait=15,
-        extras=charging.Extras(
+        extras=charging.ExtraRecords(
             before=lambda: charging.charge_records(power[0]),
             after=lambda: (charging.out_of_band_record(bytes.fromhex("C1D857000101"), random=True),),
         ),
@@ -171,7 +171,7 @@ def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(
         assert records[1].payload == b"\x01\x50"
         assert records[-1].payload.hex() == "081b0101005" + "7d8c101021c00"  # the octets of a real record
         assert tnep.our_service(records) is not None
-        power[0] = Power(PowerFlag.BATTERY | PowerFlag.FULL, 100)
+        power[0] = PowerReply(PowerFlag.BATTERY | PowerFlag.FULL, 100)
         node.activated()
         assert node.ready(5)
         renewed = message.decode(Mailbox(tag).read())

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from teds_provision import plant
-from teds_provision.plant import leaving
-from teds_provision.plant.files import FilesPost
+from teds_provision.plant import removed_members
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.station.station import Station
 from teds_provision.store import WhitelistEntry
 from teds_provision.store.tables.plant import Alarm
@@ -33,16 +33,16 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         plant.owner.create(north, "plant Augsburg")
         south = certified(fresh.folder / "south", "south", north)
         signed = plant.owner.signed(north, plant.owner.add(north, request_of(south), frozenset({"keeper", "base"})))
-        plant.folding.put_roster(north, signed)
+        plant.apply_pages.put_roster(north, signed)
         plant.owner.join(south, signed, url=None, told=[])
         south.pins.put(WhitelistEntry(NODE, "cd" * 32, assurance="tap"))
         north.pins.put(WhitelistEntry(NODE, "ab" * 32, assurance="tap"))
         with north.transaction():
             north.plant.tell("agreed", NODE, fingerprint="ab" * 32, epoch=2, key_id="0123456789abcdef")
         for station in (south, north):
-            plant.sync.sync(station, FilesPost(stick))
+            plant.sync.sync(station, FolderTransport(stick))
         plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", told=[])
-        north.keys.demand_rotation(bytes(10), f"{leaving.WHY}west (lost) has held this key")
+        north.keys.demand_rotation(bytes(10), f"{removed_members.WHY}west (lost) has held this key")
         north.plant.tables.put_alarm(
             Alarm("rolled-back", south.fingerprint, 3, "page 3 was there, and now 1 is the last")
         )

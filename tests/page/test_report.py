@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import NodeSilentError
 from teds_provision.station.station import Station
-from teds_provision.steps.batch_sheet import About, BoardResult, Progress, read_sheet, write_report
+from teds_provision.steps.batch_sheet import BoardResult, Progress, ReportHead, read_sheet, write_report
 from teds_provision.steps.build import BuildOrder
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def test_it_fits_a4_and_tears_no_word_apart(browser: Browser, station: Station, 
             "Node 8d4d did not answer on udp_multicast:239.74.163.2?port=43113 within 3 s.", hint="x" * 80
         )
         progress.note(row, BoardResult(uuid, 4.2, error=why if number == 2 else None, row=number))
-    about = About("bench north", "ab12cd34" * 8, "Ada Lovelace", "teds-provision 0.2.0, Python 3.11.7")
+    about = ReportHead("bench north", "ab12cd34" * 8, "Ada Lovelace", "teds-provision 0.2.0, Python 3.11.7")
     write_report(tmp_path / "day.html", progress, about)
     page = browser.new_page(viewport={"width": A4_LYING, "height": 700})
     try:

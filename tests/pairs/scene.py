@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from teds_provision.node.described import create
+from teds_provision.node.node_template import create
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.station.station import initialise
 from teds_provision.vault.passphrase import THROWAWAY

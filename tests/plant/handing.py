@@ -10,12 +10,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from teds_provision.handover import trust
-from teds_provision.plant.post import Carried, Parcel
+from teds_provision.plant.transport import CarriedPage, Parcel
 from teds_provision.protocol.keys import PrivateKey, node_key_message, station_key_message
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import Own, View, view
-from teds_provision.protocol.plant.roster import Member, Removed, Roster, Share, open_roster, seal_roster
+from teds_provision.protocol.plant.fold import LocalState, MergedClaims, view
+from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share, open_roster, seal_roster
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
@@ -51,7 +51,7 @@ class MemoryPost:
     def heads(self) -> Mapping[str, int]:
         return {}
 
-    def pages(self, station: str, after: int) -> Iterator[Carried]:
+    def pages(self, station: str, after: int) -> Iterator[CarriedPage]:
         return iter(())
 
     def append(self, station: str, n: int, previous: str, hash: str, octets: bytes) -> None:
@@ -137,7 +137,8 @@ class Plant:
                 for name, words in roles.items()
             ),
             removed=tuple(
-                Removed(name, self[name].point, frozenset({"base"}), "stolen", last) for name, last in removed.items()
+                RemovedMember(name, self[name].point, frozenset({"base"}), "stolen", last)
+                for name, last in removed.items()
             ),
             share=share,
         )
@@ -167,7 +168,7 @@ class Plant:
     def views(self, name: str):  # type: ignore[no-untyped-def]
         """What a station knows of nodes: every event that anybody told who is not ``deaf``."""
 
-        def see(uuid: bytes) -> View:
+        def see(uuid: bytes) -> MergedClaims:
             claims: dict[str, Claim] = {}
             for each, station in self.stations.items():
                 if each in self.deaf and each != name:
@@ -178,7 +179,7 @@ class Plant:
                         claims.setdefault(station.fingerprint, Claim()).take(told)
             own = self[name]
             pin = own.pins.pinned(uuid)
-            return view(self.roster_, claims, Own(own.fingerprint, pin, "tap" if pin else "", bool(pin)))
+            return view(self.roster_, claims, LocalState(own.fingerprint, pin, "tap" if pin else "", bool(pin)))
 
         return lambda uuids: {uuid: see(uuid) for uuid in uuids}
 

@@ -11,12 +11,12 @@ from typing import Any
 from teds_provision.protocol.handover.revocation import open_revocation
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.plant import event
-from teds_provision.protocol.plant.chain import Counting, counting
+from teds_provision.protocol.plant.chain import CountedPages, counting
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import Own, Statement, View, view
+from teds_provision.protocol.plant.fold import BanStatement, LocalState, MergedClaims, view
 from teds_provision.protocol.plant.page import Page, PageDraft, open_page, seal_page
-from teds_provision.protocol.plant.roster import Member, Place, Removed, Roster, open_roster, seal_roster
-from teds_provision.protocol.plant.signer import Signing, Word, signing
+from teds_provision.protocol.plant.roster import Member, Place, RemovedMember, Roster, open_roster, seal_roster
+from teds_provision.protocol.plant.signer import SignatureClaim, SignerVerdict, signing
 
 REGISTRY = "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"
 NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -73,7 +73,7 @@ def roster_of(
         REGISTRY, "plant", version, "" if version == 1 else "ab" * 32, NOW, NOW + timedelta(days=90),
         tuple(Member(one.name, one.key.point, certificate(one.key), one.roles, signed.get(one.name))
               for one in members),
-        tuple(Removed(one.name, one.key.point, one.roles, "stolen", last, signed.get(one.name))
+        tuple(RemovedMember(one.name, one.key.point, one.roles, "stolen", last, signed.get(one.name))
               for one, last in removed),
     )  # fmt: skip
     return open_roster(seal_roster(draft, CA), CA.point)
@@ -88,10 +88,10 @@ class Reader:
         for octets in pages:
             page = open_page(octets, REGISTRY, roster.point_of)
             self.pages.setdefault(page.station, {})[page.n, page.hash] = page
-        self.counting: dict[str, Counting] = {}
+        self.counting: dict[str, CountedPages] = {}
         self.claims: dict[bytes, dict[str, Claim]] = {}
-        self.words: dict[str, list[Word]] = {}
-        self.statements: dict[bytes, list[Statement]] = {}
+        self.words: dict[str, list[SignatureClaim]] = {}
+        self.statements: dict[bytes, list[BanStatement]] = {}
         self.liftings: dict[str, set[str]] = {}
         for station, there in sorted(self.pages.items()):
             self._fold(station, there, accepted.get(station))
@@ -112,25 +112,25 @@ class Reader:
             for one in map(event.read, page.events):
                 if isinstance(one, event.Event) and one.act == "revoked" and one.uuid is not None:
                     said = open_revocation(one.members["statement"], self.roster.point_of)
-                    held = Statement(event.hash_of_statement(said.statement), station, place in counts.pages, said)
+                    held = BanStatement(event.hash_of_statement(said.statement), station, place in counts.pages, said)
                     if held not in self.statements.setdefault(one.uuid, []):
                         self.statements[one.uuid].append(held)
 
     def _take(self, station: str, place: Place, one: event.Event) -> None:
         if one.act in ("signed", "vouched"):
-            word = Word(station, place[0], one.act == "vouched")
+            word = SignatureClaim(station, place[0], one.act == "vouched")
             self.words.setdefault(one.members["teds_sha256"], []).append(word)
         elif one.act == "lifted":
             self.liftings.setdefault(one.members["of"], set()).add(station)
         elif one.uuid is not None:
             self.claims.setdefault(one.uuid, {}).setdefault(station, Claim()).take(one)
 
-    def view(self, uuid: bytes, own: Own | None = None) -> View:
-        own = own or Own("f" * 64)
+    def view(self, uuid: bytes, own: LocalState | None = None) -> MergedClaims:
+        own = own or LocalState("f" * 64)
         claims, said = self.claims.get(uuid, {}), self.statements.get(uuid, [])
         return view(self.roster, claims, own, said, self.liftings)
 
-    def signing(self, signer: str, digest: str) -> Signing:
+    def signing(self, signer: str, digest: str) -> SignerVerdict:
         behind = any(
             place[0] > self.counted(about)
             for station, pages in self.pages.items()

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from teds_provision import plant
 from teds_provision.handover import trust
-from teds_provision.plant.files import FilesPost
-from teds_provision.plant.sync import Synced, sync
+from teds_provision.plant.folder_transport import FolderTransport
+from teds_provision.plant.sync import SyncResult, sync
 from teds_provision.protocol.plant.document import MemberRequest
 from teds_provision.protocol.plant.roster import Role, Roster
 from teds_provision.station.station import Station, initialise
@@ -60,10 +60,10 @@ class Plant:
 
     def change(self, draft: Roster) -> None:
         """The owner signs a version, which counts for him at once."""
-        plant.folding.put_roster(self.north, plant.owner.signed(self.north, draft))
+        plant.apply_pages.put_roster(self.north, plant.owner.signed(self.north, draft))
 
-    def sync(self, station: Station, stick: Path | None = None) -> Synced:
-        return sync(station, FilesPost(stick or self.stick))
+    def sync(self, station: Station, stick: Path | None = None) -> SyncResult:
+        return sync(station, FolderTransport(stick or self.stick))
 
     def round(self) -> None:
         """Everybody syncs, twice: what the last one said reaches the first."""

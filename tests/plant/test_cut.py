@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision import files
-from teds_provision.plant.files import FilesPost
-from teds_provision.plant.folding import heads_digest, views
+from teds_provision.plant.apply_pages import heads_digest, views
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import sync
 from teds_provision.station.station import Station
 from teds_provision.store import WhitelistEntry
@@ -72,7 +72,7 @@ def killed_at(folder: Path, step: int, home: str, before: Callable[[Station], No
         try:
             station = Station.open(folder / home, ask=ask)
             before(station)
-            sync(station, FilesPost(folder / "stick"))
+            sync(station, FolderTransport(folder / "stick"))
             station.close()
         finally:
             os._exit(0)
@@ -83,7 +83,7 @@ def carried_on(folder: Path) -> list[object]:
     """What everybody knows once each has synced again, twice."""
     for home in ("west", "north") * 3:
         station = Station.open(folder / home, ask=ask)
-        sync(station, FilesPost(folder / "stick"))
+        sync(station, FolderTransport(folder / "stick"))
         station.close()
     seen: list[object] = []
     for home in ("west", "north"):

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.demo import cluster, plant
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 
 
 @pytest.mark.link
@@ -17,7 +17,7 @@ def test_three_stations_share_a_key_and_refuse_what_the_stolen_one_signs(
     if not driver:
         monkeypatch.setattr(plant, "find_spec", lambda _name: None)
     said: list[str] = []
-    done = plant.run_plant_demo(Silent(), said.append)
+    done = plant.run_plant_demo(SilentReporter(), said.append)
     assert (done.by, done.before, done.after) == ("postgresql" if driver else "files", "authentic", "not authentic")
     assert ("No psycopg (the extra registry) is installed here" in said[0]) == (not driver)
     assert all(step.result != "failed" for step in done.steps)

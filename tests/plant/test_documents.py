@@ -14,7 +14,7 @@ from teds_provision.protocol.handover.strict_json import decode_base64url
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
 from teds_provision.protocol.plant import document, event, page, roster
 from teds_provision.protocol.plant.document import DocumentKind, NewerFormatError, hash_of
-from teds_provision.protocol.plant.roster import Member, Removed, Roster, open_roster, seal_roster, taking
+from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, open_roster, seal_roster, taking
 
 KAT: dict[str, Any] = json.loads((Path(__file__).parent.parent / "vectors/profile/plant_kat.json").read_text())
 KEYS = {name: SoftwareKey(int(key["d"], 16)) for name, key in KAT["keys"].items()}
@@ -148,8 +148,8 @@ def a_roster(version: int, members: tuple[Member, ...], previous: str = "", **mo
     return open_roster(seal_roster(draft, CA), CA.point)
 
 
-def left(member: Member) -> Removed:
-    return Removed(member.name, member.point, member.roles, "lost", (0, ""))
+def left(member: Member) -> RemovedMember:
+    return RemovedMember(member.name, member.point, member.roles, "lost", (0, ""))
 
 
 NORTH, WEST = a_member("north", "keeper"), a_member("west", "line", "sign")

@@ -14,7 +14,7 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint, reset_message
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import Own
+from teds_provision.protocol.plant.fold import LocalState
 from teds_provision.protocol.plant.roster import Place, open_roster
 from tests.plant.plants import NODES, NOW, Reader, Speaker, roster_of, shuffled, speaker
 from tests.plant.test_documents import CA, KAT, octets_of
@@ -178,7 +178,7 @@ def test_the_order_in_which_pages_arrive_changes_no_view(seed: int) -> None:
         for again in range(4):
             other = Reader(roster, shuffled(pages, again))
             for uuid in NODES:
-                for own in (Own("f" * 64), Own("f" * 64, pin=PIN, met=True)):
+                for own in (LocalState("f" * 64), LocalState("f" * 64, pin=PIN, met=True)):
                     assert other.view(uuid, own) == first.view(uuid, own)
             for one in speakers:
                 for digest in (DIGEST, DIGEST2):
@@ -241,7 +241,7 @@ def test_keepers_pin_for_everybody_while_they_agree(four: list[Speaker]) -> None
 
 def test_a_pin_here_that_differs_from_the_keepers_stays_and_is_told(four: list[Speaker]) -> None:
     four[0].page(pinned(four[0], PIN))
-    seen = Reader(roster_of(four), pages_of(four)).view(A, Own("f" * 64, pin=OTHER, assurance="tap", met=True))
+    seen = Reader(roster_of(four), pages_of(four)).view(A, LocalState("f" * 64, pin=OTHER, assurance="tap", met=True))
     assert (list(seen.conflicts), seen.key_it) == (["other pin"], True)
 
 
@@ -252,11 +252,11 @@ def test_two_keys_hold_back_who_has_not_met_the_node_and_nobody_else(four: list[
     reader = Reader(roster_of(four), pages_of(four))
     assert list(reader.view(A).conflicts) == ["two keys"]
     assert not reader.view(A).key_it
-    assert reader.view(A, Own("f" * 64, pin=PIN, met=True)).key_it
-    assert not reader.view(A, Own("f" * 64, pin=PIN, met=True)).conflicts
-    assert reader.view(A, Own("f" * 64, holds=True)).key_it
-    assert reader.view(A, Own("f" * 64, pin=PIN, assurance="uuid")).key_it
-    assert not reader.view(A, Own("f" * 64, pin=PIN, assurance="registry")).key_it
+    assert reader.view(A, LocalState("f" * 64, pin=PIN, met=True)).key_it
+    assert not reader.view(A, LocalState("f" * 64, pin=PIN, met=True)).conflicts
+    assert reader.view(A, LocalState("f" * 64, holds=True)).key_it
+    assert reader.view(A, LocalState("f" * 64, pin=PIN, assurance="uuid")).key_it
+    assert not reader.view(A, LocalState("f" * 64, pin=PIN, assurance="registry")).key_it
 
 
 def test_the_highest_epoch_is_the_holder_and_two_keys_of_it_are_told(four: list[Speaker]) -> None:
@@ -283,8 +283,8 @@ def test_a_move_that_was_not_undone_ends_a_holder_and_a_reset_ends_all(four: lis
     base.page(base.event("reset", A, epoch=1, challenge=challenge.hex(), proof=proof, point=NODE.point.hex()))
     reader = Reader(roster_of(four), pages_of(four))
     assert set(reader.view(A).held) == {line.fingerprint}, "nobody pins this key: the reset counts nowhere"
-    assert not reader.view(A, Own("f" * 64, pin=PIN)).held
-    assert set(reader.view(A, Own("f" * 64, pin=OTHER)).held) == {line.fingerprint}
+    assert not reader.view(A, LocalState("f" * 64, pin=PIN)).held
+    assert set(reader.view(A, LocalState("f" * 64, pin=OTHER)).held) == {line.fingerprint}
     keep.page(pinned(keep, PIN))
     assert not Reader(roster_of(four), pages_of(four)).view(A).held
 
@@ -334,8 +334,8 @@ def test_no_liar_without_a_key_bans_unsigns_or_unpins_a_node(roles: str, four: l
     told = [] if roles == "stranger" else liar.pages
     honest, lied = Reader(roster, pages_of(four)), Reader(roster, [*pages_of(four), *told])
     for own in (
-        Own("f" * 64),
-        Own(base.fingerprint, pin=PIN, met=True, holds=True, holders=frozenset({line.fingerprint})),
+        LocalState("f" * 64),
+        LocalState(base.fingerprint, pin=PIN, met=True, holds=True, holders=frozenset({line.fingerprint})),
     ):
         before, after = honest.view(A, own), lied.view(A, own)
         assert (after.pin, after.bans, after.key_it) == (before.pin, before.bans, True)
@@ -355,16 +355,18 @@ def test_a_ban_counts_from_a_keeper_and_from_who_has_the_key(four: list[Speaker]
     statement = seal_revocation(line.key, uuid=A, node=PIN, why="lost", created=NOW)
     line.page(line.event("revoked", A, statement=statement.statement))
     reader = Reader(roster_of(four), pages_of(four))
-    assert not reader.view(A, Own("f" * 64)).bans
-    assert reader.view(A, Own("f" * 64, holders=frozenset({line.fingerprint}))).bans
-    assert not reader.view(A, Own("f" * 64, pin=OTHER, holders=frozenset({line.fingerprint}))).bans, "another board"
+    assert not reader.view(A, LocalState("f" * 64)).bans
+    assert reader.view(A, LocalState("f" * 64, holders=frozenset({line.fingerprint}))).bans
+    assert not reader.view(A, LocalState("f" * 64, pin=OTHER, holders=frozenset({line.fingerprint}))).bans, (
+        "another board"
+    )
     theirs = seal_revocation(keep.key, uuid=A, node=PIN, why="lost", created=NOW)
     base.page(base.event("revoked", A, statement=theirs.statement))  # carried by somebody else
     assert Reader(roster_of(four), pages_of(four)).view(A).bans
     keep.page(keep.event("lifted", None, of=event.hash_of_statement(theirs.statement)))
     assert not Reader(roster_of(four), pages_of(four)).view(A).bans
     keep.page(keep.event("lifted", None, of=event.hash_of_statement(statement.statement)))
-    own = Own("f" * 64, holders=frozenset({line.fingerprint}))
+    own = LocalState("f" * 64, holders=frozenset({line.fingerprint}))
     assert not Reader(roster_of(four), pages_of(four)).view(A, own).bans, "a keeper lifts anybody's"
 
 

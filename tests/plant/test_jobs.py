@@ -25,21 +25,21 @@ from teds_provision.errors import (
 from teds_provision.plant import line as line_module
 from teds_provision.plant import owner as owning
 from teds_provision.plant import parcels
-from teds_provision.plant.asking import send_job
-from teds_provision.plant.files import FilesPost
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import digest_of_file, find_job, take_job, take_received
 from teds_provision.plant.line import LineRun, Scans
-from teds_provision.plant.verify_evidence import Grounds
+from teds_provision.plant.sign_requests import send_job
+from teds_provision.plant.verify_evidence import EvidenceAnchors
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, require_pattern, seal_job
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.build import BuildOrder, Prepared, prepare
-from teds_provision.steps.provision import Provisioned, inspect, provision
+from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
+from teds_provision.steps.provision import ProvisionResult, inspect, provision
 from teds_provision.store.tables.parcels import ParcelRow
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.profile.load import find_profile
 from tests.bench import Board, MemoryLink, make_station, talk
 
@@ -54,9 +54,9 @@ def owner(tmp_path: Path) -> Iterator[Station]:
     station.close()
 
 
-def build(line: LineRun, board: Board, link: MemoryLink | None = None) -> Provisioned:
+def build(line: LineRun, board: Board, link: MemoryLink | None = None) -> ProvisionResult:
     with talk(board, link) as node:
-        return provision(line.station, node, line.order, accept=lambda who: None, reporter=Silent(), line=line)
+        return provision(line.station, node, line.order, accept=lambda who: None, reporter=SilentReporter(), line=line)
 
 
 def line_of(owner: Station, calibrations: Path | None = None, **changes: Any) -> LineRun:
@@ -145,7 +145,7 @@ def test_a_job_that_comes_while_the_roster_has_expired_waits_for_the_renewed_one
     station.plant.parcels.put_parcel(row, job.octets)
     take_received(station)
     assert station.plant.line.jobs() == []
-    plant.folding.put_roster(station, roster_of(station, own, version=2, previous=expired.hash))
+    plant.apply_pages.put_roster(station, roster_of(station, own, version=2, previous=expired.hash))
     take_received(station)
     assert [one.id for one in station.plant.line.jobs()] == [job.id]
     assert parcels.received(station, "job") == []
@@ -176,7 +176,7 @@ def test_a_board_of_another_type_costs_no_unit(tmp_path: Path, owner: Station) -
     other, one = make_station(tmp_path / "other"), board(1)
     with talk(one) as node:
         order = BuildOrder(profile="tactile-finger-sensor")
-        provision(other, node, order, accept=lambda who: None, reporter=Silent())
+        provision(other, node, order, accept=lambda who: None, reporter=SilentReporter())
     line = line_of(owner)
     with pytest.raises(WrongBoardError):
         build(line, one)
@@ -226,7 +226,7 @@ def test_a_calibration_that_is_rewritten_while_it_is_read_is_not_used(
     listed = CalibrationRule("list", by_uuid={one.uuid: hashlib.sha256(file.read_bytes()).hexdigest()})
     line = line_of(owner, tmp_path, calibration=listed)
 
-    def rewritten(*given: Any, **more: Any) -> Prepared:
+    def rewritten(*given: Any, **more: Any) -> PreparedOrder:
         file.write_text(TABLE.replace("6.28", "6.27"))
         return prepare(*given, **more)
 
@@ -251,7 +251,7 @@ def test_evidence_names_the_calibration_that_was_read_whatever_lies_there_later(
         file.write_text(TABLE.replace("6.28", "6.27"))
 
     with talk(one) as node:
-        provision(owner, node, line.order, accept=rewrite, reporter=Silent(), line=line)
+        provision(owner, node, line.order, accept=rewrite, reporter=SilentReporter(), line=line)
     (row,) = owner.plant.line.evidence(uuid=one.uuid)
     assert codec.read(row.document).facts.calibration_sha256 == read
 
@@ -374,7 +374,7 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
     tester.unlock()
     for attempt in (1, 2):
         with talk(one) as node:
-            done = inspect(tester, node, tests, Silent())
+            done = inspect(tester, node, tests, SilentReporter())
         assert done.verified.verdict == "authentic"
         assert tests.unit_to_json(one.uuid)["attempt"] == attempt
     assert one.state == before
@@ -385,14 +385,14 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
     other = board(2)
     with talk(other) as node:
         order = BuildOrder(profile="tactile-finger-sensor")
-        provision(plant.north, node, order, accept=lambda who: None, reporter=Silent())
+        provision(plant.north, node, order, accept=lambda who: None, reporter=SilentReporter())
     with talk(other) as node, pytest.raises(WrongBoardError):
-        inspect(tester, node, tests, Silent())
+        inspect(tester, node, tests, SilentReporter())
     tampered = {**one.state.blocks, (0, 12): one.state.blocks[0, 12][:-3] + b"\0\0\0"}
     one.flash.state = replace(one.state, blocks=tampered)
     one.power_on()
     with talk(one) as node:
-        assert inspect(tester, node, tests, Silent()).verified.verdict == "not authentic"
+        assert inspect(tester, node, tests, SilentReporter()).verified.verdict == "not authentic"
     last = codec.read(list(tester.plant.line.evidence(uuid=one.uuid))[-1].document)
     assert (last.verdict, last.facts.failure) == ("failed", "not-authentic")
     assert codec.faults(last, plant.north.identity.ca) == []
@@ -434,9 +434,9 @@ def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path
 
     def faults() -> list[str]:
         assert plant.north.plant.roster is not None
-        return Grounds(plant.north.identity.ca, roster=plant.north.plant.roster).faults(document)
+        return EvidenceAnchors(plant.north.identity.ca, roster=plant.north.plant.roster).faults(document)
 
-    first = Grounds(plant.north.identity.ca, roster=plant.roster)
+    first = EvidenceAnchors(plant.north.identity.ca, roster=plant.roster)
     assert "its station is not in the roster" in first.faults(document)
     assert faults() == []
     plant.change(owning.with_roles(plant.north, "west", frozenset({"audit"}), (0, "")))
@@ -451,10 +451,10 @@ def test_a_job_is_sent_to_those_that_it_is_for(tmp_path: Path) -> None:
     west = plant.member("west", "line")
     told = {"registry": plant.roster.registry, "stations": {west.fingerprint: 3}}
     job = take_job(plant.north, job_of(plant.north, **told))
-    send_job(plant.north, FilesPost(plant.stick), job)
-    send_job(plant.north, FilesPost(plant.stick), job)
+    send_job(plant.north, FolderTransport(plant.stick), job)
+    send_job(plant.north, FolderTransport(plant.stick), job)
     plant.round()
     take_received(west)
     assert find_job(west, job.id[:8]).hash == job.hash
-    assert list(FilesPost(plant.stick).parcels(west.fingerprint)) == []
+    assert list(FolderTransport(plant.stick).parcels(west.fingerprint)) == []
     plant.close()

@@ -13,7 +13,7 @@ import pytest
 from teds_provision import plant
 from teds_provision.errors import KeyStolenError
 from teds_provision.measure.standing import NodeStanding
-from teds_provision.plant import leaving
+from teds_provision.plant import removed_members
 from teds_provision.protocol.plant.roster import Share, Why
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
@@ -50,7 +50,7 @@ class Scene:
         self.sync(self.north)
 
     def marks(self, station: Station) -> list[bytes]:
-        return [uuid for uuid, why in station.keys.rotations_due().items() if why.startswith(leaving.WHY)]
+        return [uuid for uuid, why in station.keys.rotations_due().items() if why.startswith(removed_members.WHY)]
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def later(station: Station, hours: float) -> None:
     """What a sync finds so many hours from now."""
     roster = station.plant.roster
     assert roster is not None
-    leaving.review(station, roster, datetime.now(UTC) + timedelta(hours=hours))
+    removed_members.review(station, roster, datetime.now(UTC) + timedelta(hours=hours))
 
 
 def test_who_made_a_key_that_a_thief_has_rotates_it_at_the_next_contact(scene: Scene) -> None:
@@ -73,7 +73,7 @@ def test_who_made_a_key_that_a_thief_has_rotates_it_at_the_next_contact(scene: S
     scene.sync(scene.north, scene.south, scene.north)
     scene.remove(scene.south, "stolen")
     assert scene.marks(scene.north) == [board.uuid]
-    assert leaving.due(scene.north) == 1
+    assert removed_members.due(scene.north) == 1
     before = scene.north.keys.of(board.uuid)[-1].epoch
     with talk(board) as node:
         session_if_keyed(scene.north, node)
@@ -102,7 +102,7 @@ def test_a_clock_that_was_ahead_does_not_keep_anybody_from_looking_again(scene: 
     scene.sync(scene.south)
     later(scene.south, 20_000)
     later(scene.south, 0)
-    review = leaving.last(scene.south)
+    review = removed_members.last(scene.south)
     assert review is not None
     assert abs(datetime.fromisoformat(review.at) - datetime.now(UTC)) < timedelta(minutes=5)
 
@@ -160,14 +160,14 @@ def test_what_only_the_lost_one_held_is_counted_as_a_tap(scene: Scene) -> None:
     board_of(scene.west, os.urandom(10))
     scene.sync(scene.west, scene.north)
     scene.remove(scene.west, "lost")
-    review = leaving.last(scene.north)
+    review = removed_members.last(scene.north)
     assert review is not None
-    assert (review.alone, leaving.due(scene.north)) == (1, 0)
+    assert (review.alone, removed_members.due(scene.north)) == (1, 0)
 
 
 def test_nobody_left_and_nothing_is_due(scene: Scene) -> None:
     scene.keyed_by(scene.west)
-    assert (leaving.last(scene.north), leaving.due(scene.west)) == (None, 0)
+    assert (removed_members.last(scene.north), removed_members.due(scene.west)) == (None, 0)
 
 
 @pytest.mark.parametrize(("why", "cut"), [("stolen", True), ("lost", False), ("retired", False)])

@@ -16,7 +16,7 @@ import pytest
 
 from teds_provision import files
 from teds_provision.errors import PolicyError, StoreError
-from teds_provision.plant.files import FilesPost
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, answer
@@ -215,12 +215,12 @@ def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_s
     job = take_job(west, job_of(plant.north, registry=plant.roster.registry, **own))
     west.unlock()
     build(LineRun(west, job), board(1))
-    sync(west, FilesPost(plant.stick))
+    sync(west, FolderTransport(plant.stick))
     west.close()
     shutil.copytree(tmp_path / "west", tmp_path / "backup")
     with opened(tmp_path, "west") as homes:
         build(LineRun(homes["west"], job), board(2))
-        sync(homes["west"], FilesPost(plant.stick))
+        sync(homes["west"], FolderTransport(plant.stick))
     with opened(tmp_path, "backup") as homes:
         back = homes["backup"]
         back.plant.begin_restored()
@@ -228,7 +228,7 @@ def test_a_home_out_of_an_old_backup_gives_no_unit_before_it_knows_those_given_s
         with pytest.raises(PolicyError, match="was restored from a backup"):
             build(line, third)
         assert units(line) == [(1, 1, 1)]
-        sync(back, FilesPost(plant.stick))
+        sync(back, FolderTransport(plant.stick))
         assert units(line) == [(1, 1, 1), (2, 1, 1)]
         build(line, third)
         assert [unit for unit, _, _ in units(line)] == [1, 2, 3]
@@ -270,11 +270,11 @@ def test_an_office_out_of_an_old_backup_counts_the_units_and_answers_that_it_gav
         for number in range(MOST_ANSWERS - 2):
             again = proven(first, west, one, nonce=number.to_bytes(16, "big"))
             assert answered(homes["office"], west, again).security
-        sync(homes["office"], FilesPost(plant.stick))
+        sync(homes["office"], FolderTransport(plant.stick))
     with opened(tmp_path, "backup") as homes:
         back = homes["backup"]
         back.plant.begin_restored()
-        sync(back, FilesPost(plant.stick))
+        sync(back, FolderTransport(plant.stick))
         rows = back.plant.line.units(job.id)
         assert [(row.uuid, row.unit, row.attempts) for row in rows] == [
             (one.uuid, 1, MOST_ANSWERS - 1),

@@ -16,12 +16,12 @@ import pytest
 
 from teds_provision.errors import NotAuthenticError, PolicyError
 from teds_provision.plant import jobs, office, parcels
-from teds_provision.plant.asking import OfficeRefusedError, OfficeSilentError, PostOffice, send
-from teds_provision.plant.files import FilesPost
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, answer
-from teds_provision.plant.yields import attempts_of, yields
+from teds_provision.plant.sign_requests import OfficeRefusedError, OfficeSilentError, RemoteOffice, send
+from teds_provision.plant.yield_stats import attempts_of, yields
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job
@@ -359,7 +359,7 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
     east = desk.plant.member("east", "audit")
     desk.plant.round()
     east.unlock()
-    run, one, post = desk.run(), board(1), FilesPost(desk.plant.stick)
+    run, one, post = desk.run(), board(1), FolderTransport(desk.plant.stick)
     request = desk.request(run, one)
     lies = [
         seal_answer(Answer(request.hash, refused="revoked", why="a lie"), station.credentials().key)
@@ -371,7 +371,7 @@ def test_another_members_answer_neither_ends_the_waiting_nor_hides_the_offices(d
         send(east, post, desk.line.identity.fingerprint, document, f"{name}-0000-4000-8000-000000000000")
 
     leave(lies[0], "00000000")
-    run.office = PostOffice(desk.line, post, 0.2)
+    run.office = RemoteOffice(desk.line, post, 0.2)
     with pytest.raises(OfficeSilentError):
         build(run, one)
     for n, lie in enumerate(lies):
@@ -386,7 +386,7 @@ def test_an_answer_waits_for_the_line_that_asked_and_for_no_person(desk: Desk) -
     """One that came again, after the board was done, stayed for ever: "1 parcel waits for import-keys --received"."""
     run, one = desk.run(), board(1)
     request = desk.request(run, one)
-    post, me = FilesPost(desk.plant.stick), desk.line.identity.fingerprint
+    post, me = FolderTransport(desk.plant.stick), desk.line.identity.fingerprint
     sealed = answer(desk.office, request.octets)
     assert sealed is not None
     send(desk.office, post, me, sealed, str(uuid.uuid4()))

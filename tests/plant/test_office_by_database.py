@@ -13,13 +13,13 @@ import pytest
 
 from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import RegistryError, TedsProvisionError
-from teds_provision.plant.asking import Inbox, PostOffice, send_job
 from teds_provision.plant.jobs import find_job, take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import answer_all
-from teds_provision.plant.post import Parcel
+from teds_provision.plant.sign_requests import Inbox, RemoteOffice, send_job
 from teds_provision.plant.sync import sync
-from teds_provision.plant.yields import attempts_of
+from teds_provision.plant.transport import Parcel
+from teds_provision.plant.yield_stats import attempts_of
 from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.plant.document import SIGN_REQUEST
 from teds_provision.teds.codec import security
@@ -64,7 +64,7 @@ def test_an_office_signs_through_the_registry_for_all_readers_of_a_line(plant: O
 
     office = threading.Thread(target=signer)
     office.start()
-    asks = PostOffice(west, at_line, 60)
+    asks = RemoteOffice(west, at_line, 60)
     line = LineRun(west, find_job(west, job.id), office=asks)
     try:
         with ThreadPoolExecutor(8) as readers:
@@ -107,7 +107,7 @@ def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
     job = take_job(north, job_of(north, **told))
     send_job(north, plant.post(north), job)
     plant.sync(north, west)
-    away = PostOffice(west, plant.post(west, port=free_tcp_port()), 1)
+    away = RemoteOffice(west, plant.post(west, port=free_tcp_port()), 1)
     line = LineRun(west, find_job(west, job.id), office=away)
     first, second = board(1), board(2)
     with pytest.raises(RegistryError):

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from teds_provision.handover import incoming, life, outgoing
-from teds_provision.plant import asking, parcels
-from teds_provision.plant.post import Parcel
+from teds_provision.plant import parcels, sign_requests
+from teds_provision.plant.transport import Parcel
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import CONTENT_TYPE
 from teds_provision.protocol.handover.strict_json import time_text
@@ -342,7 +342,7 @@ def test_a_job_travels_sealed_and_comes_out_as_it_was_signed(plant: Plant) -> No
     plant.roster(ROLES)
     members = {"format": document.JOB.format, "id": "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29"}
     signed = document.seal(members, plant["north"].vault.identity(), document.JOB)
-    asking.send(plant["north"], plant.post, plant["west"].fingerprint, signed, members["id"])
+    sign_requests.send(plant["north"], plant.post, plant["west"].fingerprint, signed, members["id"])
     [parcel] = plant.post.there.values()
     assert b"teds-job" not in parcel.octets
     sync(plant, "west")

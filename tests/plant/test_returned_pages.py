@@ -90,7 +90,7 @@ def test_the_pages_of_a_removed_station_return_whatever_it_was(loss: Loss, roles
     later = loss.member("later", "base")
     loss.sync(loss.north, later)
     assert loss.pages_here(later, west) == loss.pages_here(loss.north, west)
-    assert plant_room.folding.heads_digest(later) == plant_room.folding.heads_digest(loss.north)
+    assert plant_room.apply_pages.heads_digest(later) == plant_room.apply_pages.heads_digest(loss.north)
 
 
 def test_a_datasheet_of_a_removed_signer_is_judged_by_a_station_that_joins_after_the_loss(loss: Loss) -> None:
@@ -175,7 +175,7 @@ def test_forged_pages_and_a_wrong_author_are_passed_over_and_the_member_is_named
         loss.north.plant.tables.chain(west.fingerprint).chain, 1, loss.pages_here(loss.north, west)[0]
     )
     assert page is not None
-    genuine = plant_room.folding.octets_of(page).decode()
+    genuine = plant_room.apply_pages.octets_of(page).decode()
     loss.remove(west)
     loss.lose(loss.north, loss.south)
     liar = loss.member("liar", "audit")
@@ -228,7 +228,9 @@ def test_another_history_that_a_thief_wrote_gives_way_to_the_rosters_last(loss: 
     west.unlock()
     roster = loss.north.plant.roster
     assert roster is not None
-    draft = plant_room.sync.PageDraft(roster.registry, 2, first, "0" * 16, plant_room.folding.now(), {}, (1, "0" * 64))
+    draft = plant_room.sync.PageDraft(
+        roster.registry, 2, first, "0" * 16, plant_room.apply_pages.now(), {}, (1, "0" * 64)
+    )
     other = plant_room.sync.seal_page(draft, [], west.credentials().key)
     loss.remove(west)
     loss.lose(loss.north, loss.south)
@@ -236,7 +238,7 @@ def test_another_history_that_a_thief_wrote_gives_way_to_the_rosters_last(loss: 
     genuine = loss.north.plant.tables.page(chain.chain, 1, first)
     assert genuine is not None
     with loss.login(liar).connect() as connection:
-        restore(connection, west.fingerprint, 1, plant_room.folding.octets_of(genuine).decode())
+        restore(connection, west.fingerprint, 1, plant_room.apply_pages.octets_of(genuine).decode())
         restore(connection, west.fingerprint, 2, other.decode())
     later = loss.member("later", "base")
     loss.sync(later)
@@ -297,7 +299,7 @@ def test_a_home_from_a_backup_finds_its_own_pages_among_those_handed_in(loss: Lo
         tables._database.execute("DELETE FROM pages WHERE chain = ? AND hash = ?", (chain.chain, hash))
         roster = west.plant.roster
         assert roster is not None
-        plant_room.folding.recount(west, chain, roster)
+        plant_room.apply_pages.recount(west, chain, roster)
         west.unlock()
         west.plant.begin_restored()
     loss.known(west)

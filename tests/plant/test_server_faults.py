@@ -14,7 +14,7 @@ import pytest
 from teds_provision import plant as plant_room
 from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import RegistryError
-from teds_provision.plant.postgres import PostgresPost
+from teds_provision.plant.postgres import PostgresTransport
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.system
 class Mortal:
     """A post whose server dies, as by a power cut, before the k-th thing that is asked of it; then it is back."""
 
-    def __init__(self, post: PostgresPost, cluster: Cluster, step: int) -> None:
+    def __init__(self, post: PostgresTransport, cluster: Cluster, step: int) -> None:
         self._post, self._cluster, self.left = post, cluster, step
 
     def __getattr__(self, name: str) -> Any:
@@ -63,7 +63,7 @@ def survived(office: Office, cluster: Cluster, *steps: int) -> int:
             assert each.plant.tables.alarms() == [], step
             assert each.plant.tables.unsent(each.fingerprint) == 0, step
         assert plant_room.parcels.waiting_out(office.north) == 0, step
-        plant_room.folding.put_roster(office.north, plant_room.owner.signed(
+        plant_room.apply_pages.put_roster(office.north, plant_room.owner.signed(
             office.north, plant_room.owner.unshared(office.north, ("all", ""))))  # fmt: skip
         office.sync(office.north, south)
     return reached

@@ -14,7 +14,7 @@ from teds_provision.demo.cluster import Cluster
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.plant import PlantWatch
 from teds_provision.ncap.web.metrics import text
-from teds_provision.plant import membership, reaching
+from teds_provision.plant import connecting, membership
 from teds_provision.plant.schema import member_sql
 from teds_provision.plant.sync import sync
 from teds_provision.protocol.plant.document import open_request
@@ -47,7 +47,7 @@ def by_url(office: Office, station: Station) -> Station:
 
 
 def synced(station: Station) -> None:
-    post = reaching.post_of(station)
+    post = connecting.post_of(station)
     assert post is not None
     sync(station, post)
     post.close()

@@ -12,8 +12,8 @@ from teds_provision.errors import PolicyError, UnprovenError
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
-from teds_provision.steps.verify import Verified, remember, require_authentic, verify_image, verify_images
-from teds_provision.talk.progress import Silent
+from teds_provision.steps.verify import Verification, remember, require_authentic, verify_image, verify_images
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
 from tests.plant.stations import Plant
@@ -30,14 +30,14 @@ def plants(tmp_path: Path) -> Iterator[Plant]:
 def made_by(station: Station, board: Board) -> Image:
     """The datasheet that a station provisions a board with."""
     with talk(board) as node:
-        provision(station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=Silent())
+        provision(station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter())
     image = station.nodes.datasheet(board.uuid)
     assert image is not None
     return image
 
 
-def judged(station: Station, image: Image) -> Verified:
-    return Verified(image.uuid, tuple(verify_image(station, image)), "image")
+def judged(station: Station, image: Image) -> Verification:
+    return Verification(image.uuid, tuple(verify_image(station, image)), "image")
 
 
 def verdict(station: Station, image: Image) -> str:
@@ -76,7 +76,7 @@ def test_a_removal_without_the_pages_proves_nothing_until_they_come(plants: Plan
     plants.change(plant.owner.without(plants.north, "west", "lost", newest(plants, west)))
     held = plants.north.plant.roster
     assert held is not None
-    plant.folding.take_rosters(south, [held.octets])
+    plant.apply_pages.take_rosters(south, [held.octets])
     found = judged(south, image)
     assert found.verdict == verdict(south, image) == "unproven"
     with pytest.raises(UnprovenError, match="pages of west") as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant
-from teds_provision.plant.folding import apply_claims, put_roster, recount, take_pages, views
+from teds_provision.plant.apply_pages import apply_claims, put_roster, recount, take_pages, views
 from teds_provision.protocol.plant.page import open_page
 from teds_provision.protocol.plant.roster import Roster, open_roster, seal_roster
 from teds_provision.station.station import Station
@@ -66,10 +66,10 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     assert roster is not None
     oracle = Reader(roster, [octets for one in speakers for octets in one.pages])
     seen = views(station, roster, NODES)
-    from teds_provision.protocol.plant.fold import Own
+    from teds_provision.protocol.plant.fold import LocalState
 
     for uuid in NODES:
-        due = oracle.view(uuid, Own(station.fingerprint))
+        due = oracle.view(uuid, LocalState(station.fingerprint))
         assert seen[uuid] == due
         entry = station.pins.entry(uuid)
         assert (entry.fingerprint if entry is not None else None) == (None if due.bans else due.pin)
@@ -84,4 +84,6 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     for one in speakers:  # said anew, nothing changes
         recount(station, station.plant.tables.chain(one.fingerprint), roster)
     assert views(station, roster, NODES) == seen
-    assert plant.folding.heads_digest(station)[1] == sum(counts.newest[0] > 0 for counts in oracle.counting.values())
+    assert plant.apply_pages.heads_digest(station)[1] == sum(
+        counts.newest[0] > 0 for counts in oracle.counting.values()
+    )

@@ -13,8 +13,8 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import ForkError, LinkError, NotMemberError, PolicyError, StoreLockedError
-from teds_provision.plant.files import FilesPost
-from teds_provision.plant.folding import heads_digest, views
+from teds_provision.plant.apply_pages import heads_digest, views
+from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import resume
 from teds_provision.protocol.plant.document import hash_of
 from teds_provision.protocol.plant.page import PageDraft, seal_page
@@ -139,7 +139,7 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     with pytest.raises(ForkError, match="copy of this home"):
         plants.sync(west)
     assert west.plant.tables.unsent(west.fingerprint) >= 1
-    assert resume(west, plant.files.FilesPost(plants.stick)) == 1
+    assert resume(west, plant.folder_transport.FolderTransport(plants.stick)) == 1
     plants.sync(west)
     plants.sync(plants.north)
     roster = plants.north.plant.roster
@@ -250,7 +250,7 @@ def test_a_clock_a_year_ahead_makes_no_roster_that_counts(plants: Plant) -> None
     ahead = replace(draft, created=draft.created + timedelta(days=365), expires=draft.expires + timedelta(days=365))
     version = south.plant.roster.version if south.plant.roster else 0
     signed = plant.owner.signed(plants.north, ahead)
-    FilesPost(plants.stick).post_roster(signed.version, signed.hash, signed.octets)
+    FolderTransport(plants.stick).post_roster(signed.version, signed.hash, signed.octets)
     done = plants.sync(south)
     assert any("check this machine's clock" in line for line in done.told)
     assert south.plant.roster is not None
@@ -278,7 +278,7 @@ def test_a_page_of_a_clock_a_year_ahead_counts_and_no_name_of_it_wins_for_ever(p
     ahead = datetime.now(UTC) + timedelta(days=365)
     draft = PageDraft(roster.registry, chain.counted[0] + 1, chain.counted[1], "0" * 16, ahead, {}, (1, "0" * 64))
     octets = seal_page(draft, [], south.vault.identity())
-    FilesPost(plants.stick).append(south.fingerprint, draft.n, draft.previous, hash_of(octets), octets)
+    FolderTransport(plants.stick).append(south.fingerprint, draft.n, draft.previous, hash_of(octets), octets)
     plants.sync(plants.north)
     assert plants.north.plant.tables.chain(south.fingerprint).counted[0] == draft.n
     assert alarms(plants.north) == []

@@ -14,10 +14,10 @@ import pytest
 from teds_provision import plant as plant_room
 from teds_provision.demo.cluster import Cluster
 from teds_provision.errors import ForkError, NotAuthenticError, RegistryError
-from teds_provision.plant.postgres import PostgresPost, Registry, parameters
+from teds_provision.plant.postgres import PostgresTransport, Registry, parameters
 from teds_provision.plant.schema import member_sql, mend_sql, registry_sql
 from teds_provision.plant.scram import verifier
-from teds_provision.plant.sync import Synced, resume, sync
+from teds_provision.plant.sync import SyncResult, resume, sync
 from teds_provision.protocol.plant.roster import Share
 from teds_provision.station.station import Station
 from teds_provision.store import TrustRecord, WhitelistEntry
@@ -53,12 +53,12 @@ class Office:
                 one.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
         return made
 
-    def post(self, station: Station, **more: Any) -> PostgresPost:
+    def post(self, station: Station, **more: Any) -> PostgresTransport:
         told = parameters(self.database.url, station.fingerprint, self.secrets[station.fingerprint])
-        return PostgresPost(Registry(told | more), "the registry", station.fingerprint)
+        return PostgresTransport(Registry(told | more), "the registry", station.fingerprint)
 
-    def sync(self, *stations: Station) -> Synced:
-        done = Synced()
+    def sync(self, *stations: Station) -> SyncResult:
+        done = SyncResult()
         for station in stations:
             post = self.post(station)
             done = sync(station, post)
@@ -209,14 +209,14 @@ def test_the_doors_that_a_restore_opens_are_seen_by_every_member(office: Office)
 def test_what_the_database_allows_too_much_is_kept_for_the_status(office: Office) -> None:
     west, post = office.member("west", "line"), office.post(office.north)
     office.sync(office.north, west)
-    assert plant_room.reaching.check_database(office.north, post) == []
+    assert plant_room.connecting.check_database(office.north, post) == []
     office.plant.change(plant_room.owner.without(office.north, "west", "stolen", 0))
-    assert plant_room.reaching.check_database(office.north, post) == ["login of west, which was removed"]
+    assert plant_room.connecting.check_database(office.north, post) == ["login of west, which was removed"]
     shown = call(office.north.home, "--json", "registry", "status").json
     assert shown["open_doors"] == ["login of west, which was removed"]
     removed = [one.fingerprint for one in office.north.plant.roster.removed]  # type: ignore[union-attr]
     office.database.sql(registry_sql(office.database.registry, removed))
-    assert plant_room.reaching.check_database(office.north, post) == []
+    assert plant_room.connecting.check_database(office.north, post) == []
     post.close()
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.bus_multiplexer import BroadcastReplies
 from teds_provision.links.can.isotp import Pair
-from teds_provision.links.can.shared import Gathering
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 from tests.vectors.recipes_links import Mailbox, TagHandler, node
@@ -136,7 +136,7 @@ def test_our_ends_of_the_bus_send_the_published_frames(document: Entry, entry: E
 
 
 def check_gathering(entry: Entry) -> None:
-    gathering = Gathering(entry["station_address"], entry["transaction"])
+    gathering = BroadcastReplies(entry["station_address"], entry["transaction"])
     flows = []
     for step in entry["steps"]:
         frame = Frame(int(step["id"], 16), bytes.fromhex(step["data"]), step["fd"])

@@ -18,7 +18,7 @@ NOTE = b'{"note": "an iron ring, found beside the river"}'
 
 
 def seal(payload, receivers=(RECEIVER,)):
-    made = envelope.Sealing(payload, SENDER, [key.point for key in receivers], typ="note", cty="JWS")
+    made = envelope.EnvelopeWriter(payload, SENDER, [key.point for key in receivers], typ="note", cty="JWS")
     return b"".join([*made.body(), made.end()]), made
 
 
@@ -104,7 +104,7 @@ def test_a_bundle_that_is_cut_off_anywhere_is_no_bundle():
 
 
 def test_what_was_written_before_the_end_opens_for_nobody():
-    made = envelope.Sealing([NOTE * 2000], SENDER, [RECEIVER.point], typ="note", cty="JWS")
+    made = envelope.EnvelopeWriter([NOTE * 2000], SENDER, [RECEIVER.point], typ="note", cty="JWS")
     body = b"".join(made.body())
     for closed in (body, body + b'"}', body + b'","tag":"' + strict_json.base64url(bytes(16)) + b'"}'):
         with pytest.raises((BadDataError, NotAuthenticError)):
@@ -132,7 +132,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
 
 
 def test_the_tag_is_looked_at_before_anything_that_came_out():
-    made = envelope.Sealing([NOTE], SENDER, [RECEIVER.point], typ="note", cty="JWS")
+    made = envelope.EnvelopeWriter([NOTE], SENDER, [RECEIVER.point], typ="note", cty="JWS")
     signature_of_other = b"".join([*made.body(), made.end()])
     members = json.loads(signature_of_other)
     text = members["ciphertext"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import GarbledError, NotAuthenticError
-from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.session import NodeSession, SessionKeys, StationSession, _decrypt, _seal_padded, open_mac
+from teds_provision.protocol.wire_agreement import key_id
 
 from .desk import NODE, STATION, UUID, Desk
 

@@ -7,15 +7,6 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import GarbledError, KeyMismatchError, NotAuthenticError, PolicyError
-from teds_provision.protocol.agreement import (
-    AgreedKey,
-    Credentials,
-    NodeAgreement,
-    RequestPayload,
-    StationAgreement,
-    TranscriptMismatchError,
-    transcript,
-)
 from teds_provision.protocol.keys import (
     GROUP_ORDER,
     SoftwareKey,
@@ -27,6 +18,15 @@ from teds_provision.protocol.keys import (
 from teds_provision.protocol.messages.frames import Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
+from teds_provision.protocol.wire_agreement import (
+    AgreedKey,
+    Credentials,
+    NodeAgreement,
+    RequestPayload,
+    StationAgreement,
+    TranscriptMismatchError,
+    transcript,
+)
 from teds_provision.teds.codec import security
 
 from .desk import CA, CREDENTIALS, NODE, STATION, UUID, Desk

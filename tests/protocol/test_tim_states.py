@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from teds_provision.protocol.agreement import StationAgreement, key_id
 from teds_provision.protocol.flash import ChipError
 from teds_provision.protocol.keys import prove_message, reset_message, verify
 from teds_provision.protocol.messages.frames import (
@@ -25,6 +24,7 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim import Tim
+from teds_provision.protocol.wire_agreement import StationAgreement, key_id
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 

@@ -13,13 +13,13 @@ from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board as Hardware
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.station.station import Station
-from teds_provision.steps.adopting import Brought, NotAdoptedError
+from teds_provision.steps.adoption import FactoryDatasheet, NotAdoptedError
 from teds_provision.steps.agree import require_session, reset_node
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import NOTHING, Silent
+from teds_provision.talk.progress import NOTHING, SilentReporter
 from teds_provision.teds.calibration import read_calibrations
 from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
 from teds_provision.teds.image import BlockId, Image
@@ -47,16 +47,16 @@ def board(folder: Path, blocks: Mapping[BlockId, bytes], uuid: bytes = UUID) -> 
 
 def adopted(
     station: Station, node: VirtualNode, order: BuildOrder = ADOPT, says: TedsProvisionError | None = None
-) -> tuple[Provisioned, list[Brought]]:
-    shown: list[Brought] = []
+) -> tuple[ProvisionResult, list[FactoryDatasheet]]:
+    shown: list[FactoryDatasheet] = []
 
-    def ask(brought: Brought) -> None:
+    def ask(brought: FactoryDatasheet) -> None:
         shown.append(brought)
         if says is not None:
             raise says
 
     with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
-        done = provision(station, talk, order, accept=lambda _who: None, reporter=Silent(), adopt=ask)
+        done = provision(station, talk, order, accept=lambda _who: None, reporter=SilentReporter(), adopt=ask)
     return done, shown
 
 
@@ -81,7 +81,7 @@ def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> N
         Conversation(on_reader(node), notice=lambda _notice: None) as talk,
         pytest.raises(NotAdoptedError, match="nobody has approved"),
     ):
-        provision(station, talk, ADOPT, accept=lambda _who: None, reporter=Silent())
+        provision(station, talk, ADOPT, accept=lambda _who: None, reporter=SilentReporter())
     assert node.tim.flash.sequence == 0
     done, _ = adopted(station, node)
     assert done.verified.verdict == "authentic"

@@ -17,18 +17,18 @@ from teds_provision.errors import (
     NotWhitelistedError,
     PolicyError,
 )
-from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.messages.frames import Command, Reason, Reply, refusal
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.wire_agreement import key_id
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import Agreed, agree, open_session
+from teds_provision.steps.agree import AgreeResult, agree, open_session
 from teds_provision.steps.identify import identify
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.codec import security
 from tests.bench import Board, MemoryLink, make_station, talk
 
 
-def run(station: Station, board: Board, link: MemoryLink | None = None, *, rotate: bool = False) -> Agreed:
+def run(station: Station, board: Board, link: MemoryLink | None = None, *, rotate: bool = False) -> AgreeResult:
     with talk(board, link) as node:
         return agree(station, node, identify(station, node), rotate=rotate)
 

@@ -14,7 +14,7 @@ from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
-from teds_provision.steps.read import Survey
+from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.meeting import the_one
@@ -67,7 +67,7 @@ def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station
     link = MemoryLink(board, tamper=drop_session)
     with talk(board, link) as node:
         require_session(station, node)
-        present = Survey(Image(board.uuid, signed.unsigned_blocks()), frozenset(), board.tim.identity())
+        present = NodeSnapshot(Image(board.uuid, signed.unsigned_blocks()), frozenset(), board.tim.identity())
         with pytest.raises(NodeRefusedError) as refused:
             write(station, node, signed, present=present)
     assert (lost, refused.value.reason) == (0, Reason.DIGEST_MISMATCH)

@@ -13,9 +13,9 @@ from teds_provision.handover.life import plan_takeover, take_over
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, build
-from teds_provision.steps.document import plan_sheet, write_sheet
-from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.talk.progress import Silent
+from teds_provision.steps.datasheet_edit import plan_sheet, write_sheet
+from teds_provision.steps.provision import ProvisionResult, provision
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.calibration import Calibration, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import Channel, ChannelKind
@@ -30,9 +30,9 @@ ANGLE = "magnetic-angular-position-sensor"
 DEGREES = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
 
 
-def provisioned(station: Station, board: Board, order: BuildOrder) -> Provisioned:
+def provisioned(station: Station, board: Board, order: BuildOrder) -> ProvisionResult:
     with talk(board) as node:
-        return provision(station, node, order, accept=lambda _who: None, reporter=Silent())
+        return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter())
 
 
 @pytest.fixture
@@ -110,9 +110,9 @@ def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
         blocks = dict(station.nodes.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
         blocks[1, AccessCode.CHANNEL] = load_profile("load-cell").build(board.uuid).blocks[1, AccessCode.CHANNEL]
         with pytest.raises(WrongBoardError, match="in rad, not in N"):
-            write_sheet(station, node, blocks, Silent())
+            write_sheet(station, node, blocks, SilentReporter())
         with pytest.raises(CalibrationMisfitError):
-            write_sheet(station, node, blocks, Silent(), retype=True)
+            write_sheet(station, node, blocks, SilentReporter(), retype=True)
         del blocks[1, AccessCode.CALIBRATION]
         with pytest.raises(WrongBoardError):
             plan_sheet(station, node, blocks)

@@ -10,10 +10,10 @@ from teds_provision.errors import PolicyError
 from teds_provision.links.hints import Charging
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, contact
 
 ANGLE = "magnetic-angular-position-sensor"
@@ -21,12 +21,12 @@ ANGLE = "magnetic-angular-position-sensor"
 
 def run(
     station: Station, board: Board, percent: int | None, low: Low = wait_for_charge, name: str = "a"
-) -> Provisioned:
+) -> ProvisionResult:
     charging = None if percent is None else Charging("wanted", percent)
     there = replace(contact(board), charging=charging)
     with Conversation(there, notice=lambda _notice: None) as node:
         order = BuildOrder(profile=ANGLE, name=name)
-        return provision(station, node, order, accept=lambda _who: None, reporter=Silent(), low=low)
+        return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter(), low=low)
 
 
 def test_below_ten_per_cent_nothing_is_written_without_a_word(station: Station, board: Board) -> None:

@@ -17,7 +17,7 @@ from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.frames import Function, Reason, refusal
 from teds_provision.station.station import Station
 from teds_provision.steps.commands import identify_at
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.pace import PATIENCE
 from tests.places import free_bus
 
@@ -37,7 +37,7 @@ class Proves(VirtualNode):
         return super().request(link, frame, tapped=tapped)
 
 
-class Told(Silent):
+class Told(SilentReporter):
     """What a person is told meanwhile."""
 
     def __init__(self) -> None:

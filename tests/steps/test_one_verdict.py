@@ -16,18 +16,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadDatasheetError, NotAuthenticError
-from teds_provision.measure.rest import Rest
-from teds_provision.measure.trusting import open_trusted
+from teds_provision.measure.background_reread import BackgroundReread
+from teds_provision.measure.verified_session import open_trusted
 from teds_provision.station.station import Station
-from teds_provision.steps import reading
+from teds_provision.steps import readings
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
-from teds_provision.steps.read import read_image
 from teds_provision.steps.sign import known_node_keys
+from teds_provision.steps.teds_read import read_image
 from teds_provision.steps.verify import possession
-from teds_provision.steps.verify_node import Looked, look_at_node, look_in_session, verify_node
+from teds_provision.steps.verify_node import NodeVerification, look_at_node, look_in_session, verify_node
 from teds_provision.store import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import AccessCode
@@ -58,7 +58,7 @@ def changed_in_flash(board: Board, block: tuple[int, int] = NAME, *, restart: bo
         board.power_on()
 
 
-def looked(station: Station, board: Board) -> Looked:
+def looked(station: Station, board: Board) -> NodeVerification:
     """What a measurement does before it claims anything."""
     with talk(board, over_the_bus(board)) as node:
         require_session(station, node)
@@ -72,7 +72,7 @@ def verified(station: Station, board: Board) -> str:
 
 def shown(station: Station, board: Board) -> tuple[str | None, str | None]:
     """The verdict as every screen has it: of the one node, and of it in a list."""
-    judged = reading.verdict_of(station, board.uuid)
+    judged = readings.verdict_of(station, board.uuid)
     (listed,) = inventory(station, [board.uuid])
     word = None if judged is None else judged.verified.verdict
     assert listed["verdict"] == word
@@ -89,7 +89,7 @@ def test_the_row_names_the_digest_of_each_teds_the_command_and_the_session(stati
     assert (row.by, row.whole, row.in_session) == ("provision", True, True)
     image = station.nodes.datasheet(board.uuid)
     assert image is not None
-    assert set(reading.digests_of(row)) == set(image.blocks)
+    assert set(readings.digests_of(row)) == set(image.blocks)
     assert shown(station, board) == ("authentic", "session")
 
 
@@ -191,9 +191,9 @@ def test_a_node_that_was_mended_is_authentic_again(station: Station, board: Boar
 def test_another_security_teds_makes_everything_be_read(station: Station, board: Board) -> None:
     with talk(board) as node:
         from teds_provision.steps.provision import provision
-        from teds_provision.talk.progress import Silent
+        from teds_provision.talk.progress import SilentReporter
 
-        provision(station, node, BuildOrder(name="other"), accept=lambda _who: None, reporter=Silent())
+        provision(station, node, BuildOrder(name="other"), accept=lambda _who: None, reporter=SilentReporter())
     assert shown(station, board) == ("authentic", "session")
     image = station.nodes.datasheet(board.uuid)
     assert image is not None
@@ -234,7 +234,7 @@ def test_a_reading_in_no_session_is_replaced_by_any(station: Station) -> None:
 
 def test_a_row_that_no_reading_of_ours_made_is_never_authentic(station: Station) -> None:
     station.nodes.keep_reading(NodeReading(bytes(10), utc_now(), "x", bytes(8), True, b""))
-    judged = reading.verdict_of(station, bytes(10))
+    judged = readings.verdict_of(station, bytes(10))
     assert judged is not None
     assert judged.verified.verdict == "unsigned"
 
@@ -242,7 +242,7 @@ def test_a_row_that_no_reading_of_ours_made_is_never_authentic(station: Station)
 def test_a_ban_of_today_is_in_the_verdict_of_a_reading_of_yesterday(station: Station, board: Board) -> None:
     station.policy.deny(RevocationRecord(board.uuid, None, "stolen", "{}"))
     assert shown(station, board) == ("not authentic", "session")
-    judged = reading.verdict_of(station, board.uuid)
+    judged = readings.verdict_of(station, board.uuid)
     assert judged is not None
     assert [check.name for check in judged.verified.checks if check.result == "failed"] == ["not revoked"]
     station.policy.lift(board.uuid)
@@ -281,7 +281,7 @@ def read_behind(station: Station, board: Board) -> list[str]:
     bus = SimpleNamespace(reading=threading.Lock())
     with talk(board, over_the_bus(board)) as node:
         trusted = open_trusted(station, node, by="ncap")
-        rest = Rest(station, trusted, bus, by="ncap")  # type: ignore[arg-type]
+        rest = BackgroundReread(station, trusted, bus, by="ncap")  # type: ignore[arg-type]
         rest._due = 0.0
         steps = 0
         while rest.step():
@@ -314,7 +314,7 @@ def test_a_bus_that_another_node_is_read_on_is_waited_for(station: Station, boar
     bus = SimpleNamespace(reading=threading.Lock())
     link = over_the_bus(board)
     with talk(board, link) as node, bus.reading:
-        rest = Rest(station, open_trusted(station, node, by="ncap"), bus, by="ncap")  # type: ignore[arg-type]
+        rest = BackgroundReread(station, open_trusted(station, node, by="ncap"), bus, by="ncap")  # type: ignore[arg-type]
         rest._due, asked = 0.0, link.count
         assert rest.step()
         assert link.count == asked
@@ -325,5 +325,5 @@ def test_a_node_without_its_key_is_not_authentic_by_any_row(station: Station, bo
     with talk(board) as node:
         require_session(station, node)
         failed = possession(lambda: (_ for _ in ()).throw(NotAuthenticError("It does not hold the key.")))  # type: ignore[arg-type, return-value]
-        reading.keep(station, node, read_image(node), by="verify", known=None, more=[failed])
+        readings.keep(station, node, read_image(node), by="verify", known=None, more=[failed])
     assert shown(station, board) == ("not authentic", "session")

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.errors import GarbledError, PolicyError, VaultError
 from teds_provision.station.station import Station
-from teds_provision.steps import read as reading
+from teds_provision.steps import teds_read as reading
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import add_to_whitelist
 from tests.bench import Board, MemoryLink, make_station, talk

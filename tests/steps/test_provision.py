@@ -23,10 +23,10 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder, merged
-from teds_provision.steps.identify import Identified
-from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.identify import IdentifiedNode
+from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.steps.write import write
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
@@ -35,7 +35,7 @@ from tests.bench import Board, MemoryLink, make_station, talk
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 
 
-def accept(who: Identified) -> None:
+def accept(who: IdentifiedNode) -> None:
     """Whoever lies on the reader."""
 
 
@@ -44,13 +44,13 @@ def run(
     board: Board,
     link: MemoryLink | None = None,
     order: BuildOrder = ANGLE,
-    accept: Callable[[Identified], None] = accept,
-) -> Provisioned:
+    accept: Callable[[IdentifiedNode], None] = accept,
+) -> ProvisionResult:
     with talk(board, link) as node:
-        return provision(station, node, order, accept=accept, reporter=Silent())
+        return provision(station, node, order, accept=accept, reporter=SilentReporter())
 
 
-def results(done: Provisioned) -> dict[str, str]:
+def results(done: ProvisionResult) -> dict[str, str]:
     return {step.name: step.result for step in done.steps}
 
 
@@ -82,7 +82,7 @@ def test_a_small_node_takes_its_datasheet_in_many_segments(station: Station) -> 
 
 
 def test_without_a_yes_an_unknown_node_is_left_alone(station: Station, board: Board) -> None:
-    def no(who: Identified) -> None:
+    def no(who: IdentifiedNode) -> None:
         raise NotWhitelistedError("no")
 
     with pytest.raises(NotWhitelistedError):
@@ -210,7 +210,7 @@ def test_another_owners_station_is_refused(station: Station, board: Board, tmp_p
     with pytest.raises(PolicyError, match="has a key that this station does not hold"):
         run(stranger, board)
     with talk(board) as node, pytest.raises(NodeRefusedError) as refused:  # a person's word does not help either
-        provision(stranger, node, ANGLE, accept=accept, reporter=Silent(), take_over=lambda question: None)
+        provision(stranger, node, ANGLE, accept=accept, reporter=SilentReporter(), take_over=lambda question: None)
     assert refused.value.reason == Reason.UNTRUSTED_STATION
     assert board.state == before
 

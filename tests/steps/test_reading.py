@@ -6,7 +6,7 @@ import pytest
 
 from teds_provision.errors import GarbledError, NodeRefusedError
 from teds_provision.protocol.messages.frames import Reason, Reply, refusal
-from teds_provision.steps.read import LARGEST_SECURITY, read_block
+from teds_provision.steps.teds_read import LARGEST_SECURITY, read_block
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
 from tests.bench import Board, MemoryLink, talk

@@ -11,8 +11,8 @@ from teds_provision.station.station import Station
 from teds_provision.steps.agree import reset_node
 from teds_provision.steps.build import BuildOrder, UnrequestedChangeError, build, nobody
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.talk.progress import Silent
+from teds_provision.steps.provision import ProvisionResult, provision
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.profile.load import shipped_profiles
 from tests.bench import Board, talk
 from tests.pace import until
@@ -21,9 +21,9 @@ CELL = (shipped_profiles() / "load-cell.toml").read_text()
 OVEN = (shipped_profiles() / "temperature-sensor.toml").read_text()
 
 
-def provisioned(station: Station, board: Board, order: BuildOrder) -> Provisioned:
+def provisioned(station: Station, board: Board, order: BuildOrder) -> ProvisionResult:
     with talk(board) as node:
-        return provision(station, node, order, accept=lambda _who: None, reporter=Silent(), confirm=nobody)
+        return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter(), confirm=nobody)
 
 
 @pytest.fixture

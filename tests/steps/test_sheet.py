@@ -10,11 +10,11 @@ import pytest
 from teds_provision.errors import BadDataError, NodeBusyError, NodeSilentError, NoNodeError
 from teds_provision.station.station import Station
 from teds_provision.steps.batch_sheet import (
-    About,
     BatchSheet,
     BoardResult,
     DeclinedError,
     Progress,
+    ReportHead,
     SheetRow,
     read_sheet,
     write_report,
@@ -230,7 +230,7 @@ def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(st
     progress = Progress(station.home, read(station, tmp_path, "name\n<b>\nb\n"))
     progress.take(progress.sheet.rows[0], bytes(10))
     progress.note(progress.sheet.rows[0], BoardResult(bytes(10), 1.23, error=NodeSilentError("It is <silent>."), row=1))
-    about = About("bench <1>", "ab" * 32, "Ada", "teds-provision 9")
+    about = ReportHead("bench <1>", "ab" * 32, "Ada", "teds-provision 9")
     write_report(tmp_path / "day.html", progress, about)
     text = (tmp_path / "day.html").read_text()
     assert "<th>first-pass yield</th><td>0.0%</td>" in text

@@ -19,9 +19,9 @@ from teds_provision.protocol.messages.frames import COMMON, Function, Reason, Re
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import proof_of_reset, require_session
-from teds_provision.steps.commands import ReadDone, Visit, read_at, verify_at
+from teds_provision.steps.commands import NodeVisit, ReadReport, read_at, verify_at
 from teds_provision.steps.identify import identify
-from teds_provision.steps.verify import Verified, require_authentic
+from teds_provision.steps.verify import Verification, require_authentic
 from teds_provision.steps.verify_node import look_at_node
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, refused
@@ -29,7 +29,7 @@ from teds_provision.talk.meeting import refuse_twins, without_twins
 from teds_provision.teds.image import SECURITY, Image
 from tests.bench import Board, MemoryLink, contact, make_station, talk
 
-from .test_provision import ANGLE, Silent, run
+from .test_provision import ANGLE, SilentReporter, run
 
 FORGED_ADDRESS = 99
 
@@ -70,7 +70,7 @@ class Attacker:
         """Nothing to leave."""
 
 
-def looked_at(station: Station, attacker: Attacker) -> Verified:
+def looked_at(station: Station, attacker: Attacker) -> Verification:
     node = Conversation(Contact(attacker.identity, attacker, address=FORGED_ADDRESS), notice=lambda notice: None)
     with node:
         return look_at_node(station, node, identify(station, node)).verified
@@ -190,12 +190,12 @@ def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
         yield
 
     monkeypatch.setattr("teds_provision.steps.commands.at_node", contextmanager(refuses))
-    done = verify_at(station, LinkSettings(), board.uuid.hex(), Silent())
+    done = verify_at(station, LinkSettings(), board.uuid.hex(), SilentReporter())
     assert (done.verified.verdict, type(done.error)) == ("unproven", UnprovenError)
 
     stranger = bytes(9) + b"\1"
     with pytest.raises(NodeRefusedError):
-        verify_at(station, LinkSettings(), stranger.hex(), Silent())
+        verify_at(station, LinkSettings(), stranger.hex(), SilentReporter())
 
 
 def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
@@ -205,14 +205,14 @@ def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
 
     def met(node: Conversation) -> None:
         @contextmanager
-        def at(*_: object, **__: object) -> Iterator[Visit]:
+        def at(*_: object, **__: object) -> Iterator[NodeVisit]:
             with node:
-                yield Visit(station, node, identify(station, node))
+                yield NodeVisit(station, node, identify(station, node))
 
         monkeypatch.setattr("teds_provision.steps.commands.at_node", at)
 
-    def read() -> ReadDone:
-        return read_at(station, LinkSettings(), board.uuid.hex(), Silent())
+    def read() -> ReadReport:
+        return read_at(station, LinkSettings(), board.uuid.hex(), SilentReporter())
 
     attacker = Attacker(board, recorded)
     met(Conversation(Contact(attacker.identity, attacker, address=FORGED_ADDRESS), notice=lambda notice: None))

@@ -16,9 +16,9 @@ from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import build
 from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
-from teds_provision.steps.read import read_image
 from teds_provision.steps.sign import known_node_keys, sign
-from teds_provision.steps.verify import Known, Verified, known_of, verify_image
+from teds_provision.steps.teds_read import read_image
+from teds_provision.steps.verify import FreshnessFloor, Verification, known_of, verify_image
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import write
 from teds_provision.store import TrustRecord
@@ -36,11 +36,11 @@ def image(station: Station, board: Board) -> Image:
 
 
 def verdict(station: Station, image: Image) -> str:
-    return Verified(image.uuid, tuple(verify_image(station, image)), scope="image").verdict
+    return Verification(image.uuid, tuple(verify_image(station, image)), scope="image").verdict
 
 
 def failed(station: Station, image: Image, identity: Identity | None = None) -> list[str]:
-    known = Known(identity) if identity is not None else None
+    known = FreshnessFloor(identity) if identity is not None else None
     return [check.name for check in verify_image(station, image, known=known) if check.result == "failed"]
 
 
@@ -165,7 +165,7 @@ def test_a_file_is_judged_alone(station: Station, board: Board, image: Image) ->
 # -- on the node -------------------------------------------------------------------------------------------------------
 
 
-def on_node(station: Station, board: Board) -> Verified:
+def on_node(station: Station, board: Board) -> Verification:
     with talk(board) as node:
         who = identify(station, node)
         require_session(station, node)
@@ -227,10 +227,10 @@ def test_what_a_stranger_signed_is_no_floor_for_sequence_and_epoch(
     )
     signed = sign_datasheet(theirs, board.uuid, stranger.credentials())
     station.nodes.keep_datasheet(image.with_block(SECURITY, signed))
-    assert known_of(station, board.uuid, None) == Known()
+    assert known_of(station, board.uuid, None) == FreshnessFloor()
     broken = replace(ours, sequence=900, key_epoch=900).encode()
     station.nodes.keep_datasheet(image.with_block(SECURITY, broken))
-    assert known_of(station, board.uuid, None) == Known(), "field 100 is not over these numbers"
+    assert known_of(station, board.uuid, None) == FreshnessFloor(), "field 100 is not over these numbers"
 
 
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:

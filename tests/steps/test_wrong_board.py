@@ -8,23 +8,23 @@ import pytest
 
 from teds_provision.errors import NodeRefusedError, PolicyError
 from teds_provision.links import Contact, LinkSettings
-from teds_provision.node.described import create
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board as Hardware
+from teds_provision.node.node_template import create
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.commands import OPERATION, ChannelState, OperationReply
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session, reset_node
-from teds_provision.steps.batch import Boards, ProvisionRequest, Questions
+from teds_provision.steps.batch import BatchRun, ProvisionRequest, Questions
 from teds_provision.steps.board_type import WrongBoardError, bears, differences, operate
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.steps.read import read_image
+from teds_provision.steps.provision import ProvisionResult, provision
+from teds_provision.steps.teds_read import read_image
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile.load import load_profile
 from teds_provision.teds.sheet import Sheet
@@ -59,9 +59,9 @@ def order(tmp_path: Path, profile: str | None, **more: bool) -> BuildOrder:
     return BuildOrder(profile, calibration=file, **more)
 
 
-def given(station: Station, contact: Contact, what: BuildOrder, **asked: object) -> Provisioned:
+def given(station: Station, contact: Contact, what: BuildOrder, **asked: object) -> ProvisionResult:
     with Conversation(contact, notice=lambda _notice: None) as node:
-        return provision(station, node, what, accept=lambda _who: None, reporter=Silent(), **asked)  # type: ignore[arg-type]
+        return provision(station, node, what, accept=lambda _who: None, reporter=SilentReporter(), **asked)  # type: ignore[arg-type]
 
 
 def test_a_factory_board_of_another_type_is_refused_before_it_becomes_ours(
@@ -228,7 +228,7 @@ def test_a_node_that_keeps_no_session_is_told_and_is_no_bug(
 def test_a_row_of_a_sheet_waits_for_its_own_board(station: Station, angle: VirtualNode, tmp_path: Path) -> None:
     sheet = tmp_path / "boards.csv"
     sheet.write_text("uuid,name,profile\n,cell,load-cell\n")
-    boards = Boards(station, LinkSettings("nfc"), ProvisionRequest(None, BuildOrder(), sheet=sheet), Silent())
+    boards = BatchRun(station, LinkSettings("nfc"), ProvisionRequest(None, BuildOrder(), sheet=sheet), SilentReporter())
     asked = Questions(lambda _who: None, None)
     from teds_provision.steps.batch_sheet import BoardResult as Ended
 

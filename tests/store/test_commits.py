@@ -19,7 +19,7 @@ from teds_provision.steps.provision import provision
 from teds_provision.store import NodeRecord
 from teds_provision.store.audit import ACTOR
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from tests.bench import Board, MemoryLink, make_station, talk
 
 _CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")
@@ -39,7 +39,7 @@ class Watched:
         self.statements.clear()
         with talk(board) as node:
             order = BuildOrder("temperature-sensor")
-            provision(self.station, node, order, accept=lambda who: None, reporter=Silent())
+            provision(self.station, node, order, accept=lambda who: None, reporter=SilentReporter())
         rows = commits = open_rows = self.waited = 0
         last, waits = "", True
         for statement in self.statements:
@@ -113,7 +113,9 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
     monkeypatch.setattr(Conversation, "send", sent)
     watched.station._store._database._connection.set_trace_callback(stated)
     with talk(Board()) as node:
-        provision(watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=Silent())
+        provision(
+            watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter()
+        )
         told.append("told")
     of_teds = [doing for doing in told if doing.startswith(("TEDS", "on the disk", "the commit"))]
     assert of_teds[-3:] == ["on the disk", "TEDS 128 of channel 0", "the commit"]
@@ -126,7 +128,9 @@ def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, syn
     """Identify is written to the log and not waited for: the next step was to do that."""
     link = MemoryLink(Board(), lose_request=3)
     with pytest.raises(LinkError), talk(link.board, link) as node:
-        provision(watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=Silent())
+        provision(
+            watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=SilentReporter()
+        )
     assert synced == ["store.sqlite3-wal"]
 
 

@@ -11,7 +11,7 @@ from teds_provision.errors import BadDataError, GarbledError, NotAuthenticError,
 from teds_provision.links import LINKS, Capabilities, Contact
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station as Ours
-from teds_provision.steps.agree import Agreed, agree
+from teds_provision.steps.agree import AgreeResult, agree
 from teds_provision.steps.identify import identify
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation
@@ -42,7 +42,7 @@ class Desk:
         pass
 
 
-def run(station: Ours, node: Node) -> Agreed:
+def run(station: Ours, node: Node) -> AgreeResult:
     station.pins.put(WhitelistEntry(node.uuid))
     contact = Contact(Identity.decode(node.hello(b"")), Desk(node), tag_uid=b"\x04" + bytes(6))
     with Conversation(contact, notice=lambda notice: None) as talk:

@@ -17,7 +17,7 @@ from tests.teds.vectors import TEDS, octets_of
 OLD, NEW = bytes(range(10)), bytes(range(16))
 
 
-def to(octets: bytes, edition: Any, **more: bytes) -> tuple[teds.Decoded, list[teds.Finding]]:
+def to(octets: bytes, edition: Any, **more: bytes) -> tuple[teds.DecodedTeds, list[teds.Finding]]:
     converted, findings = teds.convert(teds.decode(octets), edition, **more)
     return teds.decode(converted), findings
 

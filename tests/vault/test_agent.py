@@ -16,7 +16,7 @@ import pytest
 
 from teds_provision import files
 from teds_provision.cli.main import run as in_process
-from teds_provision.vault import agent, choose, forget_vaults
+from teds_provision.vault import agent, forget_vaults, selection
 from teds_provision.vault.pkcs11_token import ask_pin
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 from tests.bench import PASSPHRASE, make_station
@@ -98,7 +98,7 @@ def test_a_pin_that_is_held_is_not_spent_on_the_last_attempt() -> None:
         asked.append(prompt)
         return "typed"
 
-    give, uri = choose._holding(b"held", person), Pkcs11Uri("/m.so", token="t")
+    give, uri = selection._holding(b"held", person), Pkcs11Uri("/m.so", token="t")
     assert ask_pin(cast(Any, Shown), uri, give) == "held"
     Shown.flags = TokenFlag.USER_PIN_FINAL_TRY
     assert ask_pin(cast(Any, Shown), uri, give) == "typed"

@@ -21,7 +21,7 @@ from teds_provision.cli.context import App
 from teds_provision.errors import TedsProvisionError
 from teds_provision.station.station import Station, rewrap
 from teds_provision.store import StoreLock
-from teds_provision.vault import agent, choose, forget_vaults, passphrase
+from teds_provision.vault import agent, forget_vaults, passphrase, selection
 from teds_provision.vault.passphrase import THROWAWAY, SealingKey
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, call
@@ -67,8 +67,8 @@ class World:
 
     def run(self, name: str, **meanwhile: Callable[[], object]) -> Outcome:
         """A command, as a process of its own would run it."""
-        before, current = dict(choose._opened), App.current
-        choose._opened.clear()
+        before, current = dict(selection._opened), App.current
+        selection._opened.clear()
         running = Running(name, meanwhile)
         self.stack.append(running)
         words = [word.format(folder=self.home.parent) for word in COMMANDS[name]]
@@ -76,8 +76,8 @@ class World:
             done = call(self.home, "--json", *words, passphrase=None)
         finally:
             self.stack.pop()
-            choose._opened.clear()
-            choose._opened.update(before)
+            selection._opened.clear()
+            selection._opened.update(before)
             App.current = current
         if name == "passphrase" and done.code == 0:
             self.passphrase = NEW if self.passphrase == PASSPHRASE else PASSPHRASE
@@ -314,8 +314,8 @@ def test_a_key_that_was_read_before_a_rewrap_and_opened_after_it_is_found(world:
 
 @contextmanager
 def another_process() -> Iterator[None]:
-    before = dict(choose._opened)
-    choose._opened.clear()
+    before = dict(selection._opened)
+    selection._opened.clear()
     yield
-    choose._opened.clear()
-    choose._opened.update(before)
+    selection._opened.clear()
+    selection._opened.update(before)

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 
-from teds_provision.protocol.agreement import RequestPayload, key_id
 from teds_provision.protocol.messages.frames import Command, Function, read_teds, security_command, write_teds
+from teds_provision.protocol.wire_agreement import RequestPayload, key_id
 
 from .scene import K, Scene, credentials, key
 

@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.kdf.concatkdf import ConcatKDFHash
 from cryptography.hazmat.primitives.keywrap import aes_key_wrap
 
-from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.protocol.wire_agreement import key_id
 
 from .scene import KAT, SIGNED, UUID, K, key, octets
 

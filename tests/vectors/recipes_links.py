@@ -9,14 +9,14 @@ from dataclasses import replace
 from typing import Any
 
 from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.bus_multiplexer import BroadcastReplies
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, single
-from teds_provision.links.can.shared import Gathering
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 from teds_provision.node.nfc.tnep import TnepTag
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import Command, Function, read_teds, security_command
 from teds_provision.protocol.tim import Tim
+from teds_provision.protocol.wire_agreement import StationAgreement
 from tests.protocol.memory import RamFlash
 
 from .recipes import IDENTIFY
@@ -291,7 +291,7 @@ def _transfer(name: str, note: str, command: Command, *, state: str = "factory",
 def _functional(name: str, note: str, *, fd: bool = False, twins: bool = False) -> dict[str, Any]:
     """Identify asked of everyone; with ``twins`` two nodes answer under one address."""
     wire, tim = Wire(), node(name)
-    gathering = Gathering(STATION_ADDRESS, CAN_TRANSACTION)
+    gathering = BroadcastReplies(STATION_ADDRESS, CAN_TRANSACTION)
     reply = tim.handle(IDENTIFY.encode(), link="can:f1", tapped=True)
     pairs = [Pair(CAN_ADDRESS, STATION_ADDRESS, wire.sender(who), fd=fd) for who in ("node", "other node")[: 1 + twins]]
     body = bytes([CAN_TRANSACTION]) + IDENTIFY.encode()

@@ -17,7 +17,7 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.operation.can_frames import cut
 from teds_provision.protocol.operation.commands import (
     OPERATION,
-    Operate,
+    OperateCommand,
     idle,
     read_data_set,
     run_self_test,
@@ -31,10 +31,10 @@ from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
     WAITS,
     Action,
-    Arm,
-    Driven,
+    ArmCommand,
+    DriveReply,
     StreamKind,
-    Subscribe,
+    SubscribeCommand,
     drive,
     stop,
 )
@@ -144,13 +144,13 @@ class OperationScene:
 
 def operate(channel: int, *, digest: bytes = DIGEST, lease: int = 60, dead_man: int | None = None) -> Command:
     """Operate."""
-    return Operate(channel, digest, lease, dead_man).command()
+    return OperateCommand(channel, digest, lease, dead_man).command()
 
 
 def subscribe(**changes: object) -> Command:
     """Subscribe to two samples of channel 1 every 10 ms, or something else."""
     asked: dict[str, Any] = {"stream": 0, "kind": StreamKind.PERIODIC, "n": 2, "gap": 1000, "period": 10 * MS, "start": 0, "channels": (1,)}  # fmt: skip
-    return Subscribe(**{**asked, **changes}).command()
+    return SubscribeCommand(**{**asked, **changes}).command()
 
 
 def operation() -> Iterator[dict[str, Any]]:
@@ -271,8 +271,8 @@ def _checks_of_streams() -> Iterator[OperationScene]:
             (drive([]), "Drive of nothing: 4."),
             (drive([6]), "Drive of one not claimed: 2."),
             (drive([4, 1]), "Drive of a sensor: 3."),
-            (Arm(bytes(16), 61, 0).command(), "Arm, life 61: 19."),
-            (Arm(bytes(16), 60, 3).command(), "Arm, action 3: 19."),
+            (ArmCommand(bytes(16), 61, 0).command(), "Arm, life 61: 19."),
+            (ArmCommand(bytes(16), 60, 3).command(), "Arm, action 3: 19."),
         ]
     )
     yield OperationScene("nfc", "Over NFC: no streams, no Drive, no trigger.", NFC).rows(
@@ -280,7 +280,7 @@ def _checks_of_streams() -> Iterator[OperationScene]:
             (operate(1), "Claimed."),
             (subscribe(), "Subscribe: 21."),
             (drive([4]), "Drive, not claimed: 21."),
-            (Arm(bytes(16), 10, 0).command(), "Arm: 21."),
+            (ArmCommand(bytes(16), 10, 0).command(), "Arm: 21."),
             (sample([1]), "Sample: good."),
             (CLOCK, "Clock: good."),
         ],
@@ -418,7 +418,7 @@ def _drives() -> Iterator[OperationScene]:
     scene.say(operate(4, dead_man=500), "Actuator 4.").say(operate(6, dead_man=800), "Actuator 6.").say(
         drive([4, 6]), "Drive."
     )
-    reply = Driven.decode(bytes.fromhex(scene.steps[-1]["reply"])[3:])
+    reply = DriveReply.decode(bytes.fromhex(scene.steps[-1]["reply"])[3:])
     driver = Driver(Layout((4, 6), (2, 2)), reply, scene.bench.sessions[F1].message_key, dead_man=500)
 
     def message(*values: int, ahead: int = 0, hold: int = 500) -> bytes:

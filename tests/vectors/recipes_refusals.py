@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import (
     Command,
     Function,
@@ -17,6 +16,7 @@ from teds_provision.protocol.messages.frames import (
     update_teds,
     write_teds,
 )
+from teds_provision.protocol.wire_agreement import StationAgreement
 
 from .recipes import CAN, CHALLENGE, IDENTIFY, changed_request
 from .scene import BLOCKS, SIGNED, UUID, Scene, credentials, high, key

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.frames import Command, Function, decode_reply, security_command
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import StationSession
+from teds_provision.protocol.wire_agreement import StationAgreement
 
 from .recipes import CHALLENGE, IDENTIFY, changed_request
 from .scene import KAT, UUID, K, Scene, credentials, key, named_key

@@ -14,7 +14,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import LinkError, NoNodeError
-from teds_provision.links.ble import troubles
+from teds_provision.links.ble import ble_errors
 from teds_provision.links.ble.spec import BleSpec
 from teds_provision.protocol.messages.ble import SERVICE
 
@@ -75,7 +75,7 @@ class Adapter:
         try:
             from bleak import BleakScanner
         except ImportError:
-            raise troubles.missing_bleak() from None
+            raise ble_errors.missing_bleak() from None
         for name in ("bleak", "dbus_fast"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
@@ -95,7 +95,7 @@ class Adapter:
             try:
                 await scanner.stop()
             except Exception as error:  # bleak and D-Bus raise what they like; the scan is over either way
-                trouble = troubles.adapter_trouble(error, self.spec.text)
+                trouble = ble_errors.adapter_trouble(error, self.spec.text)
                 if trouble is not None:
                     raise trouble from error
 
@@ -110,10 +110,10 @@ class Adapter:
             except LinkError:
                 raise
             except Exception as error:
-                trouble = troubles.adapter_trouble(error, self.spec.text)
+                trouble = ble_errors.adapter_trouble(error, self.spec.text)
                 if trouble is not None:
                     raise trouble from error
-                if not troubles.is_busy(error) or attempt == _BUSY_TRIES - 1:
+                if not ble_errors.is_busy(error) or attempt == _BUSY_TRIES - 1:
                     raise
                 await asyncio.sleep(_FIRST_PAUSE * 2**attempt)
         raise AssertionError("every attempt returns or raises")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from teds_provision.errors import NoReaderError
-from teds_provision.links.ble import troubles
+from teds_provision.links.ble import ble_errors
 
 _SECONDS: Final = 5.0
 _ADAPTER, _DEVICE = "org.bluez.Adapter1", "org.bluez.Device1"
@@ -32,7 +32,7 @@ def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
     try:
         import dbus_fast  # noqa: F401
     except ImportError:
-        raise troubles.missing_bleak() from None
+        raise ble_errors.missing_bleak() from None
     try:
         return asyncio.run(asyncio.wait_for(_adapters(bus_address), _SECONDS))
     except NoReaderError:
@@ -40,8 +40,8 @@ def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
     except TimeoutError:
         raise NoReaderError("bluetoothd does not answer.", hint="sudo systemctl restart bluetooth") from None
     except Exception as error:
-        trouble = troubles.adapter_trouble(error, "this machine")
-        raise trouble or NoReaderError(f"Cannot talk to bluetoothd: {error}.", hint=troubles.SERVICE_HINT) from error
+        trouble = ble_errors.adapter_trouble(error, "this machine")
+        raise trouble or NoReaderError(f"Cannot talk to bluetoothd: {error}.", hint=ble_errors.SERVICE_HINT) from error
 
 
 async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
@@ -52,7 +52,7 @@ async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
     try:
         (owned,) = await _call(bus, "org.freedesktop.DBus", "org.freedesktop.DBus", "NameHasOwner", "org.bluez")
         if not owned:
-            raise NoReaderError("The Bluetooth service (bluetoothd) is not running.", hint=troubles.SERVICE_HINT)
+            raise NoReaderError("The Bluetooth service (bluetoothd) is not running.", hint=ble_errors.SERVICE_HINT)
         (objects,) = await _call(bus, "org.bluez", "org.freedesktop.DBus.ObjectManager", "GetManagedObjects")
     finally:
         bus.disconnect()

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import LinkError
-from teds_provision.links.ble import troubles
+from teds_provision.links.ble import ble_errors
 from teds_provision.links.ble.adapter import CONNECT_SECONDS, Adapter
 from teds_provision.links.ports import Direction, Trace
 from teds_provision.protocol.messages import ble
@@ -149,9 +149,9 @@ class BleConnection:
             except Exception as error:
                 self._client = None
                 self._adapter.forget(self.address)
-                if troubles.is_full(error, self._adapter.held):
-                    raise troubles.too_many(len(self._adapter.held), self._adapter.spec.text) from error
-                if not troubles.is_gone(error) or attempt == _FORGOTTEN_TRIES - 1:
+                if ble_errors.is_full(error, self._adapter.held):
+                    raise ble_errors.too_many(len(self._adapter.held), self._adapter.spec.text) from error
+                if not ble_errors.is_gone(error) or attempt == _FORGOTTEN_TRIES - 1:
                     raise ConnectionLostError(_why(error)) from error
         raise AssertionError("every attempt returns or raises")
 

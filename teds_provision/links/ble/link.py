@@ -9,7 +9,7 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any, Final, TypeVar
 
-from teds_provision.links.ble import troubles
+from teds_provision.links.ble import ble_errors
 from teds_provision.links.ble.connection import BleConnection, ConnectionLostError, NotConnectedError
 from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
 from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
@@ -92,7 +92,7 @@ class BleLink:
         return self._ask(frame, self._last)
 
     def exchange_within(self, frame: bytes, seconds: float) -> bytes:
-        """Send one command frame that is of no use after ``seconds``; see ``Prompt.exchange_within``.
+        """Send one command frame that is of no use after ``seconds``; see ``DeadlineLink.exchange_within``.
 
         It is not repeated: the radio's link layer does that by itself.
         """
@@ -100,12 +100,12 @@ class BleLink:
         try:
             return self._loop.run(self.connection.exchange(self._last, frame, seconds))
         except (ConnectionLostError, TimeoutError) as lost:
-            raise troubles.silent(
+            raise ble_errors.silent(
                 self.connection.address, lost if isinstance(lost, ConnectionLostError) else None
             ) from lost
 
     def again(self, frame: bytes) -> bytes:
-        """Send the last frame once more under its transaction; see ``Repeats.again``."""
+        """Send the last frame once more under its transaction; see ``ResendLink.again``."""
         return self._ask(frame, self._last)
 
     def drive(self, message: bytes) -> None:
@@ -113,7 +113,7 @@ class BleLink:
         try:
             self._loop.run(self.connection.write_data(message))
         except ConnectionLostError as lost:
-            raise troubles.silent(self.connection.address, lost) from lost
+            raise ble_errors.silent(self.connection.address, lost) from lost
 
     def close(self) -> None:
         """Disconnect; never raises."""
@@ -134,7 +134,7 @@ class BleLink:
                 pause = min(2 * pause, _LAST_PAUSE)
             except TimeoutError:
                 last, tries = None, tries + 1
-            except troubles.TooManyConnectionsError:
+            except ble_errors.TooManyConnectionsError:
                 if not self._make_room():
                     raise
-        raise troubles.silent(self.connection.address, last)
+        raise ble_errors.silent(self.connection.address, last)

@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.links.can import arrivals, bus, finding, isotp, link, port, shared, spec
+    from teds_provision.links.can import arrivals, bus, bus_multiplexer, identify_broadcast, isotp, link, port, spec
 else:
     __getattr__ = lazy(__name__)

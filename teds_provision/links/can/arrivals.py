@@ -10,15 +10,15 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from teds_provision.errors import AddressConflictError
-from teds_provision.links.can.finding import FunctionalAnswers, ask_all, conflict_text, settle
+from teds_provision.links.can.identify_broadcast import FunctionalAnswers, ask_all, conflict_text, settle
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
 from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
 if TYPE_CHECKING:
+    from teds_provision.links.can.bus_multiplexer import BusMultiplexer, Listener
     from teds_provision.links.can.isotp import Frame
-    from teds_provision.links.can.shared import Listener, SharedBus
 
 _GONE_SECONDS: Final = 3.0
 """A node that has been silent for so long has left."""
@@ -37,7 +37,7 @@ _PAUSE_PER_NODE: Final = 0.03
 
 
 @dataclass
-class _Seen:
+class _SeenNode:
     """What was last known of one node: the last ``round`` that it answered in, and since when it is ``silent``."""
 
     address: int
@@ -51,7 +51,7 @@ class WatchedPort(Protocol):
 
     spec: CanSpec
 
-    def bus(self) -> SharedBus:
+    def bus(self) -> BusMultiplexer:
         """The open bus with its receiving loop."""
 
     def next_transaction(self) -> int:
@@ -69,13 +69,13 @@ class Arrivals:
 
     def __init__(self, port: WatchedPort, notice: NoticeSink) -> None:
         self._port, self._notice = port, notice
-        self._seen: dict[bytes, _Seen] = {}
+        self._seen: dict[bytes, _SeenNode] = {}
         self._conflicts: set[int] = set()
         self._round = 0
         self._asked_at = self._served_at = 0.0
         self._served: set[int] = set()
         self._listener: Listener | None = None
-        self._bus: SharedBus | None = None
+        self._bus: BusMultiplexer | None = None
 
     def lost(self) -> None:
         """The bus failed: its listener is of no use any more."""
@@ -154,7 +154,7 @@ class Arrivals:
     def _is_news(self, address: int, identity: Identity) -> bool:
         """New, back after silence, or reset to factory state. A new address alone is no news."""
         before = self._seen.get(identity.uuid)
-        self._seen[identity.uuid] = _Seen(address, identity.state, self._round)
+        self._seen[identity.uuid] = _SeenNode(address, identity.state, self._round)
         factory = NodeState.FACTORY
         return before is None or (identity.state is factory and before.state is not factory)
 

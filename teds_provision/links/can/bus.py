@@ -40,7 +40,7 @@ _SECONDS: Final = 3.0
 _KEPT: Final = 4096
 
 
-class Echoes:
+class SentFrames:
     """What was sent and has not come back yet. Thread-safe."""
 
     def __init__(self) -> None:
@@ -140,7 +140,7 @@ class Bus:
         self._marks_own = spec.interface != "socketcan"
         gives_back = not self._marks_own and "receive_own_messages" in dict(spec.options)
         back = spec.interface == "udp_multicast" and self._multicast is None
-        self._echoes = Echoes() if back or gives_back else None
+        self._echoes = SentFrames() if back or gives_back else None
 
     @property
     def busy_seconds(self) -> float:

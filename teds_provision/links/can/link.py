@@ -16,6 +16,7 @@ from teds_provision.errors import (
     MessageTooLongError,
     NodeSilentError,
 )
+from teds_provision.links.can.bus_multiplexer import AddressPair, BusMultiplexer
 from teds_provision.links.can.isotp import (
     FUNCTIONAL,
     OVERFLOW,
@@ -27,7 +28,6 @@ from teds_provision.links.can.isotp import (
     physical_id,
     single,
 )
-from teds_provision.links.can.shared import AddressPair, SharedBus
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, decode_reply, refusal
 from teds_provision.protocol.messages.identity import Identity
@@ -85,7 +85,7 @@ class CanLink:
 
     def __init__(
         self,
-        bus: Callable[[], SharedBus],
+        bus: Callable[[], BusMultiplexer],
         number: Callable[[], int],
         address: int,
         *,
@@ -110,18 +110,19 @@ class CanLink:
         return self.ask(frame, tries=TRIES, seconds=self._reply_seconds)
 
     def exchange_within(self, frame: bytes, seconds: float) -> bytes:
-        """Send one command frame that is of no use after ``seconds``; see ``Prompt.exchange_within``."""
+        """Send one command frame that is of no use after ``seconds``; see ``DeadlineLink.exchange_within``."""
         self._last = self._number()
         return self._ask(frame, self._last, tries=TRIES, seconds=seconds, prompt=True)
 
     def again(self, frame: bytes) -> bytes:
-        """Send the last frame once more under its transaction; see ``Repeats.again``."""
+        """Send the last frame once more under its transaction; see ``ResendLink.again``."""
         return self._ask(frame, self._last, tries=TRIES, seconds=self._reply_seconds)
 
     def close(self) -> None:
         """Nothing to leave behind on CAN."""
 
-    # -- to try a node out, see links.ports.OnABus ------------------------------------------------------------------
+    # -- to try a node out, see links.ports.MultiStationLink
+    # ------------------------------------------------------------------
 
     def beside(self, source: int) -> CanLink:
         """A line to the same node from another station's address."""
@@ -191,7 +192,7 @@ class _Exchange:
 
     def __init__(
         self,
-        bus: SharedBus,
+        bus: BusMultiplexer,
         line: AddressPair,
         body: bytes,
         tries: int,

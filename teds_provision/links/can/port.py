@@ -14,7 +14,8 @@ from typing import Final
 from teds_provision.errors import LinkError, NoNodeError
 from teds_provision.links.can.arrivals import Arrivals
 from teds_provision.links.can.bus import Bus
-from teds_provision.links.can.finding import (
+from teds_provision.links.can.bus_multiplexer import BusMultiplexer, Listener
+from teds_provision.links.can.identify_broadcast import (
     LONGEST_SECONDS,
     SILENCE_SECONDS,
     FunctionalAnswers,
@@ -27,7 +28,6 @@ from teds_provision.links.can.finding import (
 )
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.link import CanLink, conflict
-from teds_provision.links.can.shared import Listener, SharedBus
 from teds_provision.links.can.spec import LAST_NODE, parse_spec
 from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
@@ -59,7 +59,7 @@ class CanPort:
         self.spec = parse_spec(spec_text)
         self.place = f"can:{spec_text}"
         self.trace = trace
-        self._bus: SharedBus | None = SharedBus(Bus(self.spec, trace))
+        self._bus: BusMultiplexer | None = BusMultiplexer(Bus(self.spec, trace))
         self._transaction = secrets.randbelow(256)
         self._lock = threading.Lock()
         self._rival_told = False
@@ -69,14 +69,14 @@ class CanPort:
         """What a bus can do."""
         return CAN
 
-    def bus(self) -> SharedBus:
+    def bus(self) -> BusMultiplexer:
         """The open bus with its receiving loop; opens it again after it was lost."""
         with self._lock:
             if self._bus is None or self._bus.failed:
                 if self._bus is not None:
                     self._bus.close()
                     self._bus = None
-                self._bus = SharedBus(Bus(self.spec, self.trace))
+                self._bus = BusMultiplexer(Bus(self.spec, self.trace))
             return self._bus
 
     def use_source(self, source: int) -> None:
@@ -85,7 +85,10 @@ class CanPort:
         self.spec = replace(self.spec, source=source)
 
     def listen(self, wanted: Callable[[Frame], bool]) -> Listener:
-        """Hear every frame for which ``wanted`` is true, data frames and announcements above all; see SharedBus."""
+        """Hear every frame for which ``wanted`` is true, data frames and announcements above all.
+
+        See BusMultiplexer.
+        """
         return self.bus().listen(wanted)
 
     def send(self, frame: Frame) -> None:

@@ -60,7 +60,7 @@ def _logged() -> bool:
     return bool(nfc.clf.log.isEnabledFor(logging.DEBUG))
 
 
-class Quiet:
+class QuietExchange:
     """What a Type 4 tag of nfcpy does with an APDU, without writing it out for the log."""
 
     _dep: Any
@@ -101,11 +101,11 @@ class Frontend(nfc.ContactlessFrontend):  # type: ignore[misc]
         opened = bool(super().open(path))
         pn53x = getattr(nfc.clf, "pn53x", None)  # imported by nfcpy when its first driver is
         if opened and pn53x is not None and isinstance(self.device, pn53x.Device):
-            self.device.send_cmd_recv_rsp = _Slim(self.device, pn53x).exchange
+            self.device.send_cmd_recv_rsp = _LeanExchange(self.device, pn53x).exchange
         return opened
 
 
-class _Slim:
+class _LeanExchange:
     """The exchange of a PN53x, registers and time-out set when target, bit rate or time-out are others."""
 
     def __init__(self, device: Any, pn53x: Any) -> None:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from teds_provision.errors import NoReaderError, UsageError
 from teds_provision.lazy import how_to_install
-from teds_provision.links.nfc.nfcpy import Quiet, Type2TagCommandError, Type4ATag, nfc
+from teds_provision.links.nfc.nfcpy import QuietExchange, Type2TagCommandError, Type4ATag, nfc
 from teds_provision.links.nfc.tag import FieldLostError, ReaderLostError, ReaderTag, Type2, Type4Ndef
 from teds_provision.links.ports import Trace
 
@@ -198,7 +198,7 @@ def _tag(card: _Card) -> ReaderTag:
     return ReaderTag(_PcscType4(card, card.target), "Type 4")
 
 
-class _Apdus:
+class _ApduExchange:
     """Stands where nfcpy has its ISO-DEP."""
 
     def __init__(self, card: _Card) -> None:
@@ -210,7 +210,7 @@ class _Apdus:
         return bytearray(self._card.transmit(_PRESENCE if command is None else bytes(command)))
 
 
-class _PcscType4(Quiet, Type4ATag):  # type: ignore[misc]
+class _PcscType4(QuietExchange, Type4ATag):  # type: ignore[misc]
     """Type 4 behind a PC/SC reader."""
 
     NDEF = Type4Ndef
@@ -218,7 +218,7 @@ class _PcscType4(Quiet, Type4ATag):  # type: ignore[misc]
     def __init__(self, card: _Card, target: _Target) -> None:
         super(Type4ATag, self).__init__(card, target)
         self._nfcid = bytearray(target.uid)
-        self._dep = _Apdus(card)
+        self._dep = _ApduExchange(card)
         self._extended_length_support = False
 
     def _is_present(self) -> bool:

@@ -38,29 +38,29 @@ class NodeInField:
 
 
 @dataclass(frozen=True)
-class Foreign:
+class ForeignTag:
     """A tag that is no node of ours; ``text`` says what it is."""
 
     tag: ReaderTag
     text: str
 
 
-def look(tag: ReaderTag) -> NodeInField | Foreign:
+def look(tag: ReaderTag) -> NodeInField | ForeignTag:
     """Read the initial message and say what the tag is; raises FieldLostError and ReaderLostError."""
     try:
         records = message.decode(tag.read())
     except GarbledError as error:
-        return Foreign(tag, _described(tag, error.message))
+        return ForeignTag(tag, _described(tag, error.message))
     service = tnep.our_service(records)
     if service is None:
-        return Foreign(tag, _described(tag, f"It holds {_listed(records)}."))
+        return ForeignTag(tag, _described(tag, f"It holds {_listed(records)}."))
     payload = tnep.external(records, tnep.ID_TYPE)
     if payload is None:
-        return Foreign(tag, _described(tag, "It offers the service but gives no UUID (no id record)."))
+        return ForeignTag(tag, _described(tag, "It offers the service but gives no UUID (no id record)."))
     try:
         identity = Identity.decode(payload)
     except BadDataError as error:
-        return Foreign(tag, _described(tag, error.message))
+        return ForeignTag(tag, _described(tag, error.message))
     return NodeInField(tag, service, identity, hints.charging(records), hints.ble_address(records))
 
 
@@ -130,7 +130,7 @@ class NfcPort:
         """
         until, told, never = time.monotonic() + seconds, "", threading.Event()
         waiting = False
-        seen: NodeInField | Foreign | None = None
+        seen: NodeInField | ForeignTag | None = None
         while (left := until - time.monotonic()) > 0:
             seen = self._look(notice, never)
             if isinstance(seen, NodeInField) and wanted(seen.identity):
@@ -181,7 +181,7 @@ class NfcPort:
                 # Short where nodes are being changed, so that none is waited for.
                 stop.wait(_SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE)
                 continue
-            if isinstance(seen, Foreign):
+            if isinstance(seen, ForeignTag):
                 told = _tell(seen, told, notice)
                 self._stay(seen, stop, _LOOK_AGAIN)
                 continue
@@ -246,7 +246,7 @@ class NfcPort:
     def _contact(self, visit: NodeInField, notice: NoticeSink) -> Contact:
         return _contact(visit, NfcLink(self, visit, notice), self.trace)
 
-    def _look(self, notice: NoticeSink, stop: threading.Event) -> NodeInField | Foreign | None:
+    def _look(self, notice: NoticeSink, stop: threading.Event) -> NodeInField | ForeignTag | None:
         """Poll once; None when nothing lies there or the reader is away (which is told once)."""
         try:
             with self.turn:
@@ -269,7 +269,7 @@ class NfcPort:
             stop.wait(_REOPEN)
             return None
 
-    def _sense_and_look(self) -> NodeInField | Foreign | None:
+    def _sense_and_look(self) -> NodeInField | ForeignTag | None:
         with self.turn:
             if self._reader is None:
                 raise ReaderLostError("it was closed")
@@ -277,7 +277,7 @@ class NfcPort:
             self._failures = 0
             return None if tag is None else look(tag)
 
-    def _stay(self, seen: NodeInField | Foreign, stop: threading.Event, seconds: float | None) -> None:
+    def _stay(self, seen: NodeInField | ForeignTag, stop: threading.Event, seconds: float | None) -> None:
         """Wait until the tag does not answer (one miss: the next look finds who is there), at most ``seconds``."""
         until = None if seconds is None else time.monotonic() + seconds
         while not stop.is_set() and (until is None or time.monotonic() < until):
@@ -330,7 +330,7 @@ class NfcLink:
             return self._exchange(frame, self._last)
 
     def again(self, frame: bytes) -> bytes:
-        """Send the last frame once more under its transaction; see ``Repeats.again``."""
+        """Send the last frame once more under its transaction; see ``ResendLink.again``."""
         with self._port.turn:
             return self._exchange(frame, self._last)
 
@@ -387,9 +387,9 @@ def _contact(visit: NodeInField, link: NfcLink, trace: Trace | None) -> Contact:
     return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble, trace=trace)
 
 
-def _tell(seen: NodeInField | Foreign, told: str, notice: NoticeSink) -> str:
+def _tell(seen: NodeInField | ForeignTag, told: str, notice: NoticeSink) -> str:
     """Name a tag that is waited past, unless it was the last one named; return what was said."""
-    if isinstance(seen, Foreign):
+    if isinstance(seen, ForeignTag):
         text = seen.text
         if text != told:
             notice(Notice("foreign-tag", text))
@@ -400,7 +400,7 @@ def _tell(seen: NodeInField | Foreign, told: str, notice: NoticeSink) -> str:
     return text
 
 
-def _has_left(here: bytes | None, seen: NodeInField | Foreign | None, gone_at: float) -> TypeGuard[bytes]:
+def _has_left(here: bytes | None, seen: NodeInField | ForeignTag | None, gone_at: float) -> TypeGuard[bytes]:
     """Whether the node ``here``, which is not ``seen``, is gone: something else lies there, or nothing for a while."""
     return here is not None and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE)
 

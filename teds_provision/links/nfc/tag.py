@@ -15,7 +15,7 @@ from teds_provision.errors import GarbledError, NodeSilentError, NoReaderError
 from teds_provision.links.nfc.nfcpy import (
     NfcpyType2Ndef,
     NfcpyType4Ndef,
-    Quiet,
+    QuietExchange,
     Type2Tag,
     Type2TagCommandError,
     Type4ATag,
@@ -119,7 +119,7 @@ class Type4Ndef(NfcpyType4Ndef):  # type: ignore[misc]
         return found
 
 
-class _Patient:
+class _BufferedFrontend:
     """The front end for one command at a time: whatever the tag asks for, its answer is there by ``until``."""
 
     def __init__(self, clf: Any) -> None:
@@ -137,7 +137,7 @@ class IsoDep(nfc.tag.tt4.IsoDepInitiator):  # type: ignore[misc]
     """ISO-DEP, the reader's side, with an end: nfcpy follows a tag that says S(WTX), or R(ACK), or chains, for ever."""
 
     def __init__(self, clf: Any, fsc: int, fwt: float) -> None:
-        self._air = _Patient(clf)
+        self._air = _BufferedFrontend(clf)
         super().__init__(self._air, fsc, fwt)
 
     def exchange(self, command: bytes | None, timeout: float | None = None) -> Any:
@@ -149,7 +149,7 @@ class IsoDep(nfc.tag.tt4.IsoDepInitiator):  # type: ignore[misc]
             raise Type4TagCommandError(nfc.tag.PROTOCOL_ERROR) from error
 
 
-class _Type4Tag(Quiet, Type4ATag):  # type: ignore[misc]
+class _Type4Tag(QuietExchange, Type4ATag):  # type: ignore[misc]
     """Type 4A, its answer to select read as ISO/IEC 14443-4 clause 5.2 lays it out (nfcpy takes fixed positions)."""
 
     NDEF = Type4Ndef

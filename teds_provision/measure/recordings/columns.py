@@ -121,7 +121,7 @@ def integers(values: Sequence[int]) -> NDArray[Any]:
     return np.array(values, dtype=object)
 
 
-class Joined:
+class BlockJoiner:
     """Joins blocks of a stream that follow each other, so that few and large ones go on.
 
     :meth:`take` gives back what is ready, at the latest when :data:`ROWS` rows wait; nodes stay as near to each other

@@ -39,7 +39,7 @@ _BURST: Final = 5000  # rows of a grid at a time
 
 
 @dataclass(frozen=True)
-class Converted:
+class ConversionResult:
     """What became of a recording: the files, oldest part first, and what went into them."""
 
     recording: Recording
@@ -47,7 +47,7 @@ class Converted:
     summary: RecordingSummary
 
 
-def convert(source: Path, target: Path, *, wide: bool = False) -> Converted:
+def convert(source: Path, target: Path, *, wide: bool = False) -> ConversionResult:
     """Write a recording in the format of ``target``'s suffix. ``wide``: as rows of one grid (text and Parquet).
 
     Of a recording that is still being written, or was cut off, what is whole by now is taken. Raises UsageError
@@ -82,7 +82,7 @@ def convert(source: Path, target: Path, *, wide: bool = False) -> Converted:
             sync_folder(target.parent)
     except OSError as error:
         raise as_sink_failure(error, str(target)) from error
-    return Converted(recording, files, summary)
+    return ConversionResult(recording, files, summary)
 
 
 def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, wide: bool) -> list[Path]:

@@ -12,8 +12,8 @@ import numpy as np
 
 from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
-from teds_provision.measure.blocks import Block, Invalid, NodeReport, Note, State
-from teds_provision.measure.recordings.columns import Joined, integers, stacked
+from teds_provision.measure.blocks import Block, InvalidValues, NodeReport, Note, State
+from teds_provision.measure.recordings.columns import BlockJoiner, integers, stacked
 from teds_provision.measure.recordings.source import (
     MOST,
     Entry,
@@ -86,7 +86,7 @@ class JsonLines(Recording):
 
     def entries(self) -> Iterator[Entry]:
         """See the class above."""
-        joined, numbers = Joined(), dict[str, dict[tuple[int, ...], int]]()
+        joined, numbers = BlockJoiner(), dict[str, dict[tuple[int, ...], int]]()
         together: list[dict[str, Any]] = []  # lines of one block: a line for each channel
         for line in self._lines():
             event = self._event(line)
@@ -163,10 +163,10 @@ def report_of(words: dict[str, Any]) -> NodeReport | None:
         return None
     counts = {name: words.get(name) for name in _COUNTS}
     error, time, reasons = words.get("clock_error"), words.get("time"), words.get("invalid_why")
-    why: list[Invalid] = []
+    why: list[InvalidValues] = []
     for one in reasons[: MOST.text] if isinstance(reasons, list) else ():
         if isinstance(one, dict) and isinstance(one.get("channel"), int) and isinstance(one.get("count"), int):
-            why.append(Invalid(one["channel"], str(one.get("why"))[: MOST.text], one["count"]))
+            why.append(InvalidValues(one["channel"], str(one.get("why"))[: MOST.text], one["count"]))
     return NodeReport(
         uuid,
         state,

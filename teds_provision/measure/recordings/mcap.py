@@ -20,7 +20,7 @@ import numpy as np
 from teds_provision.errors import BadDataError
 from teds_provision.files import open_to_read
 from teds_provision.measure.blocks import Block, ChannelFacts, Note
-from teds_provision.measure.recordings.columns import Joined, raw_kind
+from teds_provision.measure.recordings.columns import BlockJoiner, raw_kind
 from teds_provision.measure.recordings.json_lines import report_of
 from teds_provision.measure.recordings.source import MOST, Entry, Recording, facts_of, station_of, unix_of
 from teds_provision.measure.sinks.mcap.recording import LITTLE_ENDIAN, TYPE, layout
@@ -141,7 +141,7 @@ class McapRecording(Recording):
         schemas: dict[int, str] = {0: ""}
         topics: dict[int, _Topic] = {}
         waiting: dict[tuple[int, int], list[bytes]] = {}  # messages by topic and length
-        joined, count = Joined(), 0
+        joined, count = BlockJoiner(), 0
         self.foreign = 0
         for code, content in self._records():
             if code == MESSAGE and len(content) >= MESSAGE_HEAD.size - HEAD.size:
@@ -216,7 +216,7 @@ class McapRecording(Recording):
         return number, _Topic(name, kind, uuid, stream, tuple(one.number for one in known), facts)
 
     def _blocks(
-        self, waiting: dict[tuple[int, int], list[bytes]], topics: dict[int, _Topic], joined: Joined
+        self, waiting: dict[tuple[int, int], list[bytes]], topics: dict[int, _Topic], joined: BlockJoiner
     ) -> Iterator[Entry]:
         for (number, length), contents in waiting.items():
             topic = topics[number]

@@ -27,7 +27,7 @@ from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import SetPointCommand, StationFacts
 from teds_provision.measure.buses import Buses
 from teds_provision.measure.request import MeasurementRequest, Requirements
-from teds_provision.measure.runner import Ended, Measurement, Watcher
+from teds_provision.measure.runner import Measurement, MeasurementEnd, Watcher
 from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
 from teds_provision.measure.sinks.wide import WIDE
 from teds_provision.protocol.operation.stream_commands import StreamKind
@@ -76,7 +76,7 @@ class MeasurementJob:
         self._commands: Callable[[SetPointCommand], None] = lambda _command: None
         self.sinks = self._new_sinks()
         self.measurement: Measurement | None = None
-        self.ended: Ended | None = None
+        self.ended: MeasurementEnd | None = None
         self.lent: set[bytes] = set()
         self.error: TedsProvisionError | None = None
         self._stop = threading.Event()
@@ -89,7 +89,7 @@ class MeasurementJob:
         *,
         watcher: Watcher | None = None,
         duration: float | None = None,
-    ) -> Ended:
+    ) -> MeasurementEnd:
         """Measure until ``stop``, for ``duration`` seconds of data, or to the kept end; nodes and group are held.
 
         Raises PolicyError where another measurement holds one of them, and what a sink's ``open`` raises.

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.measure.blocks import Block, Invalid
+from teds_provision.measure.blocks import Block, InvalidValues
 from teds_provision.measure.buses import MeasuredBus
-from teds_provision.measure.clock import ClockMap, HostClock, Monotone
-from teds_provision.measure.hearing import HeardStream
+from teds_provision.measure.clock import ClockMap, HostClock, MonotonicStamps
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.measure.trusting import Trusted, ask_clock
-from teds_provision.protocol.operation.stream_commands import Clock, StreamKind, decode_stopped, stop
+from teds_provision.measure.stream_receiver import ReceivedStream
+from teds_provision.measure.verified_session import VerifiedSession, ask_clock
+from teds_provision.protocol.operation.stream_commands import ClockReply, StreamKind, decode_stopped, stop
 from teds_provision.protocol.operation.subscription import Receiver, StreamPlan
 from teds_provision.talk.conversation import SessionLostError
 
@@ -38,9 +38,9 @@ class StreamTotals:
     bad: int = 0
     invalid: int = 0
     clock_error: float | None = None
-    invalid_why: tuple[Invalid, ...] = ()
+    invalid_why: tuple[InvalidValues, ...] = ()
 
-    def add(self, heard: HeardStream) -> None:
+    def add(self, heard: ReceivedStream) -> None:
         """Count a run."""
         counts = heard.receiver.counts
         self.messages += counts.good
@@ -53,7 +53,7 @@ class StreamTotals:
         self.invalid = sum(one.count for one in self.invalid_why)
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
 
-    def with_run(self, heard: HeardStream | None) -> StreamTotals:
+    def with_run(self, heard: ReceivedStream | None) -> StreamTotals:
         """These totals with those of the run that still goes on; themselves stay as they are."""
         sums = replace(self)
         if heard is not None:
@@ -61,12 +61,12 @@ class StreamTotals:
         return sums
 
 
-def added(*parts: Sequence[Invalid]) -> tuple[Invalid, ...]:
+def added(*parts: Sequence[InvalidValues]) -> tuple[InvalidValues, ...]:
     """Counts of the same channel and reason put together."""
     counts: Counter[tuple[int, str]] = Counter()
     for one in chain.from_iterable(parts):
         counts[one.channel, one.why] += one.count
-    return tuple(Invalid(channel, why, count) for (channel, why), count in counts.items())
+    return tuple(InvalidValues(channel, why, count) for (channel, why), count in counts.items())
 
 
 class NodeStreams:
@@ -78,13 +78,13 @@ class NodeStreams:
     def __init__(self, host: HostClock, deliver: Callable[[Block], None]) -> None:
         self.clock = ClockMap()
         self.mapping = threading.Lock()
-        self.running: dict[int, HeardStream] = {}
+        self.running: dict[int, ReceivedStream] = {}
         self.totals: dict[int, StreamTotals] = {}
         self._host, self._hand_on = host, deliver
         self._held: list[Block] | None = None  # what comes before its channels were described
         self._gate = threading.Lock()
         self._run = 0  # the session's last
-        self._monotone: dict[int, Monotone] = {}
+        self._monotone: dict[int, MonotonicStamps] = {}
 
     def new_session(self) -> None:
         """Nothing is known of the node's clock: it may have started anew. Runs begin at 1 again.
@@ -115,7 +115,7 @@ class NodeStreams:
             else:
                 self._held.append(block)
 
-    def tell_time(self, trusted: Trusted) -> Clock:
+    def tell_time(self, trusted: VerifiedSession) -> ClockReply:
         """One Clock: sends and waits without the map's lock, which the hearing thread needs."""
         reply, exchange = ask_clock(trusted.node)
         with self.mapping:
@@ -123,7 +123,7 @@ class NodeStreams:
         return reply
 
     def subscribe(
-        self, bus: MeasuredBus, trusted: Trusted, plan: StreamPlan, address: int, *, ahead: float = 0.0
+        self, bus: MeasuredBus, trusted: VerifiedSession, plan: StreamPlan, address: int, *, ahead: float = 0.0
     ) -> None:
         """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
@@ -136,7 +136,7 @@ class NodeStreams:
         receiver = Receiver(
             plan, reply, trusted.node.message_key, previous=before.receiver if before is not None else None
         )
-        monotone = self._monotone.setdefault(number, Monotone())
+        monotone = self._monotone.setdefault(number, MonotonicStamps())
         interpreter = StreamInterpreter(
             trusted.sheet,
             plan,
@@ -147,13 +147,13 @@ class NodeStreams:
             raw_only=UNSIGNED if trusted.unsigned else "",
         )
         assembly = bus.assembly(plan.length)
-        heard = HeardStream(receiver, assembly, interpreter, self.clock, self.mapping, self._deliver)
+        heard = ReceivedStream(receiver, assembly, interpreter, self.clock, self.mapping, self._deliver)
         heard.heard += ahead
         self.running[number] = heard
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
         bus.hearing.register(address, number, heard)
 
-    def stop(self, bus: MeasuredBus, trusted: Trusted | None, address: int) -> None:
+    def stop(self, bus: MeasuredBus, trusted: VerifiedSession | None, address: int) -> None:
         """Stop each in order, so that its counter tells what was lost at the end; without a session hear no more.
 
         First the messages that are being filled may come: the samples until now are all wanted, and Stop takes back
@@ -185,7 +185,7 @@ class NodeStreams:
 
     # -- whether the node is still there -----------------------------------------------------------------------------
 
-    def _steady(self) -> list[HeardStream]:
+    def _steady(self) -> list[ReceivedStream]:
         """Streams whose messages come all the time: events may be silent for ever, and so may what waits."""
         return [
             one

@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.keeper import NodeKeeper
+from teds_provision.measure.node_supervisor import NodeSupervisor
 from teds_provision.measure.running.common_start import CommonStart
-from teds_provision.measure.trusting import Trusted
+from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.protocol.operation.can_frames import trigger_identifier
 from teds_provision.protocol.operation.stream_commands import Action
 from teds_provision.protocol.operation.subscription import TickBounds
@@ -25,7 +25,7 @@ HELD_BACK = 10_000_000  # ns: a controller may hold a frame back while others wi
 # sees it late. The bounds alone are below a millisecond, and would turn away nodes that tell the truth as they know it.
 
 
-def pull(common_start: CommonStart, keepers: Sequence[NodeKeeper], note: Callable[[str], None]) -> None:
+def pull(common_start: CommonStart, keepers: Sequence[NodeSupervisor], note: Callable[[str], None]) -> None:
     """Arm every node, send a frame on each bus, read each node's mark: it must meet the time of sending."""
     common_start.triggered()
     token = TriggerToken.draw()
@@ -51,8 +51,8 @@ def _send(port: CanPort, token: TriggerToken) -> tuple[int, int]:
 
 
 def _arm(
-    token: TriggerToken, keepers: Sequence[NodeKeeper], note: Callable[[str], None]
-) -> list[tuple[NodeKeeper, Trusted]]:
+    token: TriggerToken, keepers: Sequence[NodeSupervisor], note: Callable[[str], None]
+) -> list[tuple[NodeSupervisor, VerifiedSession]]:
     """The nodes that wait for the trigger now."""
     armed = []
     for keeper in keepers:
@@ -68,7 +68,9 @@ def _arm(
     return armed
 
 
-def _mark(keeper: NodeKeeper, trusted: Trusted, before: int, after: int, note: Callable[[str], None]) -> int | None:
+def _mark(
+    keeper: NodeSupervisor, trusted: VerifiedSession, before: int, after: int, note: Callable[[str], None]
+) -> int | None:
     """The tick at which the node saw the trigger, which went out between two times (monotonic ns).
 
     None where it does not say, or names a moment at which the frame was not on the bus; such a node is stopped.

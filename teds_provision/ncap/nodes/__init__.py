@@ -1,5 +1,5 @@
 """The nodes of the daemon.
 
-Who is there (``watching``, ``directory``), what they are worth (``looking``), what is done with them (``desk``,
-``sheets``, ``provisioning``, ``holding``), and those that it makes itself (``virtual``).
+Who is there (``link_watch``, ``directory``), what they are worth (``inspection``), what is done with them
+(``node_jobs``, ``sheets``, ``provisioning``, ``actuator_leases``), and those that it makes itself (``virtual``).
 """

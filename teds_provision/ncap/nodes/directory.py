@@ -20,7 +20,7 @@ from teds_provision.ncap.sinks import for_readers
 from teds_provision.station.shown_units import shown_units
 from teds_provision.station.station import Station
 from teds_provision.steps.inventory import with_verdicts
-from teds_provision.steps.reading import NodeVerdict
+from teds_provision.steps.readings import NodeVerdict
 from teds_provision.store import Search
 from teds_provision.store.records import iso
 from teds_provision.teds.sheet import Channel, Sheet
@@ -31,7 +31,7 @@ MOST_GONE: Final = 200
 
 
 @dataclass
-class Seen:
+class NodePresence:
     """What the links say of one node now."""
 
     place: str = ""
@@ -59,7 +59,7 @@ class NodeDirectory:
         self.actuator: Callable[[str, int], dict[str, Any] | None] = lambda _uuid, _number: None
         self.virtual: Callable[[str], bool] = lambda _uuid: False
         self._lock, self._reading = threading.RLock(), threading.Lock()
-        self._seen: dict[str, Seen] = {}
+        self._seen: dict[str, NodePresence] = {}
         self._rows: dict[str, dict[str, Any]] = {}
         self._judged: dict[str, NodeVerdict | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
@@ -120,7 +120,7 @@ class NodeDirectory:
         """Change what is known of a node; with ``state`` every client is told (``came``, ``left``, ``verified`` …)."""
         verdict = facts.pop("verdict", None)  # for the event: what is shown is judged from the row of reading
         with self._lock:
-            seen = self._seen.setdefault(uuid, Seen())
+            seen = self._seen.setdefault(uuid, NodePresence())
             seen.version += 1
             for name, value in facts.items():
                 setattr(seen, name, value)
@@ -134,10 +134,10 @@ class NodeDirectory:
             told |= {} if verdict is None else {"verdict": verdict}
             self._live.event("node", uuid=uuid, state=state, **told)
 
-    def seen(self, uuid: str) -> Seen:
+    def seen(self, uuid: str) -> NodePresence:
         """What the links say of a node."""
         with self._lock:
-            return self._seen.get(uuid) or Seen()
+            return self._seen.get(uuid) or NodePresence()
 
     def stranger(self, place: str, uuid: str, *, there: bool) -> bool:
         """Count a node that whitelist mode does not look at; True where that is news."""
@@ -182,7 +182,7 @@ class NodeDirectory:
         """The name under which a node is published, and whether it is only what the node says itself (unverified)."""
         channels = self._sheet(uuid)
         with self._lock:
-            judged = self._verdicts(uuid, self._seen.get(uuid) or Seen())["verdict"]
+            judged = self._verdicts(uuid, self._seen.get(uuid) or NodePresence())["verdict"]
             if channels and judged is not None and judged["verdict"] == "unsigned":
                 return self._own_names.get(uuid, ""), True
         return self.name(uuid), False
@@ -232,7 +232,7 @@ class NodeDirectory:
         """One node: api.md, `/nodes/UUID`."""
         channels = self._sheet(uuid)
         with self._lock:
-            seen = self._seen.get(uuid) or Seen()
+            seen = self._seen.get(uuid) or NodePresence()
             row = self._rows.get(uuid, {})
             out = {
                 "uuid": uuid,
@@ -270,7 +270,7 @@ class NodeDirectory:
         out["channels"] = [{**one, **self._now(uuid, one["number"])} for one in channels]
         return out
 
-    def _verdicts(self, uuid: str, seen: Seen) -> dict[str, Any]:
+    def _verdicts(self, uuid: str, seen: NodePresence) -> dict[str, Any]:
         """The one verdict on a node, from its row of reading; and beside it what it said in no session.
 
         Of a node that was never read in a session, nor kept, the latter is all that is known.

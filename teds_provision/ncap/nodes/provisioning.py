@@ -27,23 +27,23 @@ from teds_provision.errors import (
 )
 from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.desk import Desk, Errand, untold
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.looking import STRANGERS_TEDS, as_problem
+from teds_provision.ncap.nodes.inspection import STRANGERS_TEDS, as_problem
+from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, untold
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, prepare
-from teds_provision.steps.document import write_sheet
+from teds_provision.steps.datasheet_edit import write_sheet
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import Provisioned, newcomer, provision
-from teds_provision.steps.read import list_blocks
-from teds_provision.steps.verify import Verified, require_authentic
+from teds_provision.steps.provision import ProvisionResult, newcomer, provision
+from teds_provision.steps.teds_read import list_blocks
+from teds_provision.steps.verify import Verification, require_authentic
 from teds_provision.store.audit import ACTOR
 from teds_provision.talk.conversation import Conversation, SessionLostError
-from teds_provision.talk.progress import Silent, StepResult
+from teds_provision.talk.progress import SilentReporter, StepResult
 from teds_provision.teds.formats import placed
 
 _log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ _SUFFIXES: Final = (".csv", ".json", ".toml", ".txt")
 
 
 @dataclass
-class Run:
+class ProvisioningRun:
     """One request; as the API shows it by :meth:`as_json`."""
 
     uuid: str
@@ -63,7 +63,7 @@ class Run:
     steps: list[dict[str, Any]] = field(default_factory=list)
     error: dict[str, str] | None = None
     verdict: str | None = None
-    errand: Errand[Any] | None = None
+    errand: NodeJob[Any] | None = None
 
     def as_json(self) -> dict[str, Any]:
         """api.md, `/nodes/UUID/provision`."""
@@ -79,12 +79,12 @@ class Provisioning:
         station: Station,
         roster: NodeDirectory,
         live: Live,
-        desk: Desk,
+        desk: NodeJobs,
         apart: Callable[[str, str], AbstractContextManager[None]] = lambda _uuid, _why: nullcontext(),
     ) -> None:
         self._station, self._roster, self._live, self._desk = station, roster, live, desk
         self._apart = apart
-        self._runs: dict[str, Run] = {}
+        self._runs: dict[str, ProvisioningRun] = {}
         self._guard = threading.Lock()
 
     def of(self, uuid: str) -> dict[str, Any]:
@@ -117,7 +117,7 @@ class Provisioning:
             before = self._runs.get(uuid)
             if before is not None and before.state in ("waiting", "running"):
                 raise UsageError(f"Node {uuid} is already being provisioned.", hint="Cancel that first.")
-            run = self._runs[uuid] = Run(uuid)  # at once: a second request meanwhile is refused
+            run = self._runs[uuid] = ProvisioningRun(uuid)  # at once: a second request meanwhile is refused
         # The text of a calibration, as the file that the steps read; it is there until the run has ended.
         folder: tempfile.TemporaryDirectory[str] | None = None
         try:
@@ -176,7 +176,9 @@ class Provisioning:
 
     # -- the ways to the node ----------------------------------------------------------------------------------------
 
-    def _wait_for_a_tap(self, run: Run, work: Callable[[Conversation], None], clean: Callable[[], None]) -> None:
+    def _wait_for_a_tap(
+        self, run: ProvisioningRun, work: Callable[[Conversation], None], clean: Callable[[], None]
+    ) -> None:
         run.state, run.waits_for, run.until = "waiting", "tap", time.time() + WAITING
         errand = run.errand = self._desk.wait_for(None if run.uuid == NEXT else run.uuid, "provision", work, WAITING)
         self._tell(run)
@@ -197,7 +199,9 @@ class Provisioning:
 
         threading.Thread(target=watch, name=f"provision {run.uuid[:8]}", daemon=True).start()
 
-    def _on_the_bus(self, run: Run, work: Callable[[Conversation], None], clean: Callable[[], None]) -> None:
+    def _on_the_bus(
+        self, run: ProvisioningRun, work: Callable[[Conversation], None], clean: Callable[[], None]
+    ) -> None:
         try:
             with self._apart(run.uuid, "let go for provision"):
                 self._desk.with_node(run.uuid, "it is provisioned", work)
@@ -217,7 +221,7 @@ class Provisioning:
             self._fail(run, as_problem(untold(error)))
             clean()
 
-    def _work(self, run: Run, node: Conversation, order: BuildOrder) -> None:
+    def _work(self, run: ProvisioningRun, node: Conversation, order: BuildOrder) -> None:
         run.state, run.waits_for, run.until = "running", None, None
         uuid = node.uuid.hex()
         if run.uuid == NEXT:
@@ -226,10 +230,10 @@ class Provisioning:
                 run.uuid = uuid
                 self._runs[uuid] = run
         self._tell(run)
-        reporter = _Told(run, self._live)
+        reporter = _RunReporter(run, self._live)
         try:
             # Whoever asks for this very node, or for the one that they are about to tap, has accepted its key.
-            done: Provisioned = provision(
+            done: ProvisionResult = provision(
                 self._station, node, order, accept=lambda _who: None, reporter=reporter, adopt=lambda _brought: None
             )
         except SessionLostError as lost:
@@ -243,19 +247,19 @@ class Provisioning:
         run.state = "done"  # last: who hears it asks for the node next
         self._tell(run)
 
-    def _fail(self, run: Run, error: dict[str, str]) -> None:
+    def _fail(self, run: ProvisioningRun, error: dict[str, str]) -> None:
         run.state, run.error, run.waits_for, run.until = "failed", error, None, None
         self._tell(run)
 
-    def _tell(self, run: Run) -> None:
+    def _tell(self, run: ProvisioningRun) -> None:
         facts = {"waits_for": run.waits_for, "until": run.until, "error": run.error, "verdict": run.verdict}
         self._live.event("provision", uuid=run.uuid, state=run.state, **facts)
 
 
-class _Told:
+class _RunReporter:
     """A reporter whose steps go to the run and to everybody who watches."""
 
-    def __init__(self, run: Run, live: Live) -> None:
+    def __init__(self, run: ProvisioningRun, live: Live) -> None:
         self._run, self._live = run, live
 
     def started(self, step: str) -> None:
@@ -302,7 +306,7 @@ def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
 # assurance ``bus``).
 
 
-class Adopting:
+class AutoProvisioner:
     """Takes up what may be; ``adopts`` says whether factory nodes of a bus are among it.
 
     ``signs``: whether the datasheet that such a node brought is signed at once, by a person's word at the start, where
@@ -372,7 +376,7 @@ class Adopting:
                 node,
                 BuildOrder(adopt=True),
                 accept=lambda _who: None,
-                reporter=Silent(),
+                reporter=SilentReporter(),
                 adopt=lambda _brought: None,
             )
         except (BadDataError, PolicyError) as error:
@@ -385,18 +389,18 @@ class Adopting:
         self._roster.note(uuid, "verified", problem=None, verdict=verdict, heard=None, looked=time.time())
         return True
 
-    def _virtual(self, node: Conversation, uuid: str) -> Verified:
+    def _virtual(self, node: Conversation, uuid: str) -> Verification:
         """A virtual transducer gets the datasheet that it was made from."""
         station, profile = self._station, self._virtuals.profile_of(uuid)
         if profile is not None:
             order = BuildOrder(
                 profile, calibration=self._virtuals.calibration_of(uuid), name=self._virtuals.name_of(uuid) or None
             )
-            return provision(station, node, order, accept=lambda _who: None, reporter=Silent()).verified
+            return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter()).verified
         blocks = placed((self._virtuals.document_of(uuid) or "").encode())
         with station.turn(node.uuid):
             agree(station, node, identify(station, node))
-            done = write_sheet(station, node, blocks, Silent())
+            done = write_sheet(station, node, blocks, SilentReporter())
         if self._virtuals.name_of(uuid):
             station.nodes.remember(node.uuid, name=self._virtuals.name_of(uuid))
         return done.verified

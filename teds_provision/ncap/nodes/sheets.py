@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadDataError, NotFoundError, TedsProvisionError, UsageError
 from teds_provision.lazy import late
-from teds_provision.ncap.nodes.desk import Desk
 from teds_provision.ncap.nodes.directory import NodeDirectory
-from teds_provision.ncap.nodes.looking import read_anew
+from teds_provision.ncap.nodes.inspection import read_anew
+from teds_provision.ncap.nodes.node_jobs import NodeJobs
 from teds_provision.station.station import Station
 from teds_provision.steps.build import guard
-from teds_provision.steps.document import SheetPlan, plan_sheet, write_sheet
+from teds_provision.steps.datasheet_edit import SheetPlan, plan_sheet, write_sheet
 from teds_provision.steps.identify import identify
-from teds_provision.steps.read import read_image
-from teds_provision.steps.reading import NodeVerdict, is_keyed, verdict_of
-from teds_provision.steps.verify import Verified, known_of, session, verify_image
+from teds_provision.steps.readings import NodeVerdict, is_keyed, verdict_of
+from teds_provision.steps.teds_read import read_image
+from teds_provision.steps.verify import Verification, known_of, session, verify_image
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import Silent
+from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.calibration.model import is_finite
 from teds_provision.teds.channel import TURN
 from teds_provision.teds.formats import TedsBlock, placed, write_blocks
@@ -42,7 +42,7 @@ MeasuredSheet = Callable[[str], Image | None]
 
 
 @dataclass(frozen=True)
-class ReadSheet:
+class DatasheetRead:
     """What a node has, or had when it was last read (``now`` False)."""
 
     image: Image
@@ -53,10 +53,10 @@ class ReadSheet:
 class Sheets:
     """Reads and writes. ``measured`` gives the datasheet of a node that a measurement holds, as its session has it."""
 
-    def __init__(self, station: Station, roster: NodeDirectory, desk: Desk, measured: MeasuredSheet) -> None:
+    def __init__(self, station: Station, roster: NodeDirectory, desk: NodeJobs, measured: MeasuredSheet) -> None:
         self._station, self._roster, self._desk, self._measured = station, roster, desk, measured
 
-    def read(self, uuid: str) -> ReadSheet:
+    def read(self, uuid: str) -> DatasheetRead:
         """From the node if it is on a bus, else as it was last read; raises NotFoundError, and what reading raises."""
         held = self._measured(uuid)
         if held is None and self._desk.on_a_bus(uuid):
@@ -70,18 +70,18 @@ class Sheets:
                 f"The datasheet of node {uuid} has never been read.",
                 hint="Connect it to the bus, or place it on the reader.",
             )
-        return ReadSheet(kept, judged, now=held is not None)
+        return DatasheetRead(kept, judged, now=held is not None)
 
-    def _read(self, node: Conversation) -> ReadSheet:
+    def _read(self, node: Conversation) -> DatasheetRead:
         station = self._station
         found = read_anew(station, node)
         if found is not None:
-            return ReadSheet(*found, now=True)
+            return DatasheetRead(*found, now=True)
         identify(station, node)
         image = read_image(node)
         why = "it opens no session under our key" if is_keyed(station, node.uuid) else ""
         checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
-        return ReadSheet(image, NodeVerdict(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
+        return DatasheetRead(image, NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
 
     def document(self, uuid: str, form: str) -> tuple[str, str]:
         """The datasheet as a document, and its media type; raises UsageError for a format that is none of ours."""
@@ -133,7 +133,9 @@ class Sheets:
 
         def work(node: Conversation) -> dict[str, Any]:
             with self._station.turn(node.uuid):
-                done = write_sheet(self._station, node, blocks, Silent(), accept_calibration=accept, retype=retype)
+                done = write_sheet(
+                    self._station, node, blocks, SilentReporter(), accept_calibration=accept, retype=retype
+                )
             steps = [
                 {"name": one.name, "result": one.result, "seconds": one.seconds, "detail": one.detail}
                 for one in done.steps

@@ -29,7 +29,7 @@ from teds_provision.handover.life import DECOMMISSIONED
 from teds_provision.links.ports import free_port
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.settings import own_source, with_source
-from teds_provision.node.described import create
+from teds_provision.node.node_template import create
 from teds_provision.node.sources.base import seconds_of
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.keys import fingerprint

@@ -117,7 +117,7 @@ async def _nothing(_request: Request) -> Response:
     raise NotFoundError("Resource not found.", hint="See /api/v1/openapi.json.")
 
 
-class Places:
+class LiveSlots:
     """The places of /live, ``most`` in all and ``of_one`` for one token.
 
     Where all are taken, a token that has fewer than the one that has most gets the newest place of that one: nobody
@@ -153,7 +153,7 @@ class Places:
 
 
 def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
-    places = Places()
+    places = LiveSlots()
 
     async def live(socket: WebSocket) -> None:
         caller: Caller = socket.scope[CALLER]

@@ -84,7 +84,7 @@ class RequestRefusedError(Exception):
 
 
 @dataclass(frozen=True)
-class Front:
+class ServedNames:
     """Under which names the page is served: ``host:port`` of each, and whether by TLS."""
 
     hosts: frozenset[str]
@@ -102,11 +102,11 @@ class Front:
         return f"ncap-{self.port}"
 
 
-def front(hosts: tuple[str, ...], port: int, *, tls: bool) -> Front:
+def front(hosts: tuple[str, ...], port: int, *, tls: bool) -> ServedNames:
     """The names of a server: loopback's always, and those that were allowed."""
     names = {"127.0.0.1", "localhost", "[::1]", *(f"[{one}]" if one.count(":") > 1 else one.lower() for one in hosts)}
     usual = 443 if tls else 80
-    return Front(frozenset({f"{one}:{port}" for one in names} | (names if port == usual else set())), port, tls)
+    return ServedNames(frozenset({f"{one}:{port}" for one in names} | (names if port == usual else set())), port, tls)
 
 
 @dataclass
@@ -115,7 +115,7 @@ class Guard:
 
     app: App
     tokens: Tokens
-    front: Front | None
+    front: ServedNames | None
     _wrong: deque[float] = field(default_factory=deque)
     _slowed: int = 0
 
@@ -225,7 +225,7 @@ def _headers(scope: Scope) -> dict[str, str]:
     return found
 
 
-def _require_origin(named: Front, headers: Mapping[str, str]) -> None:
+def _require_origin(named: ServedNames, headers: Mapping[str, str]) -> None:
     if headers.get("host", "").lower() not in named.hosts:
         raise RequestRefusedError(
             421,

@@ -26,12 +26,12 @@ from teds_provision.api.operations import (
 )
 from teds_provision.errors import NotFoundError, PolicyError, TedsProvisionError, UsageError
 from teds_provision.ncap.daemon import Daemon
-from teds_provision.ncap.measuring import LONGEST_LOAN, Loan
+from teds_provision.ncap.measurement_supervisor import LONGEST_LOAN, NodeLoan
 from teds_provision.ncap.nodes.directory import for_reader
 from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import body_of, changing, moving, reading
 from teds_provision.ncap.web.guard import CALLER, Caller
-from teds_provision.store import Choice, is_failure
+from teds_provision.store import AuditFilter, is_failure
 from teds_provision.store.records import iso
 from teds_provision.teds.profile import default_folders, list_profiles, listed
 
@@ -147,10 +147,10 @@ class Resources:
             raise UsageError(f"text may have at most {LONGEST_TEXT} characters.")
         failed = words.get("failed", "0") not in ("0", "", "false")
         since = _moment("since", words["since"]) if words.get("since") else None
-        choice = Choice(act=words.get("act") or None, failed=failed, text=text or None, before=before, since=since)
+        choice = AuditFilter(act=words.get("act") or None, failed=failed, text=text or None, before=before, since=since)
         return _shown(request, await reading(self._log, choice, limit, words.get("uuid")))
 
-    def _log(self, choice: Choice, limit: int, uuid: str | None) -> dict[str, Any]:
+    def _log(self, choice: AuditFilter, limit: int, uuid: str | None) -> dict[str, Any]:
         log = self._daemon.station.audit_log
         if uuid:
             choice = replace(choice, uuid=bytes.fromhex(self._daemon.resolve(uuid)))
@@ -220,7 +220,7 @@ class Resources:
         uuid = request.path_params["uuid"].lower()
         measuring, until = self._daemon.measuring, time.monotonic() + LONGEST_LOAN
         why = f"let go for {request.query_params.get('for', 'a command')[:40]}"
-        loan = Loan(uuid, why)
+        loan = NodeLoan(uuid, why)
 
         async def had() -> AsyncIterator[str]:
             try:

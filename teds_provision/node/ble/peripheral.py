@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.node.ble.address import StaticAddress
-from teds_provision.node.handler import Crew, InTheAir
+from teds_provision.node.handler import BleHandler, WorkerPool
 from teds_provision.protocol.messages import ble
 from teds_provision.protocol.repetition import Repetition
 
@@ -36,10 +36,10 @@ _FLAGS: Final = b"\x06"
 _LOG: Final = logging.getLogger(__name__)
 
 
-class BleLine:
+class CentralState:
     """One connection: its session (by name), its stored reply, what it has enabled. Used in the loop alone."""
 
-    def __init__(self, number: int, connection: Any, crew: Crew) -> None:
+    def __init__(self, number: int, connection: Any, crew: WorkerPool) -> None:
         self.number, self.connection = number, connection
         self.name = f"{BUS}:{number:x}"
         self.turns = crew.turns()
@@ -59,10 +59,10 @@ class BleLine:
 class Peripheral:
     """One node in the air. ``address`` is kept beside its flash; ``power_on`` begins, ``power_off`` ends."""
 
-    def __init__(self, node: InTheAir, address: StaticAddress, *, stranger_seconds: float = STRANGER_SECONDS) -> None:
+    def __init__(self, node: BleHandler, address: StaticAddress, *, stranger_seconds: float = STRANGER_SECONDS) -> None:
         self._node, self._address, self._stranger_seconds = node, address, stranger_seconds
-        self._crew = Crew()
-        self._lines: dict[int, BleLine] = {}
+        self._crew = WorkerPool()
+        self._lines: dict[int, CentralState] = {}
         self._tapped_until = 0.0
         self._advertising = False
         self._news = asyncio.Event()
@@ -190,12 +190,12 @@ class Peripheral:
 
     def _connected(self, connection: Any) -> None:
         number = next(free for free in range(_FIRST_SOURCE, 256) if free not in self._lines)
-        line = self._lines[number] = BleLine(number, connection, self._crew)
+        line = self._lines[number] = CentralState(number, connection, self._crew)
         connection.on("disconnection", lambda _reason: self._disconnected(line))
         self._advertising = False  # a controller stops when somebody connects
         self._news.set()
 
-    def _disconnected(self, line: BleLine) -> None:
+    def _disconnected(self, line: CentralState) -> None:
         if not line.gone:
             line.gone = True
             del self._lines[line.number]
@@ -203,12 +203,12 @@ class Peripheral:
             line.turns.put(lambda: self._node.lost(line.name))
             self._news.set()
 
-    async def _drop(self, line: BleLine) -> None:
+    async def _drop(self, line: CentralState) -> None:
         with suppress(Exception):  # it was going anyway
             await asyncio.wait_for(line.connection.disconnect(), 2.0)
         self._disconnected(line)
 
-    def _line_of(self, connection: Any) -> BleLine | None:
+    def _line_of(self, connection: Any) -> CentralState | None:
         return next((line for line in self._lines.values() if line.connection is connection), None)
 
     def _subscribed(self, connection: Any, notify: bool, _indicate: bool) -> None:
@@ -232,7 +232,7 @@ class Peripheral:
         line.turns.put(job)
 
     def _job(
-        self, line: BleLine, received: ble.Received, tick: int, loop: asyncio.AbstractEventLoop
+        self, line: CentralState, received: ble.ReceivedMessage, tick: int, loop: asyncio.AbstractEventLoop
     ) -> Callable[[], None]:
         def run(frame: bytes) -> bytes:
             return self._node.request_received(
@@ -254,7 +254,7 @@ class Peripheral:
 
         return job
 
-    async def _reply(self, line: BleLine, transaction: int, reply: bytes) -> None:
+    async def _reply(self, line: CentralState, transaction: int, reply: bytes) -> None:
         for frame in ble.cut(transaction, reply, line.mtu):
             if line.gone:
                 return

@@ -17,7 +17,7 @@ from teds_provision.lazy import how_to_install
 from teds_provision.links.hints import BleAddress
 from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Peripheral
-from teds_provision.node.handler import InTheAir
+from teds_provision.node.handler import BleHandler
 from teds_provision.protocol.operation.streams import DataFrame
 
 Result = TypeVar("Result")
@@ -28,7 +28,7 @@ _SEND_SECONDS: Final = 2.0
 class BleServer:
     """Serves ``node`` over the controller ``transport``; see LinkServer. Raises UsageError without bumble."""
 
-    def __init__(self, transport: str, node: InTheAir, address: StaticAddress) -> None:
+    def __init__(self, transport: str, node: BleHandler, address: StaticAddress) -> None:
         try:
             import bumble  # noqa: F401
         except ImportError:

@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.node.can import seat, server
+    from teds_provision.node.can import endpoint, server
 else:
     __getattr__ = lazy(__name__)

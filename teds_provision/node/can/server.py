@@ -17,8 +17,8 @@ from teds_provision.errors import LinkError, NoReaderError, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, Reassembly, addresses, physical_id, read_single, single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
-from teds_provision.node.can.seat import Seat, SeatRequest, StationLine, link_name
-from teds_provision.node.handler import Crew, MeasuringHandler, NodeHandler
+from teds_provision.node.can.endpoint import CanEndpoint, EndpointRequest, StationState, link_name
+from teds_provision.node.handler import MeasuringHandler, NodeHandler, WorkerPool
 from teds_provision.protocol.announce import Announce, is_announce
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, Reply, refusal
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station
@@ -28,7 +28,7 @@ from teds_provision.protocol.operation.can_frames import drive_address, trigger_
 # Nothing here is thread-safe: the server of the bus calls it under its lock.
 
 
-class Addresses:
+class EndpointTable:
     """The seats of one process by their addresses.
 
     ``at_time`` runs a job at a moment (monotonic); ``moved`` is told of a seat that takes another address, before it
@@ -37,20 +37,20 @@ class Addresses:
 
     def __init__(
         self,
-        seats: Sequence[Seat],
+        seats: Sequence[CanEndpoint],
         at_time: Callable[[float, Callable[[], None]], None],
-        moved: Callable[[Seat], None],
+        moved: Callable[[CanEndpoint], None],
         tell: Callable[[str], None],
         *,
         echoes: bool,
     ) -> None:
         self._seats, self._at_time, self._moved, self._tell, self._echoes = seats, at_time, moved, tell, echoes
         self._known: set[int] = set()
-        self._at: dict[int, list[Seat]] = {}
-        self._moves_due: dict[Seat, float] = {}
+        self._at: dict[int, list[CanEndpoint]] = {}
+        self._moves_due: dict[CanEndpoint, float] = {}
         self.find()
 
-    def at(self, address: int) -> Sequence[Seat]:
+    def at(self, address: int) -> Sequence[CanEndpoint]:
         """The seats that have this address; nodes that have just met may be two."""
         return self._at.get(address, ())
 
@@ -67,7 +67,7 @@ class Addresses:
             for seat in self._seats:
                 seat.claim.hear(source)
 
-    def speaks(self, seat: Seat, identifier: int) -> None:
+    def speaks(self, seat: CanEndpoint, identifier: int) -> None:
         """A frame of one of them leaves: the others of this process hear it as they hear those of the bus."""
         source = identifier & 0xFF
         if source not in seat.spoken_from:
@@ -82,7 +82,7 @@ class Addresses:
             seat.claim.start(time.monotonic())
             self._announce_when_due(seat)
 
-    def announced(self, frame: Frame, speaker: Seat | None) -> None:
+    def announced(self, frame: Frame, speaker: CanEndpoint | None) -> None:
         """An Announce was heard, from the bus or from a node of this process (``speaker``)."""
         announce = Announce.decode(frame.identifier, frame.data)
         if announce is None:
@@ -92,7 +92,7 @@ class Addresses:
             if seat is not speaker and not (speaker is None and own):
                 self._contested(seat, announce)
 
-    def _announce_when_due(self, seat: Seat) -> None:
+    def _announce_when_due(self, seat: CanEndpoint) -> None:
         due = seat.claim.due(time.monotonic())
         if due is None:
             return
@@ -103,7 +103,7 @@ class Addresses:
 
         self._at_time(due, announce)
 
-    def _contested(self, seat: Seat, announce: Announce) -> None:
+    def _contested(self, seat: CanEndpoint, announce: Announce) -> None:
         now, before, told = time.monotonic(), seat.address, seat.claim.conflict
         address = seat.claim.take(announce, before, now, pinned=seat.handler.actuator_claimed())
         if (due := seat.claim.move_due) is not None and due != self._moves_due.get(seat):
@@ -116,13 +116,13 @@ class Addresses:
             )
         self._go(seat, address)
 
-    def _give_up_address(self, seat: Seat, due: float) -> None:
+    def _give_up_address(self, seat: CanEndpoint, due: float) -> None:
         """Make the move that had to wait, unless the node has left that address meanwhile."""
         if seat.claim.move_due == due:
             pinned = seat.handler.actuator_claimed()
             self._go(seat, seat.claim.move(seat.address, time.monotonic(), pinned=pinned))
 
-    def _go(self, seat: Seat, address: int) -> None:
+    def _go(self, seat: CanEndpoint, address: int) -> None:
         if address != seat.address:
             self._moved(seat)
             seat.move(address)
@@ -165,15 +165,15 @@ class CanServer:
         self._tell = tell
         self._nodes: list[tuple[NodeHandler, Callable[[], bool], MeasuringHandler | None]] = []
         self._bus: Bus | None = None
-        self._crew: Crew | None = None
-        self._seats: list[Seat] = []
-        self._seat_of: dict[int, Seat] = {}
+        self._crew: WorkerPool | None = None
+        self._seats: list[CanEndpoint] = []
+        self._seat_of: dict[int, CanEndpoint] = {}
         self._addresses = self._seated()
-        self._active: set[tuple[Seat, Pair]] = set()
-        self._pushing: set[tuple[Seat, Pair]] = set()
+        self._active: set[tuple[CanEndpoint, Pair]] = set()
+        self._pushing: set[tuple[CanEndpoint, Pair]] = set()
         self._looked = 0.0
         self._later: list[tuple[float, int, Callable[[], None]]] = []
-        self._everyone_due: dict[StationLine, int] = {}
+        self._everyone_due: dict[StationState, int] = {}
         self._number = itertools.count()
         self._lock = threading.RLock()
         self._sending = threading.Lock()
@@ -197,9 +197,9 @@ class CanServer:
         """Open the bus and listen; raises NoReaderError or UsageError where it cannot."""
         self._bus = Bus(self._spec)
         self._stop.clear()
-        self._crew = Crew()
+        self._crew = WorkerPool()
         self._active, self._pushing, self._later, self._everyone_due = set(), set(), [], {}
-        self._seats = [Seat(node, tapped, self._crew, self._out, more) for node, tapped, more in self._nodes]
+        self._seats = [CanEndpoint(node, tapped, self._crew, self._out, more) for node, tapped, more in self._nodes]
         self._seat_of = {id(seat.handler): seat for seat in self._seats}
         self._addresses = self._seated()
         self._addresses.announce_all()
@@ -226,11 +226,11 @@ class CanServer:
             self._bus.close()
             self._bus = None
 
-    def _seated(self) -> Addresses:
+    def _seated(self) -> EndpointTable:
         echoes = bool(dict(self._spec.options).get("receive_own_messages"))
-        return Addresses(self._seats, self._at_time, self._moves, self._tell, echoes=echoes)
+        return EndpointTable(self._seats, self._at_time, self._moves, self._tell, echoes=echoes)
 
-    def _moves(self, seat: Seat) -> None:
+    def _moves(self, seat: CanEndpoint) -> None:
         """What is under way from its old address ends."""
         for pairs in (self._active, self._pushing):
             pairs.difference_update([entry for entry in pairs if entry[0] is seat])
@@ -298,7 +298,7 @@ class CanServer:
                 pair.run()
                 self._note(seat, pair)
 
-    def _note(self, seat: Seat, pair: Pair) -> None:
+    def _note(self, seat: CanEndpoint, pair: Pair) -> None:
         """Look after a pair while a message of either side is under way, and closely while we send."""
         for pairs, belongs in (
             (self._active, pair.sending or pair.receiving),
@@ -315,7 +315,7 @@ class CanServer:
     def _at_time(self, due: float, job: Callable[[], None]) -> None:
         heapq.heappush(self._later, (due, next(self._number), job))
 
-    def _out(self, seat: Seat, frame: Frame) -> None:
+    def _out(self, seat: CanEndpoint, frame: Frame) -> None:
         """Put a node's frame on the bus."""
         assert self._bus is not None
         with self._sending:
@@ -356,7 +356,7 @@ class CanServer:
                     pair.take(frame)
                     self._note(seat, pair)
 
-    def _request(self, seat: Seat, line: StationLine, pair: Pair, frame: Frame) -> None:
+    def _request(self, seat: CanEndpoint, line: StationState, pair: Pair, frame: Frame) -> None:
         begun = Reassembly.begin(pair.peer, frame)
         if begun is not None and begun.length > seat.max_message + 1:  # refused in place of a flow control
             said = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
@@ -367,7 +367,7 @@ class CanServer:
             if pair.waits_for_flow:
                 pair.stop_sending()  # whoever asks again has not taken that answer up
             received = seat.measuring.tick(frame.at) if seat.measuring is not None else 0
-            line.put(functools.partial(self._run_request, line, pair, SeatRequest(body, frame.fd, received)))
+            line.put(functools.partial(self._run_request, line, pair, EndpointRequest(body, frame.fd, received)))
         self._note(seat, pair)
 
     def _measuring_frame(self, station: int, frame: Frame) -> None:
@@ -381,7 +381,7 @@ class CanServer:
                 if seat.measuring is not None:
                     seat.measuring.drive(link_name(station), frame.data)
 
-    def _run_request(self, line: StationLine, pair: Pair, request: SeatRequest) -> None:
+    def _run_request(self, line: StationState, pair: Pair, request: EndpointRequest) -> None:
         """Run one request in the turn of its node and send the reply from the address that was asked."""
         try:
             reply = line.answer(request)
@@ -407,7 +407,7 @@ class CanServer:
 
     # -- everyone --------------------------------------------------------------------------------------------------
 
-    def _everyone(self, seat: Seat, station: int, transaction: bytes, *, fd: bool) -> None:
+    def _everyone(self, seat: CanEndpoint, station: int, transaction: bytes, *, fd: bool) -> None:
         """Answer a functional Identify after a random wait; a newer one of the same station takes its place."""
         own = seat.address
         line, _ = seat.pair(station, own)
@@ -424,7 +424,7 @@ class CanServer:
         """Seconds to wait before an answer to everyone."""
         return random.uniform(0, _SPREAD_SECONDS)
 
-    def _answer_everyone(self, seat: Seat, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
+    def _answer_everyone(self, seat: CanEndpoint, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
         """It leaves the stored reply alone, and waits while a reply of this line is under way."""
         line, pair = seat.pair(station, own)
         self._end_answer_to_everyone(line, pair)
@@ -432,7 +432,7 @@ class CanServer:
         pair.send(transaction + Reply(True, seat.handler.identify()).encode())
         self._note(seat, pair)
 
-    def _end_answer_to_everyone(self, line: StationLine, pair: Pair) -> None:
+    def _end_answer_to_everyone(self, line: StationState, pair: Pair) -> None:
         """Let an answer to everyone that nobody takes up give way; a reply is none."""
         if pair.waits_for_flow and line.replying is not pair:
             pair.stop_sending()

@@ -17,8 +17,8 @@ from teds_provision.errors import BadDataError
 from teds_provision.node import sources
 from teds_provision.node.hardware.clock import NANOSECONDS, NodeClock
 from teds_provision.node.hardware.converter import Converter
-from teds_provision.node.sources.base import Place, Reading, Tell
-from teds_provision.protocol.operation.commands import Power, PowerFlag
+from teds_provision.node.sources.base import Reading, SourceChannel, Tell
+from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
 
@@ -48,7 +48,7 @@ class Battery:
             self._run()
             self._in_field = present
 
-    def power(self) -> Power:
+    def power(self) -> PowerReply:
         """What Power (128.18) says now."""
         with self._lock:
             self._run()
@@ -60,7 +60,7 @@ class Battery:
         flags |= PowerFlag.IN_FIELD if in_field else PowerFlag(0)
         flags |= PowerFlag.TOO_LOW if level < TOO_LOW else PowerFlag(0)
         volts = _EMPTY_VOLTS + (_FULL_VOLTS - _EMPTY_VOLTS) * level / 100
-        return Power(flags, round(level), volts, 0.05 if charging else -0.002, _CELSIUS)
+        return PowerReply(flags, round(level), volts, 0.05 if charging else -0.002, _CELSIUS)
 
     def _run(self) -> None:
         now = self._host()
@@ -131,7 +131,7 @@ class Board:
         self.source = sources.make_source(source, self.places, tell)
 
     @property
-    def places(self) -> list[Place]:
+    def places(self) -> list[SourceChannel]:
         """The sensors, as sources see them."""
         return [self.converters[n].place for n, facts in self.channels.items() if not facts.actuator]
 
@@ -258,9 +258,9 @@ class Board:
         """Whether a test put a fault in (``faults``)."""
         return channel in self.faults
 
-    def power(self) -> Power:
+    def power(self) -> PowerReply:
         """Battery and charge; without a battery nothing is known."""
-        return self.battery.power() if self.battery is not None else Power()
+        return self.battery.power() if self.battery is not None else PowerReply()
 
 
 def _self_test_seconds(stated: float) -> float:

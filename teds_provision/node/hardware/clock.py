@@ -62,7 +62,7 @@ class NodeClock:
                 self._since, self._own, self._step = self._host(), False, _HOST_STEP
 
     def advance(self, seconds: float, change: Callable[[], None]) -> None:
-        """Go to ``seconds`` since the start; see ``sources.base.Drive``."""
+        """Go to ``seconds`` since the start; see ``sources.base.SimulationClock``."""
         target = round(seconds * NANOSECONDS)
         with self.guard(), self._lock:
             step = target - self._base

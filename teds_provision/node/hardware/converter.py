@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from teds_provision.errors import BadDataError
-from teds_provision.node.sources.base import Place, Reading
+from teds_provision.node.sources.base import Reading, SourceChannel
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import DataModel, SampleReader
 from teds_provision.teds.sheet import Channel, Sheet
@@ -51,9 +51,9 @@ class Converter:
         self._table = self._tabulated()
 
     @property
-    def place(self) -> Place:
+    def place(self) -> SourceChannel:
         """The channel as sources see it."""
-        return Place(self._channel.number, self._channel.name, self.low, self.high)
+        return SourceChannel(self._channel.number, self._channel.name, self.low, self.high)
 
     def octets(self, reading: Reading) -> bytes:
         """The sample that the channel gives; values are kept within the limits, and rounded to what a sample holds.

@@ -14,7 +14,7 @@ from teds_provision.links.nfc.udp import NodeDevice, address_of, frontend
 from teds_provision.node.handler import NodeHandler
 from teds_provision.node.nfc import tags as nfc_type2
 from teds_provision.node.nfc import tags as nfc_type4
-from teds_provision.node.nfc.tnep import NO_EXTRAS, Extras, TnepTag
+from teds_provision.node.nfc.tnep import NO_EXTRAS, ExtraRecords, TnepTag
 
 # What ISO/IEC 14443-3 Type A frames take on air at 106 kbit/s, to imitate the link in benchmarks.
 #
@@ -43,7 +43,7 @@ def answer_seconds(command: bytes, octets: bytes) -> float:
     return ((len(octets) + (0 if bare else 2)) * 9 + 2) * ETU
 
 
-class Air:
+class AirTime:
     """Holds each answer back until command and answer would have passed; called with every frame of a tag.
 
     What the processes themselves take runs inside that time, so that a paced exchange lasts as long as on air.
@@ -94,7 +94,7 @@ class NfcServer:
         max_ndef: int | None = None,
         pace: bool = False,
         queue: bool = False,
-        extras: Extras = NO_EXTRAS,
+        extras: ExtraRecords = NO_EXTRAS,
     ) -> None:
         self._path = path
         self._device: Any = None
@@ -116,7 +116,7 @@ class NfcServer:
         """Lie down on the reader. Raises NoReaderError, also where another node lies there and does not leave."""
         self._device = NodeDevice(*self._address)
         if self._pace:
-            self._device.air = Air()
+            self._device.air = AirTime()
         try:
             if not self._bound() and not self._queue:
                 raise NoReaderError(

@@ -20,7 +20,7 @@ from teds_provision.links.nfc.message import WELL_KNOWN, NdefRecord
 from teds_provision.links.nfc.pieces import Piece, Responder, room
 from teds_provision.links.nfc.poller import STATUS_OCTETS
 from teds_provision.node.handler import NodeHandler
-from teds_provision.protocol.operation.commands import Power, PowerFlag
+from teds_provision.protocol.operation.commands import PowerFlag, PowerReply
 from teds_provision.protocol.repetition import Repetition
 
 # What the initial NFC message of a node says beside the profile's records: charge, and where it is in the air.
@@ -37,7 +37,7 @@ _REPEAT_WAITS: Final = bytes((0x09, 0x1E, 0x03, 0x0A))
 _BATTERY_LEVEL: Final = 0x01
 
 
-def charge_records(power: Power) -> tuple[NdefRecord, ...]:
+def charge_records(power: PowerReply) -> tuple[NdefRecord, ...]:
     """``WLCCAP`` (I can be charged, or am full) and ``WLCSTAI`` (battery in per cent); none without a battery."""
     if not power.flags & PowerFlag.BATTERY or power.level is None:
         return ()
@@ -67,7 +67,7 @@ def _none() -> tuple[NdefRecord, ...]:
 
 
 @dataclass(frozen=True)
-class Extras:
+class ExtraRecords:
     """Records of the initial message ``before`` ``Tp`` and ``after`` the id, asked for anew each time.
 
     ``field`` is told when a reader's field comes (True) and goes.
@@ -78,7 +78,7 @@ class Extras:
     field: Callable[[bool], None] = lambda present: None
 
 
-NO_EXTRAS: Final = Extras()
+NO_EXTRAS: Final = ExtraRecords()
 
 
 LINE = "nfc"
@@ -107,7 +107,7 @@ class TnepTag:
         *,
         wt_int: int,
         n_wait: int,
-        extras: Extras = NO_EXTRAS,
+        extras: ExtraRecords = NO_EXTRAS,
     ) -> None:
         self._memory = memory
         self._handler = handler

@@ -7,9 +7,9 @@ from typing import Final
 
 from teds_provision.errors import UsageError
 from teds_provision.node.sources import command, lines, noise, ramp, recorded, sine
-from teds_provision.node.sources.base import Place, Source, Tell
+from teds_provision.node.sources.base import Source, SourceChannel, Tell
 
-Maker = Callable[[str, Sequence[Place], Tell], Source]
+Maker = Callable[[str, Sequence[SourceChannel], Tell], Source]
 
 SOURCES: Final[dict[str, Maker]] = {
     "noise": noise.make,
@@ -35,7 +35,7 @@ def kind_of(text: str) -> str:
     return kind
 
 
-def make_source(text: str, places: Sequence[Place], tell: Tell) -> Source:
+def make_source(text: str, places: Sequence[SourceChannel], tell: Tell) -> Source:
     """The source that ``--source`` names, for these sensors; raises UsageError, NotFoundError or BadDataError."""
     kind = kind_of(text)
     return SOURCES[kind](text.partition(":")[2], places, tell)

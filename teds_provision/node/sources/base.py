@@ -19,7 +19,7 @@ class Reading(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Place:
+class SourceChannel:
     """A sensor that a source feeds: its number, name, and range in the unit in which people see it."""
 
     number: int
@@ -48,7 +48,7 @@ class Source(Protocol):
     def at(self, channel: int, seconds: float) -> Reading | None:
         """What a channel shows at a time of the node's clock (seconds since its start), None for nothing valid."""
 
-    def start(self, drive: Drive) -> None:
+    def start(self, drive: SimulationClock) -> None:
         """Begin; a source with a clock of its own drives the node's. Raises what names why it cannot."""
 
     def acted(self, values: Mapping[str, float]) -> None:
@@ -58,7 +58,7 @@ class Source(Protocol):
         """End; never raises."""
 
 
-class Drive(Protocol):
+class SimulationClock(Protocol):
     """The node's clock in the hands of a simulation."""
 
     def now(self) -> float:
@@ -77,13 +77,13 @@ class Drive(Protocol):
         """The source has ended: the clock goes on with that of the host."""
 
 
-class Generated:
+class GeneratedSource:
     """A source that is a function of time: it needs no beginning and no end."""
 
-    def __init__(self, places: Sequence[Place]) -> None:
+    def __init__(self, places: Sequence[SourceChannel]) -> None:
         self.places = {place.number: place for place in places}
 
-    def start(self, drive: Drive) -> None:
+    def start(self, drive: SimulationClock) -> None:
         """Nothing to begin."""
 
     def acted(self, values: Mapping[str, float]) -> None:

@@ -11,22 +11,22 @@ import threading
 from collections.abc import Mapping, Sequence
 
 from teds_provision.errors import NotFoundError, UsageError
-from teds_provision.node.sources.base import Drive, Place, Tell
-from teds_provision.node.sources.lines import Lines, feed
+from teds_provision.node.sources.base import SimulationClock, SourceChannel, Tell
+from teds_provision.node.sources.lines import LineSource, feed
 
 _SECONDS_TO_END = 2.0
 
 
-class CommandSource(Lines):
+class CommandSource(LineSource):
     """Runs a program (no shell); lines need no ``t``: without one the node's clock is the host's."""
 
-    def __init__(self, places: Sequence[Place], tell: Tell, words: Sequence[str]) -> None:
+    def __init__(self, places: Sequence[SourceChannel], tell: Tell, words: Sequence[str]) -> None:
         super().__init__(places, tell, needs_time=False)
         self._words = list(words)
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
 
-    def start(self, drive: Drive) -> None:
+    def start(self, drive: SimulationClock) -> None:
         """Start the program; raises NotFoundError where there is none. Its errors go to our standard error."""
         try:
             self._process = subprocess.Popen(
@@ -71,7 +71,7 @@ class CommandSource(Lines):
             self.end()
 
 
-def make(argument: str, places: Sequence[Place], tell: Tell) -> CommandSource:
+def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> CommandSource:
     """``exec:./hand --rate 100``: words as a shell would part them."""
     try:
         words = shlex.split(argument)

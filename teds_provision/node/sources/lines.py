@@ -21,24 +21,24 @@ from pathlib import Path
 from typing import IO, Final, TypeGuard
 
 from teds_provision.errors import NoReaderError, UsageError
-from teds_provision.node.sources.base import Drive, Place, Reading, Tell
+from teds_provision.node.sources.base import Reading, SimulationClock, SourceChannel, Tell
 
 LONGEST_LINE: Final = 1 << 20
 _LOOK_AROUND: Final = 0.2
 _TELL_EVERY: Final = 1000
 
 
-class Lines:
+class LineSource:
     """Readings as the last lines gave them; ``needs_time`` says whether a line must have ``t``.
 
     Lines that are none are counted, told (the first, then each thousandth), and change nothing.
     """
 
-    def __init__(self, places: Sequence[Place], tell: Tell, *, needs_time: bool = True) -> None:
+    def __init__(self, places: Sequence[SourceChannel], tell: Tell, *, needs_time: bool = True) -> None:
         self._numbers = {place.name: place.number for place in places if place.name}
         self._tell, self._needs_time = tell, needs_time
         self._readings: dict[int, Reading | None] = {}
-        self._drive: Drive | None = None
+        self._drive: SimulationClock | None = None
         self._last: float | None = None
         self._offset = 0.0
         self.dropped = 0
@@ -47,7 +47,7 @@ class Lines:
         """What the last line gave."""
         return self._readings.get(channel)
 
-    def begin(self, drive: Drive) -> None:
+    def begin(self, drive: SimulationClock) -> None:
         """A simulation begins; for one that must have times the clock stands still until its first line."""
         self._drive, self._last = drive, None
         if self._needs_time:
@@ -143,15 +143,15 @@ def feed(read: Callable[[], bytes], take: Callable[[bytes], None]) -> None:
         take(held)
 
 
-class StandardInput(Lines):
+class StandardInput(LineSource):
     """Lines from a pipe: standard input."""
 
-    def __init__(self, places: Sequence[Place], tell: Tell, stream: IO[bytes]) -> None:
+    def __init__(self, places: Sequence[SourceChannel], tell: Tell, stream: IO[bytes]) -> None:
         super().__init__(places, tell)
         self._stream = stream
         self._stop = threading.Event()
 
-    def start(self, drive: Drive) -> None:
+    def start(self, drive: SimulationClock) -> None:
         """Read in a thread."""
         self.begin(drive)
         threading.Thread(target=self._run, name="source", daemon=True).start()
@@ -171,10 +171,10 @@ class StandardInput(Lines):
             self.end()
 
 
-class UnixSocket(Lines):
+class UnixSocket(LineSource):
     """Lines from whoever connects to a Unix socket (mode 0600), one simulation after the other."""
 
-    def __init__(self, places: Sequence[Place], tell: Tell, path: Path) -> None:
+    def __init__(self, places: Sequence[SourceChannel], tell: Tell, path: Path) -> None:
         super().__init__(places, tell)
         self._path = path
         self._listening: socket.socket | None = None
@@ -182,7 +182,7 @@ class UnixSocket(Lines):
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def start(self, drive: Drive) -> None:
+    def start(self, drive: SimulationClock) -> None:
         """Listen; a socket that a killed node left is replaced. Raises NoReaderError."""
         try:
             self._listening = self._bound()
@@ -227,7 +227,7 @@ class UnixSocket(Lines):
             os.umask(before)
         return listening
 
-    def _run(self, drive: Drive) -> None:
+    def _run(self, drive: SimulationClock) -> None:
         assert self._listening is not None
         while not self._stop.is_set():
             if not select.select([self._listening], [], [], _LOOK_AROUND)[0]:
@@ -260,12 +260,12 @@ def _answers(path: Path) -> bool:
         return True
 
 
-def make_stream(argument: str, places: Sequence[Place], tell: Tell) -> StandardInput:
+def make_stream(argument: str, places: Sequence[SourceChannel], tell: Tell) -> StandardInput:
     """``-`` reads standard input."""
     return StandardInput(places, tell, sys.stdin.buffer)
 
 
-def make_socket(argument: str, places: Sequence[Place], tell: Tell) -> UnixSocket:
+def make_socket(argument: str, places: Sequence[SourceChannel], tell: Tell) -> UnixSocket:
     """``unix:/run/user/1000/hand.sock``."""
     if not argument:
         raise UsageError("unix: needs a path.", hint="Write --source unix:/tmp/hand.sock.")

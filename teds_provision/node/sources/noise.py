@@ -6,10 +6,10 @@ import random
 from collections.abc import Sequence
 
 from teds_provision.errors import UsageError
-from teds_provision.node.sources.base import Generated, Place, Reading, Tell
+from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell
 
 
-class Noise(Generated):
+class Noise(GeneratedSource):
     """Evenly spread noise over each channel's range."""
 
     def at(self, channel: int, seconds: float) -> Reading | None:
@@ -18,7 +18,7 @@ class Noise(Generated):
         return None if place is None else place.between(random.random())
 
 
-def make(argument: str, places: Sequence[Place], tell: Tell) -> Noise:
+def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Noise:
     """``noise`` takes no argument."""
     if argument:
         raise UsageError(f"noise takes no argument, not {argument!r}.", hint="Write --source noise.")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from teds_provision.node.sources.base import Generated, Place, Reading, Tell, seconds_of
+from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell, seconds_of
 
 
-class Ramp(Generated):
+class Ramp(GeneratedSource):
     """A ramp of ``period`` seconds over each channel's range."""
 
-    def __init__(self, places: Sequence[Place], period: float) -> None:
+    def __init__(self, places: Sequence[SourceChannel], period: float) -> None:
         super().__init__(places)
         self.period = period
 
@@ -20,6 +20,6 @@ class Ramp(Generated):
         return None if place is None else place.between((seconds / self.period) % 1.0)
 
 
-def make(argument: str, places: Sequence[Place], tell: Tell) -> Ramp:
+def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Ramp:
     """``ramp:2`` or ``ramp:20ms``; 10 s where nothing is said."""
     return Ramp(places, seconds_of(argument or "10", "ramp"))

@@ -16,18 +16,18 @@ from typing import Final
 
 from teds_provision.errors import BadDataError, UsageError
 from teds_provision.files import read_text
-from teds_provision.node.sources.base import Generated, Place, Reading, Tell
+from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell
 
 MOST_OCTETS: Final = 256 << 20
 _TIME_NAMES: Final = ("t", "time")
 _RAW: Final = "raw:"
 
 
-class Recorded(Generated):
+class RecordedSource(GeneratedSource):
     """Rows of readings: ``times`` ascend from 0, ``rows`` have one entry for each of ``columns`` (channel numbers)."""
 
     def __init__(
-        self, places: Sequence[Place], times: list[float], columns: dict[int, list[Reading | None]], tell: Tell
+        self, places: Sequence[SourceChannel], times: list[float], columns: dict[int, list[Reading | None]], tell: Tell
     ) -> None:
         super().__init__(places)
         self._times, self._columns, self._tell = times, columns, tell
@@ -48,14 +48,14 @@ class Recorded(Generated):
         return column[max(0, bisect.bisect_right(self._times, seconds) - 1)]
 
 
-def make(argument: str, places: Sequence[Place], tell: Tell) -> Recorded:
+def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> RecordedSource:
     """``file:run.csv``; raises NotFoundError, and BadDataError with the line that is wrong."""
     if not argument:
         raise UsageError("file: needs a file.", hint="Write --source file:run.csv.")
     return read(Path(argument), places, tell)
 
 
-def read(path: Path, places: Sequence[Place], tell: Tell) -> Recorded:
+def read(path: Path, places: Sequence[SourceChannel], tell: Tell) -> RecordedSource:
     """Read a file of at most 256 MiB whole."""
     lines = _lines(path)
     fields = list(csv.reader(line for _, line in lines))
@@ -68,7 +68,7 @@ def read(path: Path, places: Sequence[Place], tell: Tell) -> Recorded:
         times.append(_time(path, line, row[at], times))
         for number, index, raw in columns:
             readings[number].append(_reading(_number(path, line, row[index]), raw=raw))
-    return Recorded(places, [time - times[0] for time in times], readings, tell)
+    return RecordedSource(places, [time - times[0] for time in times], readings, tell)
 
 
 def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> Iterator[tuple[int, list[str]]]:
@@ -103,7 +103,7 @@ def _reading(number: float | None, *, raw: bool) -> Reading | None:
     return Reading(raw=number) if raw else Reading(value=number)
 
 
-def _columns(path: Path, header: list[str], places: Sequence[Place]) -> list[tuple[int, int, bool]]:
+def _columns(path: Path, header: list[str], places: Sequence[SourceChannel]) -> list[tuple[int, int, bool]]:
     """(channel, column, raw) of each column that names a channel."""
     numbers = {place.name: place.number for place in places if place.name}
     found: list[tuple[int, int, bool]] = []

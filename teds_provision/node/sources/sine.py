@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from teds_provision.node.sources.base import Generated, Place, Reading, Tell, seconds_of
+from teds_provision.node.sources.base import GeneratedSource, Reading, SourceChannel, Tell, seconds_of
 
 
-class Sine(Generated):
+class Sine(GeneratedSource):
     """A sine of ``period`` seconds; at time 0 channel 1 stands in the middle of its range and rises."""
 
-    def __init__(self, places: Sequence[Place], period: float) -> None:
+    def __init__(self, places: Sequence[SourceChannel], period: float) -> None:
         super().__init__(places)
         self.period = period
 
@@ -24,6 +24,6 @@ class Sine(Generated):
         return place.between(0.5 + 0.5 * math.sin(2 * math.pi * phase))
 
 
-def make(argument: str, places: Sequence[Place], tell: Tell) -> Sine:
+def make(argument: str, places: Sequence[SourceChannel], tell: Tell) -> Sine:
     """``sine:2`` or ``sine:20ms``; 10 s where nothing is said."""
     return Sine(places, seconds_of(argument or "10", "sine"))

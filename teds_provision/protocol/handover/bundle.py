@@ -17,9 +17,16 @@ from datetime import datetime, timedelta
 from typing import Literal, cast
 
 from teds_provision.errors import BadDataError, NotAuthenticError, PolicyError
-from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.envelope import PIECE, Sealing, Source, Unsealed, as_file, read_envelope, unseal
+from teds_provision.protocol.handover.envelope import (
+    PIECE,
+    EnvelopeWriter,
+    Source,
+    UnsealedPayload,
+    as_file,
+    read_envelope,
+    unseal,
+)
 from teds_provision.protocol.handover.jose import FindKey, link_key_of, point_of, public_jwk
 from teds_provision.protocol.handover.revocation import Revocation, open_revocations
 from teds_provision.protocol.handover.strict_json import (
@@ -34,6 +41,7 @@ from teds_provision.protocol.handover.strict_json import (
     time_text,
 )
 from teds_provision.protocol.keys import PrivateKey, fingerprint, is_point, station_key_message, verify
+from teds_provision.protocol.wire_agreement import key_id
 
 # Times are RFC 3339 text in UTC, UUIDs and fingerprints hex in either case (written in lower case). The payload may
 # hold more members than the profile lists; they are skipped. One of ours is ``revoked``, see revocation.py.
@@ -307,7 +315,7 @@ def seal_bundle(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]
 
 def seal_pieces(
     payload: Bundle, nodes: Iterable[BundledNode], count: int, sender: PrivateKey, recipients: Sequence[bytes]
-) -> Sealing:
+) -> EnvelopeWriter:
     """Sign with ``sender`` and seal to the points ``recipients``; ``count`` nodes come one by one, not in ``payload``.
 
     Its ``signed_sha256``, the digest of what was signed, is what the receipt will name.
@@ -324,7 +332,7 @@ def seal_pieces(
     for point in recipients:
         _station_signature(payload, point)
     pieces = payload_pieces(payload, nodes, count)
-    return Sealing(_within(pieces, count), sender, recipients, typ=TYPE, cty=CONTENT_TYPE)
+    return EnvelopeWriter(_within(pieces, count), sender, recipients, typ=TYPE, cty=CONTENT_TYPE)
 
 
 def _within(pieces: Iterable[bytes], count: int) -> Iterator[bytes]:
@@ -395,7 +403,7 @@ def peek_bundle(source: Source) -> BundleHeader:
     )
 
 
-def _opened(source: Source, recipient: PrivateKey, trusted: FindKey, max_octets: int) -> tuple[Bundle, Unsealed]:
+def _opened(source: Source, recipient: PrivateKey, trusted: FindKey, max_octets: int) -> tuple[Bundle, UnsealedPayload]:
     """Unseal, verify and read; each form of the payload is let go as soon as the next one is there."""
     opened = unseal(source, recipient, trusted, typ=TYPE, cty=CONTENT_TYPE, max_octets=max_octets)
     bundle = from_json(opened.payload)

@@ -49,7 +49,7 @@ Source = bytes | BinaryIO
 """Octets, or a file of them that can be read from any place."""
 
 
-class Sealing:
+class EnvelopeWriter:
     """What is written for a payload: :meth:`body`, then :meth:`end`, without which nobody can open or believe it.
 
     The digests and ``octets`` are known when :meth:`end` has returned. ``signed_sha256`` is over the JWS inside.
@@ -101,7 +101,7 @@ class Sealing:
 
 
 @dataclass(frozen=True)
-class Unsealed:
+class UnsealedPayload:
     """What was sealed and signed: ``kid`` and point of the signer, the payload, and both digests in hex."""
 
     kid: str
@@ -132,7 +132,9 @@ def as_file(source: Source) -> BinaryIO:
     return BytesIO(source) if isinstance(source, bytes) else source
 
 
-def unseal(source: Source, key: PrivateKey, find_key: FindKey, *, typ: str, cty: str, max_octets: int) -> Unsealed:
+def unseal(
+    source: Source, key: PrivateKey, find_key: FindKey, *, typ: str, cty: str, max_octets: int
+) -> UnsealedPayload:
     """Open a JWE that names ``key`` among its recipients, and check the JWS in it by a key that ``find_key`` trusts.
 
     Raises NotAuthenticError, PolicyError or BadDataError, as :func:`.jose.decrypt` and :func:`.jose.verify_compact` do.
@@ -149,7 +151,7 @@ def unseal(source: Source, key: PrivateKey, find_key: FindKey, *, typ: str, cty:
     except InvalidTag as error:
         raise NotAuthenticError(CHANGED_CONTENT) from error
     kid, signer = check_signature(*jws.signed(), find_key, typ)
-    return Unsealed(kid, signer, jws.payload(), jws.sha256, envelope.sha256)
+    return UnsealedPayload(kid, signer, jws.payload(), jws.sha256, envelope.sha256)
 
 
 def read_envelope(file: BinaryIO, max_octets: int) -> Envelope:

@@ -223,7 +223,7 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
 
 
 @dataclass(frozen=True)
-class Seal:
+class ContentSeal:
     """What opens a ciphertext beside its key: initialisation vector, tag, additional authenticated data."""
 
     iv: bytes
@@ -237,7 +237,7 @@ class Seal:
         return cipher
 
 
-def content_key_for(document: Mapping[str, Any], key: PrivateKey, *, cty: str) -> tuple[bytes, Seal]:
+def content_key_for(document: Mapping[str, Any], key: PrivateKey, *, cty: str) -> tuple[bytes, ContentSeal]:
     """Unwrap the content key of a JWE with the recipient's ``key``; raises as :func:`decrypt` does."""
     shared = _shared_header(document)
     own = fingerprint(key.point)
@@ -335,7 +335,7 @@ def _party_info(header: Mapping[str, Any], name: str) -> bytes:
     return octets
 
 
-def _seal(document: Mapping[str, Any]) -> Seal:
+def _seal(document: Mapping[str, Any]) -> ContentSeal:
     iv, tag = decode_base64url(document.get("iv"), "The iv"), decode_base64url(document.get("tag"), "The tag")
     if len(iv) != _IV_OCTETS or len(tag) != _TAG_OCTETS:
         raise BadDataError(
@@ -345,7 +345,7 @@ def _seal(document: Mapping[str, Any]) -> Seal:
     if "aad" in document:
         decode_base64url(document["aad"], "The aad")
         additional = f"{additional}.{document['aad']}"
-    return Seal(iv, tag, additional.encode())
+    return ContentSeal(iv, tag, additional.encode())
 
 
 def _header(text: object, what: str) -> dict[str, Any]:

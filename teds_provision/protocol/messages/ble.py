@@ -33,7 +33,7 @@ def cut(transaction: int, message: bytes, mtu: int) -> Iterator[bytes]:
         yield _HEAD.pack(transaction, len(message), offset) + message[offset : offset + room]
 
 
-class Received(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """A whole command or reply and its transaction."""
 
     transaction: int
@@ -52,7 +52,7 @@ class BleAssembly:
         self._transaction = self._total = 0
         self._held: bytearray | None = None
 
-    def take(self, frame: bytes) -> Received | None:
+    def take(self, frame: bytes) -> ReceivedMessage | None:
         """Take one frame; the message where it was the last one."""
         if len(frame) < _HEAD.size:
             self._held = None
@@ -75,4 +75,4 @@ class BleAssembly:
         if len(held) < total:
             return None
         self._held = None
-        return Received(transaction, bytes(held))
+        return ReceivedMessage(transaction, bytes(held))

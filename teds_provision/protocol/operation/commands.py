@@ -53,7 +53,7 @@ def channel_list(octets: bytes, most: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True)
-class Operate:
+class OperateCommand:
     """Operate (4.1): claims ``channel`` (0: every sensor); ``lease`` in s, ``dead_man`` in ms for an actuator alone."""
 
     channel: int
@@ -69,7 +69,7 @@ class Operate:
         return Command(self.channel, EITHER, OPERATE_FUNCTION, payload)
 
     @classmethod
-    def decode(cls, channel: int, payload: bytes, *, actuator: bool) -> Operate:
+    def decode(cls, channel: int, payload: bytes, *, actuator: bool) -> OperateCommand:
         """Read the payload for a sensor (or 0) or an actuator."""
         demand_form(len(payload) == DIGEST_OCTETS + (3 if actuator else 1))
         dead_man = int.from_bytes(payload[17:], "big") if actuator else None
@@ -147,7 +147,7 @@ def sample(channels: Sequence[int]) -> Command:
 
 
 @dataclass(frozen=True)
-class Sampled:
+class SampleReply:
     """Reply to Sample: ``tick`` (ns) of the first value, flags, the data sets in the order asked."""
 
     tick: int
@@ -159,7 +159,7 @@ class Sampled:
         return struct.pack(">QB", self.tick, self.flags) + self.data
 
     @classmethod
-    def decode(cls, payload: bytes, octets: int) -> Sampled:
+    def decode(cls, payload: bytes, octets: int) -> SampleReply:
         """Read the reply whose data sets have ``octets`` octets together; raises GarbledError."""
         if len(payload) != 9 + octets:
             raise GarbledError(f"A reply to Sample has {len(payload)} octets, not {9 + octets}.")
@@ -200,7 +200,7 @@ class PowerFlag(IntFlag):
 
 
 @dataclass(frozen=True)
-class Power:
+class PowerReply:
     """Reply to Power (128.18); ``flags`` are those of PowerFlag.
 
     Level in %, voltage in V, current in A (+ charges), temperature in °C; None where unknown.
@@ -234,7 +234,7 @@ class Power:
         )
 
     @classmethod
-    def decode(cls, payload: bytes) -> Power:
+    def decode(cls, payload: bytes) -> PowerReply:
         """Read the 7 octets; raises GarbledError."""
         if len(payload) != 7:
             raise GarbledError(f"A reply to Power has 7 octets, this one {len(payload)}.")

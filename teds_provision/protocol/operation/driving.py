@@ -13,7 +13,7 @@ from teds_provision.protocol.operation.datagram import (
     drive_key,
     drive_length,
 )
-from teds_provision.protocol.operation.stream_commands import Driven
+from teds_provision.protocol.operation.stream_commands import DriveReply
 from teds_provision.protocol.operation.subscription import TickBounds, require_new_run
 
 MICRO: Final = 1000
@@ -27,7 +27,7 @@ class Driver:
     computed, or its run is not a new one.
     """
 
-    def __init__(self, layout: Layout, reply: Driven, message_key: bytes, *, dead_man: int, after: int = 0) -> None:
+    def __init__(self, layout: Layout, reply: DriveReply, message_key: bytes, *, dead_man: int, after: int = 0) -> None:
         if reply.length != drive_length(layout.octets):
             raise NotAuthenticError(
                 f"The node takes Drive messages of {reply.length} octets; {drive_length(layout.octets)} were computed."

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
-from teds_provision.protocol.operation.commands import Power
+from teds_provision.protocol.operation.commands import PowerReply
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.sheet import ChannelKind, channel_from
 
@@ -93,7 +93,7 @@ class Hardware(Protocol):
     def fault(self, channel: int) -> bool:
         """Whether its hardware has a fault, or its last self-test failed."""
 
-    def power(self) -> Power:
+    def power(self) -> PowerReply:
         """Battery and charge."""
 
 

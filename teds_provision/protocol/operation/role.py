@@ -38,10 +38,10 @@ from teds_provision.protocol.operation.commands import (
     SELF_TEST_FUNCTION,
     WRITE_FUNCTION,
     ChannelState,
-    Operate,
+    OperateCommand,
     OperationReply,
     PowerFlag,
-    Sampled,
+    SampleReply,
     channel_list,
     demand_form,
 )
@@ -55,7 +55,7 @@ from teds_provision.teds.sheet import ChannelKind
 _OFFSET_OCTETS: Final = 4
 
 
-class Inner(NamedTuple):
+class InnerCommand(NamedTuple):
     """An inner command: its session, the port of its link, and the tick at which its last frame came."""
 
     command: Command
@@ -86,7 +86,7 @@ class OperationRole:
             hardware, self.claims, teds=self._channel_teds, real=self._real, address=address, room=streams
         )
         self._ports: dict[NodeSession, SessionPort] = {}
-        self._commands: dict[tuple[int, int], Callable[[Inner], bytes]] = {
+        self._commands: dict[tuple[int, int], Callable[[InnerCommand], bytes]] = {
             (EITHER, OPERATE_FUNCTION): self._operate,
             (EITHER, IDLE_FUNCTION): self._idle,
             (OPERATE, READ_FUNCTION): self._read,
@@ -115,7 +115,7 @@ class OperationRole:
         """Whether a command is one of operation.md."""
         return (command.command_class, command.function) in self._commands
 
-    def run(self, inner: Inner) -> Reply:
+    def run(self, inner: InnerCommand) -> Reply:
         """Run one inner command that it knows; raises CommandRefusedError."""
         self.poll()  # what is due by now goes first: a lease or dead-man that ran out, samples taken before a Stop
         self._ports[inner.session] = inner.port
@@ -164,13 +164,13 @@ class OperationRole:
 
     # -- claims ----------------------------------------------------------------------------------------------------
 
-    def _operate(self, inner: Inner) -> bytes:
+    def _operate(self, inner: InnerCommand) -> bytes:
         number, session = inner.command.channel, inner.session
         channels = self._hardware.channels
         sensors = [channel for channel, facts in self._hardware.channels.items() if not facts.actuator]
         demand(number in channels or (number == 0 and bool(sensors)), Reason.UNKNOWN_COMMAND)
         acting = number != 0 and channels[number].actuator
-        asked = Operate.decode(number, inner.command.payload, actuator=acting)
+        asked = OperateCommand.decode(number, inner.command.payload, actuator=acting)
         digest = hashlib.sha256(self._flash().security_teds()).digest()[:DIGEST_OCTETS]
         demand(asked.digest == digest, Reason.DIGEST_MISMATCH)
         wanted = [number] if number else [one for one in sensors if not self._hardware.fault(one)]
@@ -191,14 +191,14 @@ class OperationRole:
             self.claims.claim_sensors(session, wanted, asked.lease)
         return b""
 
-    def _idle(self, inner: Inner) -> bytes:
+    def _idle(self, inner: InnerCommand) -> bytes:
         number = inner.command.channel
         demand(number == 0 or number in self._hardware.channels, Reason.UNKNOWN_COMMAND)
         demand_form(not inner.command.payload)
         self.claims.release(inner.session, None if number == 0 else [number])
         return b""
 
-    def _operation(self, inner: Inner) -> bytes:
+    def _operation(self, inner: InnerCommand) -> bytes:
         demand_form(not inner.command.payload)
         rows = {channel: self._state(channel, inner.session) for channel in self._hardware.channels}
         return OperationReply(bool(self.claims.sessions()), rows).encode()
@@ -221,7 +221,7 @@ class OperationRole:
 
     # -- one value at a time ---------------------------------------------------------------------------------------
 
-    def _read(self, inner: Inner) -> bytes:
+    def _read(self, inner: InnerCommand) -> bytes:
         channel, facts = self._addressed(inner)
         payload = inner.command.payload
         demand_form(len(payload) == _OFFSET_OCTETS)
@@ -230,7 +230,7 @@ class OperationRole:
         self._demand_sound(channel)
         return payload + self._value(channel, facts, self._hardware.now())[0]
 
-    def _sample(self, inner: Inner) -> bytes:
+    def _sample(self, inner: InnerCommand) -> bytes:
         channels = channel_list(inner.command.payload, MOST_SAMPLE_CHANNELS)
         self._demand_claimed(inner.session, *channels)
         facts = [self._hardware.channels[channel] for channel in channels]
@@ -239,9 +239,9 @@ class OperationRole:
         tick = self._hardware.now()
         values = [self._value(channel, each, tick) for channel, each in zip(channels, facts, strict=True)]
         flags = 0 if all(valid for _, valid in values) else NOT_VALID
-        return Sampled(tick, flags, b"".join(octets for octets, _ in values)).encode()
+        return SampleReply(tick, flags, b"".join(octets for octets, _ in values)).encode()
 
-    def _write(self, inner: Inner) -> bytes:
+    def _write(self, inner: InnerCommand) -> bytes:
         channel, facts = self._addressed(inner)
         payload = inner.command.payload
         demand_form(len(payload) == _OFFSET_OCTETS + facts.octets)
@@ -251,7 +251,7 @@ class OperationRole:
         self._apply({channel: payload[_OFFSET_OCTETS:]})
         return b""
 
-    def _set(self, inner: Inner) -> bytes:
+    def _set(self, inner: InnerCommand) -> bytes:
         values = self._pairs(inner.command.payload)
         self._demand_claimed(inner.session, *values)
         demand(all(self._hardware.channels[channel].actuator for channel in values), Reason.NOT_PERMITTED)
@@ -281,7 +281,7 @@ class OperationRole:
         self._hardware.apply(values)
         self.claims.fed(values, self._real())
 
-    def _self_test(self, inner: Inner) -> bytes:
+    def _self_test(self, inner: InnerCommand) -> bytes:
         number, channels = inner.command.channel, self._hardware.channels
         demand(number == 0 or number in channels, Reason.UNKNOWN_COMMAND)
         demand_form(len(inner.command.payload) == 1)
@@ -291,13 +291,13 @@ class OperationRole:
         self._hardware.self_test(wanted)
         return b""
 
-    def _power(self, inner: Inner) -> bytes:
+    def _power(self, inner: InnerCommand) -> bytes:
         demand_form(not inner.command.payload)
         return self._hardware.power().encode()
 
     # -- the inside ------------------------------------------------------------------------------------------------
 
-    def _addressed(self, inner: Inner) -> tuple[int, ChannelHardware]:
+    def _addressed(self, inner: InnerCommand) -> tuple[int, ChannelHardware]:
         facts = self._hardware.channels.get(inner.command.channel)
         if facts is None:
             raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
@@ -328,5 +328,5 @@ class OperationRole:
         return round(self._clock() * SECOND)
 
 
-def _payload(inner: Inner) -> bytes:
+def _payload(inner: InnerCommand) -> bytes:
     return inner.command.payload

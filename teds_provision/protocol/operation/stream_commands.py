@@ -35,7 +35,7 @@ class StreamKind(IntEnum):
 
 
 @dataclass(frozen=True)
-class Subscribe:
+class SubscribeCommand:
     """Subscribe (128.14): ``gap`` in µs, ``period`` and ``start`` in ns of the node's clock (start: SOON, WAITS)."""
 
     stream: int
@@ -58,7 +58,7 @@ class Subscribe:
         return security_command(Function.SUBSCRIBE, self.encode())
 
     @classmethod
-    def decode(cls, payload: bytes) -> Subscribe:
+    def decode(cls, payload: bytes) -> SubscribeCommand:
         """Read the payload; its form is checked as section 4 says (form, stream, kind, n: 4)."""
         demand_form(len(payload) > 21)
         stream, kind, n, gap, period, start = struct.unpack_from(">BBBHQQ", payload)
@@ -79,7 +79,7 @@ def message_length(kind: StreamKind, n: int, octets: int) -> int:
 
 
 @dataclass(frozen=True)
-class Subscribed:
+class SubscribeReply:
     """Reply to Subscribe: run, length of each message in octets, first instant in ns (WAITS: not known yet)."""
 
     run: int
@@ -91,7 +91,7 @@ class Subscribed:
         return struct.pack(">HHQ", self.run, self.length, self.start)
 
     @classmethod
-    def decode(cls, payload: bytes) -> Subscribed:
+    def decode(cls, payload: bytes) -> SubscribeReply:
         """Read the 12 octets; raises GarbledError."""
         if len(payload) != 12:
             raise GarbledError(f"A reply to Subscribe has 12 octets, this one {len(payload)}.")
@@ -116,7 +116,7 @@ def drive(channels: Sequence[int]) -> Command:
 
 
 @dataclass(frozen=True)
-class Driven:
+class DriveReply:
     """Reply to Drive: run, and length of each message in octets."""
 
     run: int
@@ -127,7 +127,7 @@ class Driven:
         return struct.pack(">HH", self.run, self.length)
 
     @classmethod
-    def decode(cls, payload: bytes) -> Driven:
+    def decode(cls, payload: bytes) -> DriveReply:
         """Read the 4 octets; raises GarbledError."""
         if len(payload) != 4:
             raise GarbledError(f"A reply to Drive has 4 octets, this one {len(payload)}.")
@@ -140,7 +140,7 @@ CLOCK: Final = security_command(Function.CLOCK)
 
 
 @dataclass(frozen=True)
-class Clock:
+class ClockReply:
     """Reply to Clock (128.16): ticks in ns, ``step`` in ns, ``drift`` in ppm; ``mark`` 0: none, ``last`` NONE: none."""
 
     received: int
@@ -155,7 +155,7 @@ class Clock:
         return struct.pack(">QQQIHI", self.received, self.sent, self.mark, self.step, self.drift, self.last)
 
     @classmethod
-    def decode(cls, payload: bytes) -> Clock:
+    def decode(cls, payload: bytes) -> ClockReply:
         """Read the 34 octets; raises GarbledError."""
         if len(payload) != 34:
             raise GarbledError(f"A reply to Clock has 34 octets, this one {len(payload)}.")
@@ -171,7 +171,7 @@ class Action(IntEnum):
 
 
 @dataclass(frozen=True)
-class Arm:
+class ArmCommand:
     """Arm (128.17): ``commitment`` C, ``life`` in s (0 disarms), ``action``; the range is the node's to check (19)."""
 
     commitment: bytes
@@ -183,7 +183,7 @@ class Arm:
         return security_command(Function.ARM, self.commitment + bytes([self.life, self.action]))
 
     @classmethod
-    def decode(cls, payload: bytes) -> Arm:
+    def decode(cls, payload: bytes) -> ArmCommand:
         """Read the payload; raises CommandRefusedError (4)."""
         demand_form(len(payload) == 18)
         return cls(payload[:16], payload[16], payload[17])

@@ -29,12 +29,12 @@ from teds_provision.protocol.operation.stream_commands import (
     SOON,
     WAITS,
     Action,
-    Arm,
-    Clock,
-    Driven,
+    ArmCommand,
+    ClockReply,
+    DriveReply,
     StreamKind,
-    Subscribe,
-    Subscribed,
+    SubscribeCommand,
+    SubscribeReply,
 )
 from teds_provision.protocol.operation.streams import MICRO, DataFrame, Sender, Stream
 from teds_provision.protocol.operation.timing import START_AFTER_MARK, commitment
@@ -50,7 +50,7 @@ LONGEST_LIFE: Final = 60
 _WRAP: Final = 1 << 32
 
 
-class Armed(NamedTuple):
+class ArmedTrigger(NamedTuple):
     """A trigger that is awaited: C, and until when (real ns)."""
 
     commitment: bytes
@@ -68,11 +68,11 @@ class DriveRun:
 
 
 @dataclass
-class _Measuring:
+class _SessionStreams:
     """What a session has besides its claims: the last run, what is armed, the mark, its Drive."""
 
     run: int = 0
-    armed: dict[Action, Armed] = field(default_factory=dict)
+    armed: dict[Action, ArmedTrigger] = field(default_factory=dict)
     mark: int = 0
     drive: DriveRun | None = None
 
@@ -103,7 +103,7 @@ class StreamRole:
         self._teds, self._real, self._address, self._room = teds, real, address, room
         self._streams: list[Stream] = []
         self._senders: dict[str, Sender] = {}
-        self._sessions: dict[NodeSession, _Measuring] = {}
+        self._sessions: dict[NodeSession, _SessionStreams] = {}
         self._missed = 0
 
     @property
@@ -125,7 +125,7 @@ class StreamRole:
 
     def subscribe(self, payload: bytes, session: NodeSession, port: SessionPort) -> bytes:
         """Subscribe: every check in the order of section 4, then the stream."""
-        asked = Subscribe.decode(payload)
+        asked = SubscribeCommand.decode(payload)
         demand(port.kind != "nfc", Reason.DOES_NOT_FIT)
         demand(port.hears, Reason.WRONG_STATE)
         layout = self._layout(asked.channels, session)
@@ -156,7 +156,7 @@ class StreamRole:
         start = now + SOON_NS if asked.start == SOON else asked.start
         stream = Stream(session, port, asked, layout, own.run, None if start == WAITS else start)
         self._streams.append(stream)
-        return Subscribed(own.run, length, start).encode()
+        return SubscribeReply(own.run, length, start).encode()
 
     def stop(self, payload: bytes, session: NodeSession) -> bytes:
         """Stop: the counter that the next message would have had."""
@@ -181,24 +181,24 @@ class StreamRole:
         length = drive_length(layout.octets)
         sealer = DatagramSealer(drive_key(session.message_key, own.run))
         own.drive = DriveRun(layout, sealer, StreamAssembly(length, fd=port.fd, drive=True))
-        return Driven(own.run, length).encode()
+        return DriveReply(own.run, length).encode()
 
     def clock(self, payload: bytes, session: NodeSession, received: int) -> bytes:
         """Clock: ``received`` is the tick at which the last frame of the request came."""
         demand_form(not payload)
         own, hardware = self._measuring_of(session), self._hardware
         last = NONE if own.drive is None or own.drive.last is None else own.drive.last
-        return Clock(received, hardware.now(), own.mark, hardware.step, hardware.drift, last).encode()
+        return ClockReply(received, hardware.now(), own.mark, hardware.step, hardware.drift, last).encode()
 
     def arm(self, payload: bytes, session: NodeSession, port: SessionPort) -> bytes:
         """Arm: one trigger per action; life 0 disarms."""
-        asked = Arm.decode(payload)
+        asked = ArmCommand.decode(payload)
         demand(asked.life <= LONGEST_LIFE and asked.action in set(Action), Reason.OUT_OF_RANGE)
         demand(port.kind == "can", Reason.DOES_NOT_FIT)
         armed = self._measuring_of(session).armed
         armed.pop(Action(asked.action), None)
         if asked.life:
-            armed[Action(asked.action)] = Armed(asked.commitment, self._real() + asked.life * SECOND)
+            armed[Action(asked.action)] = ArmedTrigger(asked.commitment, self._real() + asked.life * SECOND)
         return b""
 
     # -- what comes without a reply --------------------------------------------------------------------------------
@@ -313,8 +313,8 @@ class StreamRole:
 
     # -- the inside ------------------------------------------------------------------------------------------------
 
-    def _measuring_of(self, session: NodeSession) -> _Measuring:
-        return self._sessions.setdefault(session, _Measuring())
+    def _measuring_of(self, session: NodeSession) -> _SessionStreams:
+        return self._sessions.setdefault(session, _SessionStreams())
 
     def _on(self, bus: str) -> list[Stream]:
         return [stream for stream in self._streams if stream.port.bus == bus]
@@ -338,7 +338,7 @@ class StreamRole:
         self._sender(stream.port.bus).take_back(stream)
 
 
-def _share(others: list[Stream], asked: Subscribe, length: int, port: SessionPort) -> int:
+def _share(others: list[Stream], asked: SubscribeCommand, length: int, port: SessionPort) -> int:
     """What the streams of a bus take of the node's budget, with one more, in ppm."""
     there = [stream for stream in others if stream.port.bus == port.bus]
     widest = max([1, asked.gap, *(stream.asked.gap for stream in there)])

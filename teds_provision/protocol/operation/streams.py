@@ -13,14 +13,14 @@ from teds_provision.protocol.operation.can_frames import DataAddress, Segment, b
 from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
 from teds_provision.protocol.operation.datagram import LAST_COUNTER, DatagramSealer, Layout, pattern, stream_key
 from teds_provision.protocol.operation.hardware import Hardware, SessionPort
-from teds_provision.protocol.operation.stream_commands import WAITS, StreamKind, Subscribe
+from teds_provision.protocol.operation.stream_commands import WAITS, StreamKind, SubscribeCommand
 from teds_provision.protocol.session import NodeSession
 
 MICRO: Final = 1000
 _TICK: Final = 8
 
 
-class Full(NamedTuple):
+class FullMessage(NamedTuple):
     """A message that is full and not sealed yet."""
 
     counter: int
@@ -31,7 +31,13 @@ class Stream:
     """One run of one stream. ``start`` in ns, None while it waits for a trigger; ``session``'s replies go first."""
 
     def __init__(
-        self, session: NodeSession, port: SessionPort, asked: Subscribe, layout: Layout, run: int, start: int | None
+        self,
+        session: NodeSession,
+        port: SessionPort,
+        asked: SubscribeCommand,
+        layout: Layout,
+        run: int,
+        start: int | None,
     ) -> None:
         self.session, self.port, self.asked, self.layout, self.run = session, port, asked, layout, run
         self.start = start
@@ -41,7 +47,7 @@ class Stream:
         self.missed = 0
         self.ready = False
         self.ended = False
-        self.waiting: Full | None = None
+        self.waiting: FullMessage | None = None
         self._sealer = DatagramSealer(stream_key(session.message_key, run))
         self._filling = bytearray()
         self._flags = 0
@@ -117,7 +123,7 @@ class Stream:
         flags = self._flags | (TEST_PATTERN if self.asked.test_pattern else 0)
         if self.waiting is not None:
             self.missed += 1
-        self.waiting = Full(self.counter, bytes([flags]) + bytes(self._filling))
+        self.waiting = FullMessage(self.counter, bytes([flags]) + bytes(self._filling))
         self._filling, self._flags, self._held = bytearray(), 0, 0
         self._count()
 

@@ -26,8 +26,8 @@ from teds_provision.protocol.operation.stream_commands import (
     SOON,
     WAITS,
     StreamKind,
-    Subscribe,
-    Subscribed,
+    SubscribeCommand,
+    SubscribeReply,
     message_length,
 )
 
@@ -51,7 +51,7 @@ class TickBounds(NamedTuple):
 class StreamPlan:
     """A stream that a station wants; ``subscribe`` says it, ``layout`` the channels' widths (from the signed TEDS)."""
 
-    subscribe: Subscribe
+    subscribe: SubscribeCommand
     layout: Layout
 
     @classmethod
@@ -69,7 +69,9 @@ class StreamPlan:
     ) -> StreamPlan:
         """A plan over (channel, ModLenth) pairs; ``period`` and ``start`` in ns, ``gap`` in µs."""
         numbers, widths = tuple(c for c, _ in channels), tuple(w for _, w in channels)
-        return cls(Subscribe(stream, kind, n, gap, period, start, numbers, test_pattern), Layout(numbers, widths))
+        return cls(
+            SubscribeCommand(stream, kind, n, gap, period, start, numbers, test_pattern), Layout(numbers, widths)
+        )
 
     @property
     def length(self) -> int:
@@ -90,13 +92,13 @@ class StreamPlan:
         """Subscribe."""
         return self.subscribe.command()
 
-    def accept(self, payload: bytes, now: TickBounds, *, after: int = 0) -> Subscribed:
+    def accept(self, payload: bytes, now: TickBounds, *, after: int = 0) -> SubscribeReply:
         """Read the reply; ``now`` bounds the node's tick when it came (it may have been made up to 1 s before).
 
         ``after`` is the session's last run. Raises GarbledError, or NotAuthenticError where length or start are not
         those that were asked, or the run is not a new one: end and report the stream.
         """
-        reply, asked = Subscribed.decode(payload), self.subscribe.start
+        reply, asked = SubscribeReply.decode(payload), self.subscribe.start
         if reply.length != self.length:
             raise NotAuthenticError(f"The node streams {reply.length} octets a message; {self.length} were computed.")
         good = now.low <= reply.start + START_WITHIN and reply.start <= now.high + START_WITHIN
@@ -178,7 +180,7 @@ class Receiver:
     def __init__(
         self,
         plan: StreamPlan,
-        reply: Subscribed,
+        reply: SubscribeReply,
         message_key: bytes,
         *,
         previous: Receiver | None = None,

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from teds_provision.errors import NotAuthenticError
 from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
-from teds_provision.protocol.operation.stream_commands import Action, Arm, Clock
+from teds_provision.protocol.operation.stream_commands import Action, ArmCommand, ClockReply
 from teds_provision.protocol.operation.subscription import TickBounds
 
 START_AFTER_MARK: Final = 10 * 10**6
@@ -26,7 +26,7 @@ class ClockSample:
 
     asked: int
     answered: int
-    reply: Clock
+    reply: ClockReply
 
     def __post_init__(self) -> None:
         inside = self.reply.sent - self.reply.received
@@ -66,9 +66,9 @@ class TriggerToken(NamedTuple):
         """C = SHA-256("TEDS1 trigger" ‖ 00 ‖ T)[0:16]."""
         return commitment(self.octets)
 
-    def arm(self, action: Action, life: int) -> Arm:
+    def arm(self, action: Action, life: int) -> ArmCommand:
         """Arm (send ``.command()`` in each node's session); ``life`` 1 to 60 s."""
-        return Arm(self.commitment, life, action)
+        return ArmCommand(self.commitment, life, action)
 
 
 def commitment(token: bytes) -> bytes:

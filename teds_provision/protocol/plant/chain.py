@@ -12,7 +12,7 @@ from teds_provision.protocol.plant.roster import Place
 
 
 @dataclass(frozen=True)
-class Counting:
+class CountedPages:
     """The pages that count, ascending from 1; ``two``: the number at which two histories part, None for one."""
 
     pages: tuple[Place, ...]
@@ -24,7 +24,7 @@ class Counting:
         return self.pages[-1] if self.pages else (0, "")
 
 
-def counting(pages: Iterable[tuple[int, str, str]], *, last: Place | None, accepted: Place | None) -> Counting:
+def counting(pages: Iterable[tuple[int, str, str]], *, last: Place | None, accepted: Place | None) -> CountedPages:
     """Say which of a station's signed pages (n, H, ``previous``) count.
 
     ``last`` is the roster's word on a removed station, ``accepted`` a person's on two histories; the roster's goes
@@ -46,12 +46,12 @@ def counting(pages: Iterable[tuple[int, str, str]], *, last: Place | None, accep
     counted: list[Place] = []
     for n in range(1, 1 + (last[0] if last is not None else max(there, default=0))):
         if len(names.get(n, ())) > 1:
-            return Counting(tuple(counted), n)
+            return CountedPages(tuple(counted), n)
         (hash,) = names.get(n) or ("",)
         if hash not in there.get(n, ()):
             break
         counted.append((n, hash))
-    return Counting(tuple(counted))
+    return CountedPages(tuple(counted))
 
 
 def _branch(there: dict[int, dict[str, str]], anchor: Place) -> dict[int, dict[str, str]]:

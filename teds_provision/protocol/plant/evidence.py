@@ -259,7 +259,7 @@ def _statement(payload: bytes, keyid: str, signature: bytes) -> Evidence:
 
 
 @dataclass(frozen=True)
-class Ready:
+class CheckedEvidence:
     """A document of which everything but its signatures was looked at: its Security TEDS, or why that is none."""
 
     evidence: Evidence
@@ -278,17 +278,17 @@ class Signatures(NamedTuple):
     board: bool | None
 
 
-def ready(evidence: Evidence) -> Ready:
+def ready(evidence: Evidence) -> CheckedEvidence:
     """Look at everything that comes before the signatures."""
     try:
         shown, signed = security.decode_with_tbs(evidence.uuid, evidence.teds)
     except BadDataError as error:
-        return Ready(evidence, None, error.message, b"", b"")
+        return CheckedEvidence(evidence, None, error.message, b"", b"")
     asked = prove_message(evidence.uuid, challenge(evidence.nonce, evidence.bound)) if evidence.proof else b""
-    return Ready(evidence, shown, "", signed, asked)
+    return CheckedEvidence(evidence, shown, "", signed, asked)
 
 
-def check_signatures(one: Ready) -> Signatures:
+def check_signatures(one: CheckedEvidence) -> Signatures:
     """Check the signatures alone: of many documents in a row each costs half of what it costs between other work."""
     evidence, shown = one.evidence, one.shown
     envelope = _signed_by(evidence.station, pae(evidence.payload), evidence.signature)
@@ -312,7 +312,7 @@ def faults(evidence: Evidence, ca: bytes) -> list[str]:
     return faults_of(one, check_signatures(one), ca)
 
 
-def faults_of(one: Ready, signatures: Signatures, ca: bytes) -> list[str]:
+def faults_of(one: CheckedEvidence, signatures: Signatures, ca: bytes) -> list[str]:
     """As :func:`faults`, where the signatures were checked already."""
     words = _wrong_words(one.evidence)
     return [*words, *_wrong_datasheet(one, signatures, ca), *_wrong_signatures(one.evidence, signatures, ca)]
@@ -329,7 +329,7 @@ def _wrong_words(evidence: Evidence) -> Iterator[str]:
         yield "the board did not sign it"
 
 
-def _wrong_datasheet(one: Ready, signatures: Signatures, ca: bytes) -> Iterator[str]:
+def _wrong_datasheet(one: CheckedEvidence, signatures: Signatures, ca: bytes) -> Iterator[str]:
     evidence, facts, shown = one.evidence, one.evidence.facts, one.shown
     if shown is None:
         yield f"its Security TEDS is not canonical: {one.why}"

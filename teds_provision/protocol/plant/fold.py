@@ -23,7 +23,7 @@ BY_CONTACT: Final = frozenset({"tap", "bus"})
 
 
 @dataclass(frozen=True)
-class Own:
+class LocalState:
     """What this station's own store says of the node.
 
     ``pin`` is the key that the UUID is pinned to here, ``assurance`` how ("" for none), ``met`` whether the node itself
@@ -41,7 +41,7 @@ class Own:
 
 
 @dataclass(frozen=True)
-class Statement:
+class BanStatement:
     """A ban that stands in somebody's page: H, whose page, whether that page counts, what is banned and by whom."""
 
     hash: str
@@ -51,7 +51,7 @@ class Statement:
 
 
 @dataclass(frozen=True)
-class View:
+class MergedClaims:
     """What the plant says of a node; stations are fingerprints.
 
     ``pin`` is the key that all keepers who pin it name, ``pins`` whom each station pins. ``held``: which member holds
@@ -68,7 +68,7 @@ class View:
     written: Mapping[str, tuple[int, str, str | None]]
     gave: frozenset[tuple[str, int, str, str, str, str]]
     resets: frozenset[tuple[str, int]]
-    bans: tuple[Statement, ...]
+    bans: tuple[BanStatement, ...]
     name: str | None
     groups: Mapping[str, bool]
     conflicts: Mapping[str, str]
@@ -82,10 +82,10 @@ class View:
 def view(
     roster: Roster,
     claims: Mapping[str, Claim],
-    own: Own,
-    statements: Sequence[Statement] = (),
+    own: LocalState,
+    statements: Sequence[BanStatement] = (),
     liftings: Mapping[str, Collection[str]] = {},
-) -> View:
+) -> MergedClaims:
     """Say what holds of one node.
 
     ``claims`` by station, of pages that count; ``liftings``: by H of a ban, who lifted it on a page that counts.
@@ -107,7 +107,7 @@ def view(
     own_word = own.met or own.holds or (own.pin is not None and own.assurance != "registry")
 
     names = [(_weight(roster, one, claim.name[1]), claim.name[0]) for one, claim in counted.items() if claim.name]
-    return View(
+    return MergedClaims(
         pin=pin,
         pins=pins,
         held=holdings.held,
@@ -187,7 +187,7 @@ def _holders(roster: Roster, held: Mapping[str, Key]) -> tuple[int | None, dict[
 
 
 def _pin_conflicts(
-    roster: Roster, claims: Mapping[str, Claim], own: Own, pins: Mapping[str, str], keepers: Collection[str]
+    roster: Roster, claims: Mapping[str, Claim], own: LocalState, pins: Mapping[str, str], keepers: Collection[str]
 ) -> dict[str, str]:
     """Where stations name other keys of the board: keepers among themselves, anybody where none has pinned it."""
     by_keepers = {station: pins[station] for station in keepers if station in pins}
@@ -206,7 +206,7 @@ def _pin_conflicts(
     return {}
 
 
-def bans(roster: Roster, one: Statement, own: Own, liftings: Mapping[str, Collection[str]]) -> bool:
+def bans(roster: Roster, one: BanStatement, own: LocalState, liftings: Mapping[str, Collection[str]]) -> bool:
     """Whether a statement bans its node here.
 
     Its signer is a keeper, or by one's own store holds or was given the node's key; a removed one's word counts from

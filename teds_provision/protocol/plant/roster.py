@@ -52,7 +52,7 @@ class Member:
 
 
 @dataclass(frozen=True)
-class Removed:
+class RemovedMember:
     """A station that left: what it said on pages up to ``last`` counts as ``roles`` say, and nothing after."""
 
     name: str
@@ -88,15 +88,15 @@ class Roster:
     created: datetime
     expires: datetime
     members: tuple[Member, ...]
-    removed: tuple[Removed, ...] = ()
+    removed: tuple[RemovedMember, ...] = ()
     share: tuple[Share, ...] = ()
     hash: str = ""
     octets: bytes = field(default=b"", repr=False)
 
     @cached_property
-    def by_key(self) -> dict[str, Member | Removed]:
+    def by_key(self) -> dict[str, Member | RemovedMember]:
         """Everybody whom it names, by fingerprint."""
-        everybody: tuple[Member | Removed, ...] = (*self.members, *self.removed)
+        everybody: tuple[Member | RemovedMember, ...] = (*self.members, *self.removed)
         return {one.fingerprint: one for one in everybody}
 
     def member(self, fingerprint: str) -> Member | None:
@@ -104,10 +104,10 @@ class Roster:
         found = self.by_key.get(fingerprint)
         return found if isinstance(found, Member) else None
 
-    def removed_one(self, fingerprint: str) -> Removed | None:
+    def removed_one(self, fingerprint: str) -> RemovedMember | None:
         """A station that left."""
         found = self.by_key.get(fingerprint)
-        return found if isinstance(found, Removed) else None
+        return found if isinstance(found, RemovedMember) else None
 
     def point_of(self, fingerprint: str) -> bytes | None:
         """The key of a member or removed one."""
@@ -129,7 +129,7 @@ class Roster:
         found = self.by_key.get(fingerprint)
         return found.name if found is not None else fingerprint[:16]
 
-    def named(self, text: str) -> Member | Removed | None:
+    def named(self, text: str) -> Member | RemovedMember | None:
         """A member by name, else anybody by at least 16 digits of the fingerprint, else a removed one by name."""
         for member in self.members:
             if member.name == text:
@@ -246,10 +246,10 @@ def _member(value: object, ca: bytes) -> Member:
     return Member(fields.name("name"), point, certificate, _roles(fields), _signed(fields))
 
 
-def _removed(value: object) -> Removed:
+def _removed(value: object) -> RemovedMember:
     fields = Fields(value, "A removed station of the roster")
     why: Any = fields.one_of("why", WHYS)
-    return Removed(
+    return RemovedMember(
         fields.name("name"), fields.point("point"), _roles(fields), why, fields.place("last"), _signed(fields)
     )
 

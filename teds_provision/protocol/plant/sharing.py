@@ -12,7 +12,7 @@ from datetime import datetime, timedelta
 from typing import Final
 
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.plant.fold import View
+from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.roster import Roster, Share
 
 SILENT: Final = timedelta(days=7)
@@ -24,7 +24,7 @@ def receivers(roster: Roster, sender: str, share: Share) -> tuple[str, ...]:
     return tuple(one for one in share.to if one != sender and "base" in roster.roles_of(one) and roster.member(one))
 
 
-def shares_any(shares: Iterable[Share], view: View, sender: str) -> bool:
+def shares_any(shares: Iterable[Share], view: MergedClaims, sender: str) -> bool:
     """Whether a node is one of any share's: all, a profile that the sender wrote on it, a group.
 
     A group is the sender's own, or a keeper's: else any member could put a node where its key is shared.
@@ -37,12 +37,12 @@ def shares_any(shares: Iterable[Share], view: View, sender: str) -> bool:
     )
 
 
-def gave_away(view: View, station: str) -> bool:
+def gave_away(view: MergedClaims, station: str) -> bool:
     """Whether a station gave the node away by a move that stands."""
     return any(giver == station and mode == "move" for giver, _, _, _, mode, _ in view.gave)
 
 
-def sharer(roster: Roster, view: View, key: tuple[int, str], silent: AbstractSet[str]) -> str | None:
+def sharer(roster: Roster, view: MergedClaims, key: tuple[int, str], silent: AbstractSet[str]) -> str | None:
     """Who has to share a key (epoch, key id): who made it, else the holder with the lowest fingerprint; None: unknown.
 
     ``silent`` are stations of which no page came for :data:`SILENT`. A removed one shares nothing.
@@ -74,7 +74,14 @@ LATER: Final = "the sender's pages are not here yet"
 
 
 def why_not(
-    roster: Roster, view: View, offer: Offer, *, sender: str, receiver: str, pin: str | None, quiet: AbstractSet[str]
+    roster: Roster,
+    view: MergedClaims,
+    offer: Offer,
+    *,
+    sender: str,
+    receiver: str,
+    pin: str | None,
+    quiet: AbstractSet[str],
 ) -> str:
     """Why a copy of one node is not taken in by itself, "" where it is.
 
@@ -100,7 +107,7 @@ def why_not(
     return ""
 
 
-def _claims(view: View, sender: str, node: str) -> bool:
+def _claims(view: MergedClaims, sender: str, node: str) -> bool:
     """Whether the sender names this node key, else somebody: as there is no conflict, nobody names another one."""
     named = [view.pins[sender]] if sender in view.pins else list(view.pins.values())
     return any(same_key(one, node) for one in named)

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Literal, NamedTuple
 
-from teds_provision.protocol.plant.roster import Member, Place, Removed, Roster
+from teds_provision.protocol.plant.roster import Member, Place, RemovedMember, Roster
 
 
-class Word(NamedTuple):
+class SignatureClaim(NamedTuple):
     """Who said of a datasheet's digest, on page ``n`` of its chain, that it signed it, or (``vouched``) vouches."""
 
     station: str
@@ -20,14 +20,14 @@ class Word(NamedTuple):
     vouched: bool
 
 
-class Signing(NamedTuple):
+class SignerVerdict(NamedTuple):
     """Passed, failed, or unproven for want of pages; and why."""
 
     result: Literal["passed", "failed", "unproven"]
     why: str = ""
 
 
-def limit_of(one: Member | Removed) -> Place | None:
+def limit_of(one: Member | RemovedMember) -> Place | None:
     """Up to which page the ``signed`` events of somebody without ``sign`` count; None: it never had it."""
     if isinstance(one, Member):
         return one.signed
@@ -39,12 +39,12 @@ def limit_of(one: Member | Removed) -> Place | None:
 def signing(
     roster: Roster,
     signer: str,
-    words: Collection[Word],
+    words: Collection[SignatureClaim],
     *,
     counted: Mapping[str, int],
     keepers_behind: bool,
     added: bool,
-) -> Signing:
+) -> SignerVerdict:
     """Judge the signer (fingerprint) of one datasheet.
 
     ``words`` are those about its digest, of pages that count; ``counted``: how many pages of each chain count here;
@@ -54,19 +54,21 @@ def signing(
     one = roster.by_key.get(signer)
     own = [word.n for word in words if word.station == signer and not word.vouched]
     if isinstance(one, Member) and "sign" in one.roles:
-        return Signing("passed", "" if own else "in no page yet")
+        return SignerVerdict("passed", "" if own else "in no page yet")
     if any(word.vouched and "keeper" in roster.roles_of(word.station) for word in words):
-        return Signing("passed", "vouched for by a keeper")
+        return SignerVerdict("passed", "vouched for by a keeper")
     if one is None:
         if added:
-            return Signing("passed", "trusted here")
-        return Signing("failed", f"station {signer[:16]} is not in the roster")
+            return SignerVerdict("passed", "trusted here")
+        return SignerVerdict("failed", f"station {signer[:16]} is not in the roster")
     limit = limit_of(one)
     if limit is not None and any(n <= limit[0] for n in own):
-        return Signing("passed", f"signed by {one.name} while it had the role")
+        return SignerVerdict("passed", f"signed by {one.name} while it had the role")
     if limit is not None and counted.get(signer, 0) < limit[0]:
-        return Signing("unproven", f"pages of {one.name} are missing here")
-    if isinstance(one, Removed) and keepers_behind:
-        return Signing("unproven", "pages of a keeper are missing here")
+        return SignerVerdict("unproven", f"pages of {one.name} are missing here")
+    if isinstance(one, RemovedMember) and keepers_behind:
+        return SignerVerdict("unproven", "pages of a keeper are missing here")
     why = "never had the role sign" if limit is None else "this datasheet is not in its pages of that time"
-    return Signing("failed", f"{one.name} {'was removed' if isinstance(one, Removed) else 'may not sign'}: {why}")
+    return SignerVerdict(
+        "failed", f"{one.name} {'was removed' if isinstance(one, RemovedMember) else 'may not sign'}: {why}"
+    )

@@ -32,12 +32,12 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
 from teds_provision.protocol.operation.hardware import Hardware, SessionPort, port_of
-from teds_provision.protocol.operation.role import Inner, OperationRole
+from teds_provision.protocol.operation.role import InnerCommand, OperationRole
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import LAST_COUNTER, NodeSession, OneTime
-from teds_provision.protocol.tim.agreeing import Agreeing
+from teds_provision.protocol.tim.node_agreement import AgreementSlot
+from teds_provision.protocol.tim.node_sessions import Sessions
 from teds_provision.protocol.tim.permission import Origin, Permission, of_teds
-from teds_provision.protocol.tim.sessions import Sessions
 from teds_provision.protocol.tim.teds_access import Staging, TedsAccess
 
 _ADDRESS_SECONDS: Final = 10.0
@@ -77,7 +77,7 @@ class Tim:
         self._address_written_at: float | None = None
         self._staging = Staging()
         self._teds = TedsAccess(self.max_message, self.max_teds, self.verify)
-        self._agreeing = Agreeing(self.key, self.clock, self.random, self.one_time, self.verify)
+        self._agreeing = AgreementSlot(self.key, self.clock, self.random, self.one_time, self.verify)
         self._sessions = Sessions(
             self.clock,
             self.random,
@@ -269,7 +269,7 @@ class Tim:
             return Reply(True, security(command.payload, origin))
         if self._role is None or origin.session is None or not self._role.knows(command):
             raise CommandRefusedError(Reason.UNKNOWN_COMMAND)
-        return self._role.run(Inner(command, origin.session, origin.port, origin.received))
+        return self._role.run(InnerCommand(command, origin.session, origin.port, origin.received))
 
     # -- class 128: each gives the payload of its reply ------------------------------------------------------------
 

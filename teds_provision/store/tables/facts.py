@@ -8,12 +8,12 @@ from operator import attrgetter
 from typing import Any
 
 from teds_provision.store.database import Database, places
-from teds_provision.store.records import Marks, StationRecord
+from teds_provision.store.records import KeyFlags, StationRecord
 
 _FACTS = ", ".join(column.name for column in fields(StationRecord))
-_MARKS = ", ".join(column.name for column in fields(Marks))
-_NONE = Marks()
-_values = attrgetter(*(column.name for column in fields(Marks)))
+_MARKS = ", ".join(column.name for column in fields(KeyFlags))
+_NONE = KeyFlags()
+_values = attrgetter(*(column.name for column in fields(KeyFlags)))
 
 
 class FactTables:
@@ -55,22 +55,22 @@ class FactTables:
 
     # -- marks on nodes --------------------------------------------------------------------------------------------
 
-    def marks(self, uuid: bytes) -> Marks:
+    def marks(self, uuid: bytes) -> KeyFlags:
         """Return the marks on a node; none of them is set on one without."""
-        return self._database.read_one(Marks, f"SELECT {_MARKS} FROM marks WHERE uuid = ?", (uuid,)) or Marks()
+        return self._database.read_one(KeyFlags, f"SELECT {_MARKS} FROM marks WHERE uuid = ?", (uuid,)) or KeyFlags()
 
-    def marks_of(self, uuids: Sequence[bytes]) -> dict[bytes, Marks]:
+    def marks_of(self, uuids: Sequence[bytes]) -> dict[bytes, KeyFlags]:
         """Return the marks on those of these nodes (a page of them) that have one."""
         statement = f"SELECT uuid, {_MARKS} FROM marks WHERE uuid IN ({places(uuids)})"
         return dict(self._database.read(_marked, statement, uuids))
 
-    def all_marks(self) -> dict[bytes, Marks]:
+    def all_marks(self) -> dict[bytes, KeyFlags]:
         """Return the marks on every node that has one."""
         return dict(self._database.read(_marked, f"SELECT uuid, {_MARKS} FROM marks"))
 
-    def put_marks(self, marks: Mapping[bytes, Marks]) -> None:
+    def put_marks(self, marks: Mapping[bytes, KeyFlags]) -> None:
         """Keep the marks on nodes, in place of those that are there; a node without any has no row."""
-        columns = ("uuid", *fields(Marks))
+        columns = ("uuid", *fields(KeyFlags))
         rows = ((uuid, *_values(mark)) for uuid, mark in marks.items() if mark != _NONE)
         without = [(uuid,) for uuid, mark in marks.items() if mark == _NONE]
         with self._database.together():
@@ -79,5 +79,5 @@ class FactTables:
             self._database.execute_many(statement, rows)
 
 
-def _marked(uuid: bytes, *row: Any) -> tuple[bytes, Marks]:
-    return uuid, Marks(*row)
+def _marked(uuid: bytes, *row: Any) -> tuple[bytes, KeyFlags]:
+    return uuid, KeyFlags(*row)

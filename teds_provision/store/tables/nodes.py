@@ -15,8 +15,8 @@ from teds_provision.errors import KeyMismatchError, NotFoundError, UsageError
 from teds_provision.store.database import PAGE, Database, places
 from teds_provision.store.records import (
     UUID_OCTETS,
-    ExportFacts,
-    Handed,
+    ExportedNode,
+    ExportEligibility,
     Holder,
     KeyRecord,
     NodeRecord,
@@ -34,7 +34,7 @@ _HANDED_COLUMNS = ", ".join(
     "(SELECT json_group_array(name) FROM (SELECT name FROM group_members m WHERE m.uuid = nodes.uuid ORDER BY name))"
     if name == "groups"
     else name
-    for name in Handed._fields
+    for name in ExportedNode._fields
 )
 REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({places(NODE_FIELDS)})"
 REPLACE_ENTRY = "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)"
@@ -83,11 +83,11 @@ class NodeTables:
         """Return all nodes, by UUID."""
         return self._database.read(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
-    def each_shown(self) -> Iterator[ExportFacts]:
+    def each_shown(self) -> Iterator[ExportEligibility]:
         """Give identity key and retirement of all nodes, by UUID, a page at a time."""
         after = b""
         statement = "SELECT uuid, point, point_mac, retired FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
-        while page := self._database.read(ExportFacts, statement, (after, PAGE)):
+        while page := self._database.read(ExportEligibility, statement, (after, PAGE)):
             yield from page
             after = page[-1].uuid
 
@@ -96,7 +96,7 @@ class NodeTables:
         statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
         return {record.uuid: record for record in self._database.read(NodeRecord, statement, uuids)}
 
-    def handed_of(self, uuids: Sequence[bytes]) -> dict[bytes, Handed]:
+    def handed_of(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
         """Return what a bundle says of these nodes (a page of them), by UUID."""
         statement = f"SELECT {_HANDED_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
         return {handed.uuid: handed for handed in self._database.read(_handed, statement, uuids)}
@@ -204,9 +204,9 @@ class NodeTables:
         return sorted(bytes(uuid) for (uuid,) in self._database.execute(*_by_name(name)))
 
 
-def _handed(*row: Any) -> Handed:
+def _handed(*row: Any) -> ExportedNode:
     values: tuple[Any, ...] = (*row[:-1], _groups(row[-1]))
-    return Handed(*values)
+    return ExportedNode(*values)
 
 
 @lru_cache(maxsize=256)  # nodes may be 100,000, and groups are few
@@ -262,7 +262,7 @@ def pages(values: Iterable[Value], length: int = PAGE) -> Iterator[list[Value]]:
 
 
 @dataclass(frozen=True)
-class Batch:
+class BulkRows:
     """Rows to add or replace, and marks of nodes; the caller has held epochs and keys against what is there."""
 
     nodes: Sequence[NodeRecord] = ()
@@ -273,7 +273,10 @@ class Batch:
     groups: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
     """Nodes to add to measurement groups, by the group's name; a group that does not exist is created."""
     marks: Mapping[bytes, Mapping[str, Any]] = field(default_factory=dict)
-    """Changes of marks (names, values of :class:`records.Marks`), by UUID; the caller of ``put_batch`` makes them."""
+    """Changes of marks (names, values of :class:`records.KeyFlags`), by UUID.
+
+    The caller of ``put_batch`` makes them.
+    """
 
 
 class BulkTables:
@@ -288,7 +291,7 @@ class BulkTables:
 
     def put_batch(
         self,
-        batch: Batch,
+        batch: BulkRows,
         seal_node: Callable[[NodeRecord], bytes | None] = lambda node: node.point_mac,
         seal_entry: Callable[[WhitelistEntry], bytes | None] = lambda entry: entry.mac,
     ) -> None:

@@ -51,7 +51,7 @@ class NodeOverview:
 
 
 @dataclass(frozen=True)
-class Tally:
+class WaitingNodes:
     """Nodes that wait for somebody, by UUID."""
 
     overdue: tuple[bytes, ...]
@@ -78,14 +78,14 @@ class OverviewTables:
         for first in range(0, len(uuids), PAGE):
             yield from self._page(uuids[first : first + PAGE])
 
-    def tally(self, today: str) -> Tally:
+    def tally(self, today: str) -> WaitingNodes:
         """Return the nodes that wait for somebody; ``today`` is a day, ISO 8601."""
 
         def some(statement: str, *values: Any) -> tuple[bytes, ...]:
             return tuple(bytes(uuid) for (uuid,) in self._database.execute(statement, values))
 
         gone = "(SELECT uuid FROM tombstones UNION SELECT uuid FROM revocations)"
-        return Tally(
+        return WaitingNodes(
             some("SELECT uuid FROM nodes WHERE due < ? ORDER BY due, uuid", today),
             some(
                 "SELECT uuid FROM nodes WHERE name IN"

@@ -20,7 +20,7 @@ from teds_provision.limits import LIMITS, check_size, load_json
 from teds_provision.teds.calibration.model import PLAIN, Calibration
 from teds_provision.teds.calibration.order import CalibrationOrder, calibration_of
 from teds_provision.teds.profile.model import ChannelProfile, Profile
-from teds_provision.teds.profile.reader import Item, TomlTable, Where, parse, read_text
+from teds_provision.teds.profile.reader import PlacedValue, SourcePlace, TomlTable, parse, read_text
 from teds_provision.teds.units import parse_unit
 
 # The CSV reader takes delimiter, decimal comma, header, units and metadata as instruments and spreadsheets write them.
@@ -342,26 +342,26 @@ def _json(text: str, file: str) -> TomlTable:
     if not isinstance(data, dict):
         raise BadDataError(f"{file}:1: an object is expected, with points or coefficients.")
 
-    def line(key: str) -> Where:
+    def line(key: str) -> SourcePlace:
         at = text.find(f'"{key}"')
-        return Where(file, text.count("\n", 0, max(at, 0)) + 1)
+        return SourcePlace(file, text.count("\n", 0, max(at, 0)) + 1)
 
-    def table(value: Mapping[str, object], where: Where, path: str) -> TomlTable:
+    def table(value: Mapping[str, object], where: SourcePlace, path: str) -> TomlTable:
         return TomlTable({key: entry(part, line(key), f"{path}{key}") for key, part in value.items()}, where, path)
 
-    def entry(value: object, where: Where, path: str) -> Item | TomlTable:
+    def entry(value: object, where: SourcePlace, path: str) -> PlacedValue | TomlTable:
         if isinstance(value, dict):
             return table(value, where, f"{path}.")
         if isinstance(value, list) and value and all(isinstance(part, dict) for part in value):
-            return Item(tuple(table(part, where, f"{path}[{n}].") for n, part in enumerate(value)), where)
-        return Item(value, where)
+            return PlacedValue(tuple(table(part, where, f"{path}[{n}].") for n, part in enumerate(value)), where)
+        return PlacedValue(value, where)
 
-    return table(data, Where(file, 1), "")
+    return table(data, SourcePlace(file, 1), "")
 
 
 def _from_table(table: TomlTable, file: str) -> list[CalibrationOrder]:
     many = table.entries.get("calibration")
-    if isinstance(many, Item) and isinstance(many.value, tuple):
+    if isinstance(many, PlacedValue) and isinstance(many.value, tuple):
         shared = {key: entry for key, entry in table.entries.items() if key != "calibration"}
         return [_order(TomlTable({**shared, **part.entries}, part.where), file) for part in many.value]
     return [_order(table, file)]

@@ -16,7 +16,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
 from teds_provision.errors import BadDataError
-from teds_provision.teds.codec.model import Decoded, Edition, Field, TimeInstance, Units
+from teds_provision.teds.codec.model import DecodedTeds, Edition, Field, TimeInstance, Units
 from teds_provision.teds.units import WrittenUnit, parse_unit, recognize
 
 Method = Literal["linear", "polynomial", "table", "steps"]
@@ -195,7 +195,7 @@ def instant(moment: datetime) -> TimeInstance:
 
 
 def from_decoded(
-    decoded: Decoded, *, channel: int | None = None, units: Units | None = None, actuator: bool = False
+    decoded: DecodedTeds, *, channel: int | None = None, units: Units | None = None, actuator: bool = False
 ) -> Calibration:
     """Calibration of a decoded Calibration TEDS; ``units`` and ``actuator`` as the channel's own TEDS says.
 
@@ -268,16 +268,16 @@ def _input(field: Field, channel: int) -> CalibrationInput:
     )
 
 
-def _top(decoded: Decoded, name: str) -> object:
+def _top(decoded: DecodedTeds, name: str) -> object:
     return next((field.value for field in decoded.fields if field.name == name), None)
 
 
-def _number(decoded: Decoded, name: str) -> float | None:
+def _number(decoded: DecodedTeds, name: str) -> float | None:
     value = _top(decoded, name)
     return float(value) if isinstance(value, (int, float)) else None
 
 
-def calibrated_unit(decoded: Decoded, units: Units) -> WrittenUnit:
+def calibrated_unit(decoded: DecodedTeds, units: Units) -> WrittenUnit:
     """Calibrated unit of a decoded Calibration TEDS: exponents of the channel, SIConvrt as the way into SI."""
     convert = next((field for field in decoded.fields if field.name == "SIConvrt"), None)
     if convert is None:

@@ -10,7 +10,16 @@ from typing import Final
 from teds_provision.errors import BadDataError
 from teds_provision.teds.codec import values
 from teds_provision.teds.codec.frame import TEDSID, frame, raw_tuple
-from teds_provision.teds.codec.model import AccessCode, Decoded, Edition, Field, Finding, Severity, TimeInstance, Units
+from teds_provision.teds.codec.model import (
+    AccessCode,
+    DecodedTeds,
+    Edition,
+    Field,
+    Finding,
+    Severity,
+    TimeInstance,
+    Units,
+)
 from teds_provision.teds.codec.tables import ONLY_2024, TEXT_BASED, FieldSpec, Table, table
 from teds_provision.teds.codec.values import compose_text, pairs_of
 
@@ -157,12 +166,12 @@ def _octet(given: Mapping[str, object], key: str, default: int) -> int:
     return value
 
 
-def encode(decoded: Decoded) -> bytes:
+def encode(decoded: DecodedTeds) -> bytes:
     """Octets that a TEDS was decoded from, exactly: unknown fields and classes, damage and all."""
     return decoded.octets
 
 
-def recompose(decoded: Decoded) -> bytes:
+def recompose(decoded: DecodedTeds) -> bytes:
     """Encode the fields of a decoded TEDS anew: TEDSID, width, order, spelling of units and Length as they should be.
 
     The result is equal to the original for a clean TEDS. Unknown fields keep their octets. A framed TEDS gives a framed
@@ -180,7 +189,7 @@ def recompose(decoded: Decoded) -> bytes:
     return frame(block) if decoded.framed else block
 
 
-def tuple_width(decoded: Decoded) -> int:
+def tuple_width(decoded: DecodedTeds) -> int:
     """How many length octets the tuples of a decoded TEDS have, as its TEDSID says; 1 where it does not say."""
     for field in decoded.fields:
         if field.name == "TEDSID":
@@ -222,7 +231,7 @@ def _written(field: Field, spec: FieldSpec, edition: Edition) -> bytes:
     return field.raw if octets != field.raw and field.value != field.value else octets
 
 
-def _tail(decoded: Decoded) -> bytes:
+def _tail(decoded: DecodedTeds) -> bytes:
     """What stands behind the tuples of a text-based TEDS, octet for octet."""
     if not decoded.text:
         return b""
@@ -244,7 +253,7 @@ _VERSIONS: Final = {(2007, 1): 2, (2024, 2): 1}
 _UUID_OCTETS: Final = {2007: 10, 2024: 16}
 
 
-def convert(decoded: Decoded, edition: Edition, *, uuid: bytes | None = None) -> tuple[bytes, list[Finding]]:
+def convert(decoded: DecodedTeds, edition: Edition, *, uuid: bytes | None = None) -> tuple[bytes, list[Finding]]:
     """Convert a decoded TEDS to an edition, framed or bare as it came; findings say what was changed or lost.
 
     A UUID of one edition cannot be said in the other: ``uuid`` gives the new one, else the field is left out (an error
@@ -264,7 +273,7 @@ def convert(decoded: Decoded, edition: Edition, *, uuid: bytes | None = None) ->
 
 @dataclass
 class _Conversion:
-    decoded: Decoded
+    decoded: DecodedTeds
     table: Table
     edition: Edition
     uuid: bytes | None

@@ -16,7 +16,7 @@ from teds_provision.teds.codec.model import (
     MALFORMED_CODES,
     AccessCode,
     Conformity,
-    Decoded,
+    DecodedTeds,
     Edition,
     Field,
     Finding,
@@ -165,7 +165,7 @@ _made: Final[Callable[[tuple[object, ...]], Field]] = partial(tuple.__new__, Fie
 """A Field from its six values in their order: what its own constructor does, without a call of Python's for each."""
 
 
-def decode(octets: bytes, *, strict: bool = False) -> Decoded:
+def decode(octets: bytes, *, strict: bool = False) -> DecodedTeds:
     """Decode a framed TEDS or a bare data block, 2007 or 2024 edition (told by the length of the TEDSID).
 
     Never raises, whatever the octets, unless ``strict``: then BadDataError with the first finding of severity error. A
@@ -174,7 +174,7 @@ def decode(octets: bytes, *, strict: bool = False) -> Decoded:
     octets = bytes(octets)
     shape = shape_of(octets)
     if shape == "message":
-        return Decoded(octets, False, None, None, "message", (), (), Conformity.MESSAGE)
+        return DecodedTeds(octets, False, None, None, "message", (), (), Conformity.MESSAGE)
     walk = _Walk(octets, framed=shape == "framed")
     decoded = walk.decode()
     if strict:
@@ -188,7 +188,7 @@ def decode(octets: bytes, *, strict: bool = False) -> Decoded:
 class _Walk(Head):
     """One decoding: what the head gave, then tuple for tuple."""
 
-    def decode(self) -> Decoded:
+    def decode(self) -> DecodedTeds:
         start, end = self.frame()
         fields: tuple[Field, ...] = ()
         if end > start:
@@ -198,7 +198,7 @@ class _Walk(Head):
             check(self.table, fields, self.find, self.octets, self.framed)
         name = name_of(self.access_code) if self.access_code is not None else ""
         findings = tuple(self.findings)
-        return Decoded(
+        return DecodedTeds(
             self.octets,
             self.framed,
             self.edition,

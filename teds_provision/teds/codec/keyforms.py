@@ -19,7 +19,7 @@ _HEX_DIGITS: Final = frozenset(b"0123456789abcdefABCDEF")
 
 
 @dataclass(frozen=True)
-class ReadKey:
+class ParsedKey:
     """A key or signature without its wrapping: the ``form`` it came in, its ``octets``, its P-256 ``point`` if any.
 
     ``point`` is the SEC 1 uncompressed point, 65 octets.
@@ -30,12 +30,12 @@ class ReadKey:
     point: bytes | None = None
 
 
-def read_key(value: bytes | str) -> ReadKey:
+def read_key(value: bytes | str) -> ParsedKey:
     """Unwrap the value of a field 100 to 104; never raises: what is nothing else is raw."""
     octets = value.encode() if isinstance(value, str) else bytes(value)
     stripped = octets.strip()
     form, inner = _unwrap(octets, stripped)
-    return ReadKey(form, inner, _point(inner))
+    return ParsedKey(form, inner, _point(inner))
 
 
 def _unwrap(octets: bytes, stripped: bytes) -> tuple[Form, bytes]:

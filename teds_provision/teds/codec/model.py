@@ -171,7 +171,7 @@ class Field(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Decoded:
+class DecodedTeds:
     """A decoded TEDS: never raised away, always with a verdict and the octets it came from."""
 
     octets: bytes

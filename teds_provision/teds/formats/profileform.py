@@ -14,7 +14,7 @@ from typing import Final
 from teds_provision.errors import BadDataError
 from teds_provision.teds.channel import channel_from
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import UNIT_PARTS, AccessCode, Decoded, Edition, Field, Units
+from teds_provision.teds.codec.model import UNIT_PARTS, AccessCode, DecodedTeds, Edition, Field, Units
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.tree import shortest
 from teds_provision.teds.image import TedsBlock
@@ -84,7 +84,7 @@ def _place(blocks: Sequence[TedsBlock]) -> tuple[Placed, list[str]]:
     return placed, lost
 
 
-def _lines(decoded: Mapping[tuple[int, int], Decoded]) -> Iterator[str]:
+def _lines(decoded: Mapping[tuple[int, int], DecodedTeds]) -> Iterator[str]:
     name = _name(decoded, 0)
     yield f"title = {_quoted(name or 'unnamed')}"
     if name:
@@ -107,13 +107,13 @@ def _lines(decoded: Mapping[tuple[int, int], Decoded]) -> Iterator[str]:
             yield f"xml = {_quoted(teds.text[0].decode(errors='replace'))}"
 
 
-def _name(decoded: Mapping[tuple[int, int], Decoded], channel: int) -> str:
+def _name(decoded: Mapping[tuple[int, int], DecodedTeds], channel: int) -> str:
     teds = decoded.get((channel, AccessCode.NAME))
     value = teds.get("TCName") if teds else None
     return value if isinstance(value, str) else ""
 
 
-def _meta(teds: Decoded | None) -> Iterator[str]:
+def _meta(teds: DecodedTeds | None) -> Iterator[str]:
     if teds is None:
         yield "operation-timeout = 1.0  # placeholder: there was no Meta-TEDS"
         yield "self-test-time = 0.0  # placeholder"
@@ -126,7 +126,7 @@ def _meta(teds: Decoded | None) -> Iterator[str]:
                 yield from _keys(keys, field.children)
 
 
-def _channel(teds: Decoded, name: str, number: int) -> Iterator[str]:
+def _channel(teds: DecodedTeds, name: str, number: int) -> Iterator[str]:
     if name:
         yield f"name = {_quoted(name)}"
     channel = channel_from(teds)
@@ -221,7 +221,7 @@ def _quoted(text: str) -> str:
     return f'"{inner}"'
 
 
-def _differences(body: str, placed: Placed, decoded: Mapping[tuple[int, int], Decoded]) -> list[str]:
+def _differences(body: str, placed: Placed, decoded: Mapping[tuple[int, int], DecodedTeds]) -> list[str]:
     """What the TEDS built from the text lack or have otherwise."""
     built, why = _built(body, decoded)
     lost = [f"it does not load: {why}"] if why else []
@@ -240,7 +240,7 @@ def _because(code: int) -> str:
     return " (made when a datasheet is signed)" if code == AccessCode.SECURITY else ""
 
 
-def _built(body: str, decoded: Mapping[tuple[int, int], Decoded]) -> tuple[Placed, str]:
+def _built(body: str, decoded: Mapping[tuple[int, int], DecodedTeds]) -> tuple[Placed, str]:
     problems = Problems()
     try:
         profile = interpret(parse(body, "profile"), "profile", "profile", ("profile",), problems)
@@ -256,7 +256,7 @@ def _built(body: str, decoded: Mapping[tuple[int, int], Decoded]) -> tuple[Place
     return built.blocks, ""
 
 
-def _fields_apart(built: Decoded, wanted: Decoded) -> str:
+def _fields_apart(built: DecodedTeds, wanted: DecodedTeds) -> str:
     raws = {(field.name, field.raw) for field in built.fields}
     names = [field.name or f"type {field.type}" for field in wanted.fields if (field.name, field.raw) not in raws]
     present = {field.name for field in wanted.fields}

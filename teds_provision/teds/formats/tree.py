@@ -17,7 +17,7 @@ from typing import Final, Literal
 from teds_provision.errors import BadDataError
 from teds_provision.teds.codec.composer import compose
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
+from teds_provision.teds.codec.model import UNIT_PARTS, DecodedTeds, Edition, Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import TEXT_BASED, FieldSpec, name_of, table
 from teds_provision.teds.image import TedsBlock
 
@@ -87,7 +87,7 @@ def from_tree(tree: Tree) -> TedsBlock:
     return TedsBlock(tree.channel, tree.access_code, octets if tree.framed else octets[4:-2])
 
 
-def _described(block: TedsBlock, decoded: Decoded) -> Tree:
+def _described(block: TedsBlock, decoded: DecodedTeds) -> Tree:
     tedsid = next((field.raw for field in decoded.fields if field.name == "TEDSID"), b"")
     long = len(tedsid) == 5
     known = len(tedsid) in (4, 5)
@@ -104,7 +104,7 @@ def _described(block: TedsBlock, decoded: Decoded) -> Tree:
     )
 
 
-def _entries(decoded: Decoded) -> Iterator[TreeEntry]:
+def _entries(decoded: DecodedTeds) -> Iterator[TreeEntry]:
     if decoded.access_code in TEXT_BASED and decoded.text:
         yield from _texts(decoded)
         return
@@ -114,7 +114,7 @@ def _entries(decoded: Decoded) -> Iterator[TreeEntry]:
             yield _entry(field, known)
 
 
-def _texts(decoded: Decoded) -> Iterator[TreeEntry]:
+def _texts(decoded: DecodedTeds) -> Iterator[TreeEntry]:
     """One entry per language; the directory follows from them."""
     languages = [field for field in decoded.fields if field.name == "DirBlock"]
     for number, text in enumerate(decoded.text):

@@ -27,7 +27,7 @@ from teds_provision.teds.profile.keys import (
     Need,
 )
 from teds_provision.teds.profile.model import ChannelProfile, Profile
-from teds_provision.teds.profile.reader import Problems, ProfileProblem, TomlTable, Where, parse, read_text
+from teds_provision.teds.profile.reader import Problems, ProfileProblem, SourcePlace, TomlTable, parse, read_text
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}\Z")
 MAXIMUM_DEPTH: Final = 16
@@ -191,7 +191,7 @@ def _laid_over(
     return TomlTable(inherited, below.where).merged(table), (path.stem, *lineage)
 
 
-def _base(name: str, where: Where, path: Path, folders: Sequence[Path], chain: Sequence[Path]) -> Path:
+def _base(name: str, where: SourcePlace, path: Path, folders: Sequence[Path], chain: Sequence[Path]) -> Path:
     places = list(dict.fromkeys((path.parent, *folders)))
     try:
         return _by_name(name, places, chain)

@@ -34,7 +34,7 @@ _AT: Final = re.compile(r"\(at line (\d+), column \d+\)")
 
 
 @dataclass(frozen=True)
-class Where:
+class SourcePlace:
     """File (as it is shown to people) and line, counted from 1."""
 
     file: str
@@ -45,19 +45,19 @@ class Where:
 
 
 @dataclass(frozen=True)
-class Item:
+class PlacedValue:
     """One value with its place; ``value`` is what TOML gives, or a tuple of Tables for an array of tables."""
 
     value: object
-    where: Where
+    where: SourcePlace
 
 
 @dataclass(frozen=True)
 class TomlTable:
     """A TOML table with the place of each entry."""
 
-    entries: Mapping[str, Item | TomlTable]
-    where: Where
+    entries: Mapping[str, PlacedValue | TomlTable]
+    where: SourcePlace
     path: str = ""
 
     def merged(self, over: TomlTable) -> TomlTable:
@@ -137,10 +137,10 @@ def parse(text: str, file: str) -> TomlTable:
     check_depth(data, LIMITS.toml_depth, file)
     lines = key_lines(text)
 
-    def place(path: KeyPath) -> Where:
+    def place(path: KeyPath) -> SourcePlace:
         while path and path not in lines:
             path = path[:-1]
-        return Where(file, lines.get(path, 1))
+        return SourcePlace(file, lines.get(path, 1))
 
     def build(value: dict[str, object], path: KeyPath) -> TomlTable:
         text = ""
@@ -148,12 +148,12 @@ def parse(text: str, file: str) -> TomlTable:
             text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
         return TomlTable({key: entry(item, (*path, key)) for key, item in value.items()}, place(path), text)
 
-    def entry(value: object, path: KeyPath) -> Item | TomlTable:
+    def entry(value: object, path: KeyPath) -> PlacedValue | TomlTable:
         if isinstance(value, dict):
             return build(value, path)
         if isinstance(value, list) and value and all(isinstance(part, dict) for part in value):
-            return Item(tuple(build(part, (*path, number)) for number, part in enumerate(value)), place(path))
-        return Item(value, place(path))
+            return PlacedValue(tuple(build(part, (*path, number)) for number, part in enumerate(value)), place(path))
+        return PlacedValue(value, place(path))
 
     return build(data, ())
 
@@ -163,7 +163,7 @@ def read_text(path: Path) -> str:
     return files.read_text(path, LIMITS.text_file, "profile or calibration", failure=StoreError)
 
 
-def walk(table: TomlTable) -> Iterator[tuple[str, Item]]:
+def walk(table: TomlTable) -> Iterator[tuple[str, PlacedValue]]:
     """Every value of a table with its dotted path."""
     for key, entry in table.entries.items():
         path = f"{table.path}.{key}" if table.path else key
@@ -184,7 +184,7 @@ NAME_OCTETS = 120
 class ProfileProblem:
     """One thing wrong with a profile; ``field`` is the dotted path of the key."""
 
-    where: Where
+    where: SourcePlace
     field: str
     message: str
     severity: str = "error"
@@ -212,11 +212,11 @@ class Problems:
 
     found: list[ProfileProblem] = field(default_factory=list)
 
-    def error(self, where: Where, path: str, message: str) -> None:
+    def error(self, where: SourcePlace, path: str, message: str) -> None:
         """Add an error."""
         self.found.append(ProfileProblem(where, path, message))
 
-    def warning(self, where: Where, path: str, message: str) -> None:
+    def warning(self, where: SourcePlace, path: str, message: str) -> None:
         """Add a warning."""
         self.found.append(ProfileProblem(where, path, message, "warning"))
 
@@ -248,7 +248,7 @@ class Section:
         """Dotted path of a key."""
         return f"{self.table.path}.{key}" if self.table.path else key
 
-    def where(self, key: str) -> Where:
+    def where(self, key: str) -> SourcePlace:
         """Place of a key, or of the table where the key is missing."""
         entry = self.table.entries.get(key)
         return self.table.where if entry is None else entry.where
@@ -304,7 +304,7 @@ class Section:
         """The table under a key."""
         self._known.add(key)
         entry = self.table.entries.get(key)
-        if isinstance(entry, Item):
+        if isinstance(entry, PlacedValue):
             self.error(key, f"a table [{self.path(key)}] is expected, not {_shown(entry.value)}.")
             return None
         return None if entry is None else Section(entry, self.problems, self.unit)
@@ -315,9 +315,9 @@ class Section:
         entry = self.table.entries.get(key)
         if entry is None:
             return []
-        if isinstance(entry, Item) and isinstance(entry.value, tuple):
+        if isinstance(entry, PlacedValue) and isinstance(entry.value, tuple):
             return [Section(table, self.problems, self.unit) for table in entry.value]
-        if isinstance(entry, Item) and entry.value == []:
+        if isinstance(entry, PlacedValue) and entry.value == []:
             return []
         self.error(key, f"tables [[{self.path(key)}]] are expected.")
         return []

@@ -29,7 +29,7 @@ from bumble.transport import open_transport
 from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Peripheral
 from teds_provision.node.hardware.board import Board
-from teds_provision.node.pulse import Pulse
+from teds_provision.node.realtime_loop import RealtimeLoop
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.teds.image import Image
@@ -86,7 +86,7 @@ class Everything:
         self.link = Air()
         self.nodes: list[Any] = []
         self.virtual: list[VirtualNode] = []
-        self.pulse = Pulse()
+        self.pulse = RealtimeLoop()
         self.bluez: Any = None
         self.keep: list[Any] = []
         self.strangers: list[Stranger] = []

@@ -13,8 +13,8 @@ import pytest
 from teds_provision.errors import LinkError, NoNodeError, NoReaderError, UsageError
 from teds_provision.links.ble.port import BlePort, cache_file
 from teds_provision.links.ble.spec import parse_spec
-from teds_provision.links.ports import LISTEN_SECONDS, Contact, Notice, Prompt
-from teds_provision.node import described
+from teds_provision.links.ports import LISTEN_SECONDS, Contact, DeadlineLink, Notice
+from teds_provision.node import node_template
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.protocol.messages import ble
 from teds_provision.protocol.messages.ble import piece_octets
@@ -75,7 +75,7 @@ def test_an_order_whose_connection_is_cut_is_given_up(air: Air, port: Ports) -> 
     """operation.md section 2, "No late orders": it is not sent again over another connection."""
     radio = air(manners={"mtu": 23})
     link = find(port()).link
-    assert isinstance(link, Prompt)
+    assert isinstance(link, DeadlineLink)
     assert link.exchange_within(IDENTIFY, 10.0)
     radio.do("cut", 0, 0)
     with pytest.raises(LinkError):
@@ -304,7 +304,7 @@ def test_who_has_a_session_stays(air: Air, port: Ports) -> None:
 
 
 def test_a_new_node_advertises_only_after_a_tap(air: Air, port: Ports, tmp_path: Path) -> None:
-    described.create(tmp_path / "new", profile=ANGLE)
+    node_template.create(tmp_path / "new", profile=ANGLE)
     radio = air([tmp_path / "new"])
     with pytest.raises(NoNodeError, match="The node did not answer"):
         find(port(), seconds=1.5)

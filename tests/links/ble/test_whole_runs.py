@@ -11,15 +11,15 @@ import pytest
 
 from teds_provision.links import LinkSettings, Notice
 from teds_provision.links.hints import BleAddress
-from teds_provision.node import described
+from teds_provision.node import node_template
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.station.station import Station as OpenStation
 from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.identify import Identified
-from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.identify import IdentifiedNode
+from teds_provision.steps.provision import ProvisionResult, provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import Silent, StepResult
+from teds_provision.talk.progress import SilentReporter, StepResult
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import Desk, Station, results
 from tests.pace import succeeds, until
@@ -32,20 +32,20 @@ pytestmark = [pytest.mark.link, needs_dbus]
 Air = Callable[..., Radio]
 
 
-def accept(_who: Identified) -> None:
+def accept(_who: IdentifiedNode) -> None:
     """Whoever it is."""
 
 
 def tapped_once(station: OpenStation, folder: Path) -> None:
     """Provision the node in ``folder`` at a tap, so that it has a key of ``station``."""
-    described.create(folder, profile=ANGLE)
+    node_template.create(folder, profile=ANGLE)
     node = VirtualNode(folder, exclusive=True)
     with Conversation(on_reader(node), notice=lambda _notice: None) as there:
-        provision(station, there, BuildOrder(profile=ANGLE), accept=accept, reporter=Silent())
+        provision(station, there, BuildOrder(profile=ANGLE), accept=accept, reporter=SilentReporter())
     node.flash_file.release()
 
 
-class CutsAt(Silent):
+class CutsAt(SilentReporter):
     """Cuts the connection in the middle of a step, when it has begun."""
 
     def __init__(self, radio: Radio, step: str, pieces: int) -> None:
@@ -65,7 +65,7 @@ class CutsAt(Silent):
             self.notices.append(notice)
 
 
-def over_the_air(station: OpenStation, reporter: Silent, order: BuildOrder) -> Provisioned:
+def over_the_air(station: OpenStation, reporter: SilentReporter, order: BuildOrder) -> ProvisionResult:
     with meet(station, LinkSettings(via="ble", timeout=20), None, reporter) as node:
         return provision(station, node, order, accept=accept, reporter=reporter)
 

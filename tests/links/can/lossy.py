@@ -19,7 +19,7 @@ import can
 import can.interfaces
 import can.util
 
-from teds_provision.links.can.bus import Echoes
+from teds_provision.links.can.bus import SentFrames
 from teds_provision.links.can.isotp import Frame
 
 KINDS = ("loss", "double", "swap", "delay", "corrupt")
@@ -93,7 +93,7 @@ class LossyBus(can.BusABC):
         self._under = can.Bus(interface=under, channel=channel, **options)
         self._out, self._in = Faults(f"{seed}o", shares, late), Faults(f"{seed}i", shares, late)
         self._ready: deque[can.Message] = deque()
-        self._echoes = Echoes()
+        self._echoes = SentFrames()
         self.channel_info = f"lossy {self._under.channel_info}"
         super().__init__(channel)
 

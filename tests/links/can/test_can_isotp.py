@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from teds_provision.links.can import pacing
 from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.bus_multiplexer import BroadcastReplies
 from teds_provision.links.can.isotp import (
     Pair,
     Reassembly,
@@ -24,7 +25,6 @@ from teds_provision.links.can.isotp import (
     single,
 )
 from teds_provision.links.can.pacing import Pacer, classic_bits, fd_seconds
-from teds_provision.links.can.shared import Gathering
 from teds_provision.links.can.spec import parse_spec
 from tests.pace import PATIENCE
 
@@ -275,7 +275,7 @@ def frames_of(node: int, body: bytes) -> list[Frame]:
 
 
 def test_answers_of_many_nodes_come_apart() -> None:
-    gathering = Gathering(STATION, 7)
+    gathering = BroadcastReplies(STATION, 7)
     sequences = [frames_of(node, b"\x07" + bytes([node]) * 26) for node in range(1, 21)]
     flows = [gathering.take(frame) for frames in zip(*sequences, strict=True) for frame in frames]
     assert gathering.answers == {node: bytes([node]) * 26 for node in range(1, 21)}
@@ -285,7 +285,7 @@ def test_answers_of_many_nodes_come_apart() -> None:
 
 
 def test_an_answer_to_an_earlier_identify_is_sent_away() -> None:
-    gathering = Gathering(STATION, 7)
+    gathering = BroadcastReplies(STATION, 7)
     first = frames_of(NODE, b"\x06" + bytes(26))[0]
     flow = gathering.take(first)
     assert flow is not None
@@ -299,7 +299,7 @@ def test_an_answer_to_an_earlier_identify_is_sent_away() -> None:
 @pytest.mark.parametrize("order", [(0, 0, 1, 1), (0, 2), (0, 1, 1)])
 def test_two_first_frames_or_a_broken_sequence_are_a_conflict(order: tuple[int, ...]) -> None:
     frames = frames_of(NODE, b"\x07" + bytes(26))
-    gathering = Gathering(STATION, 7)
+    gathering = BroadcastReplies(STATION, 7)
     for number in order:
         gathering.take(frames[number])
     assert gathering.conflicts == {NODE}
@@ -307,7 +307,7 @@ def test_two_first_frames_or_a_broken_sequence_are_a_conflict(order: tuple[int, 
 
 @given(st.lists(st.tuples(st.integers(0x18DAF101, 0x18DAF104), st.binary(max_size=64)), max_size=40))
 def test_any_frames_at_all_do_not_break_a_gathering(frames: list[tuple[int, bytes]]) -> None:
-    gathering = Gathering(STATION, 7)
+    gathering = BroadcastReplies(STATION, 7)
     for identifier, data in frames:
         flow = gathering.take(Frame(identifier, data))
         assert flow is None or len(flow.data) == 8

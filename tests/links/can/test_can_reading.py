@@ -11,7 +11,7 @@ import pytest
 
 from teds_provision.errors import LinkError
 from teds_provision.links.can.bus import Bus, Frame
-from teds_provision.links.can.shared import SharedBus
+from teds_provision.links.can.bus_multiplexer import BusMultiplexer
 from teds_provision.links.can.spec import parse_spec
 from tests.pace import PATIENCE, best_of
 
@@ -43,7 +43,7 @@ def frame(number: int) -> Frame:
 
 
 def test_the_one_thread_that_waits_reads_and_the_loop_goes_on_after_it(group: str, other: Bus) -> None:
-    bus, listener = SharedBus(Bus(parse_spec(group))), Listener()
+    bus, listener = BusMultiplexer(Bus(parse_spec(group))), Listener()
     bus.listen(listener.heard)
 
     def by_others() -> int:
@@ -63,7 +63,7 @@ def test_the_one_thread_that_waits_reads_and_the_loop_goes_on_after_it(group: st
 
 
 def test_several_threads_that_wait_all_get_theirs(group: str, other: Bus) -> None:
-    bus = SharedBus(Bus(parse_spec(group)))
+    bus = BusMultiplexer(Bus(parse_spec(group)))
     queues: list[SimpleQueue[Frame]] = [SimpleQueue() for _ in range(6)]
     got: list[int] = []
 
@@ -90,7 +90,7 @@ def test_several_threads_that_wait_all_get_theirs(group: str, other: Bus) -> Non
 
 
 def test_waiting_ends_with_its_time_and_with_the_bus(group: str) -> None:
-    bus = SharedBus(Bus(parse_spec(group)))
+    bus = BusMultiplexer(Bus(parse_spec(group)))
     queue: SimpleQueue[Frame] = SimpleQueue()
     began = time.monotonic()
     with pytest.raises(Empty):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.protocol.messages.frames import Command, Reply, decode_reply
-from teds_provision.protocol.operation.commands import Operate, OperationReply, Power, idle
+from teds_provision.protocol.operation.commands import OperateCommand, OperationReply, PowerReply, idle
 from teds_provision.protocol.operation.hardware import ChannelHardware, RawReading, SessionPort
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import StationSession
@@ -63,7 +63,7 @@ class FakeHardware:
     faults: set[int] = field(default_factory=set)
     tests: set[int] = field(default_factory=set)
     invalid: set[int] = field(default_factory=set)
-    charge: Power = field(default_factory=lambda: Power(1, 87, 3.7, -0.012, 23))
+    charge: PowerReply = field(default_factory=lambda: PowerReply(1, 87, 3.7, -0.012, 23))
     points: dict[int, bytes] = field(default_factory=dict)
     unkept: set[int] = field(default_factory=set)
 
@@ -103,7 +103,7 @@ class FakeHardware:
     def fault(self, channel: int) -> bool:
         return channel in self.faults
 
-    def power(self) -> Power:
+    def power(self) -> PowerReply:
         return self.charge
 
 
@@ -175,7 +175,7 @@ class Bench:
         for channel in channels:
             facts = self.hardware.channels.get(channel)
             acting = facts is not None and facts.actuator
-            asked = Operate(channel, DIGEST, lease, dead_man if acting else None)
+            asked = OperateCommand(channel, DIGEST, lease, dead_man if acting else None)
             assert self.reason(asked.command(), link) is None
         return self
 

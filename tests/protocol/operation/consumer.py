@@ -5,7 +5,7 @@ from __future__ import annotations
 from teds_provision.protocol.operation.can_frames import StreamAssembly, data_address
 from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
-    Clock,
+    ClockReply,
     decode_stopped,
     stop,
 )
@@ -59,5 +59,5 @@ def values(message: StreamMessage, width: int = 2) -> list[int]:
     return [int.from_bytes(message.data[at : at + width], "big") for at in range(0, len(message.data), width)]
 
 
-def clock(bench: Bench, link: str = "can:f1") -> Clock:
-    return Clock.decode(bench.send(CLOCK, link).payload)
+def clock(bench: Bench, link: str = "can:f1") -> ClockReply:
+    return ClockReply.decode(bench.send(CLOCK, link).payload)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from teds_provision.protocol.messages.frames import Command, Function
 from teds_provision.protocol.operation.datagram import DatagramSealer
-from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, Subscribe, stop
+from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, SubscribeCommand, stop
 
 from .bench import DIGEST, MS, SAFE_VALUE, Bench
 
@@ -59,7 +59,7 @@ class Recording(DatagramSealer):
 
 
 subscriptions = st.builds(
-    lambda stream, kind, n, period, start: Subscribe(
+    lambda stream, kind, n, period, start: SubscribeCommand(
         stream, kind, 1 if kind == StreamKind.EVENT else n, 0, period, start, (5,) if kind == StreamKind.EVENT else (1,)
     ),
     st.integers(0, 3),

@@ -14,14 +14,14 @@ from teds_provision.protocol.messages.frames import (
 )
 from teds_provision.protocol.operation.commands import (
     ChannelState,
-    Power,
     PowerFlag,
+    PowerReply,
     read_data_set,
     sample,
     set_values,
     write_data_set,
 )
-from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, Subscribe, drive
+from teds_provision.protocol.operation.stream_commands import CLOCK, StreamKind, SubscribeCommand, drive
 from teds_provision.protocol.session import StationSession
 
 from .bench import MS, SAFE_VALUE, SECOND, UUID, Bench, K
@@ -99,7 +99,7 @@ def test_whatever_ends_a_claim_brings_the_actuator_to_its_safe_state(end: str) -
             assert not safe(bench), "a half-open Open ends nothing"
             bench.send(IDENTIFY)
         case "power":
-            bench.hardware.charge = Power(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
+            bench.hardware.charge = PowerReply(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
             bench.tim.poll()
         case "last counter":
             session._counter = 0xFFFFFFFE
@@ -283,7 +283,7 @@ def test_point_arithmetic_for_strangers_waits_while_an_actuator_is_claimed(quick
 def test_strangers_read_once_a_second_while_a_stream_runs() -> None:
     bench = Bench().open().operate(1)
     assert [bench.plain(READ).ok for _ in range(3)] == [True] * 3
-    assert bench.send(Subscribe(0, StreamKind.PERIODIC, 1, 0, 100 * MS, 0, (1,)).command()).ok
+    assert bench.send(SubscribeCommand(0, StreamKind.PERIODIC, 1, 0, 100 * MS, 0, (1,)).command()).ok
     asked = [bench.plain(READ), bench.plain(LIST, "nfc"), bench.plain(READ, "can:f2")]
     assert [reply.reason for reply in asked] == [None, Reason.BUSY, Reason.BUSY], "together and over all links"
     bench.later(999 * MS)

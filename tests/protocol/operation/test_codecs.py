@@ -29,21 +29,21 @@ from teds_provision.protocol.operation.can_frames import (
 )
 from teds_provision.protocol.operation.commands import (
     ChannelState,
-    Operate,
+    OperateCommand,
     OperationReply,
-    Power,
-    Sampled,
+    PowerReply,
+    SampleReply,
     decode_data_set,
 )
 from teds_provision.protocol.operation.datagram import DatagramSealer, DriveValues, Layout, drive_length, pattern
 from teds_provision.protocol.operation.hardware import SessionPort, port_of
 from teds_provision.protocol.operation.stream_commands import (
-    Arm,
-    Clock,
-    Driven,
+    ArmCommand,
+    ClockReply,
+    DriveReply,
     StreamKind,
-    Subscribe,
-    Subscribed,
+    SubscribeCommand,
+    SubscribeReply,
     decode_stopped,
 )
 
@@ -143,26 +143,28 @@ def test_subscribe(
 ) -> None:
     if kind == StreamKind.EVENT:
         n, channels = 1, channels[:1]
-    asked = Subscribe(stream, kind, n, gap, period, start, channels, test)
-    assert Subscribe.decode(asked.encode()) == asked
+    asked = SubscribeCommand(stream, kind, n, gap, period, start, channels, test)
+    assert SubscribeCommand.decode(asked.encode()) == asked
 
 
 @given(
-    st.builds(Subscribed, u16, u16, u64), st.builds(Driven, u16, u16), st.builds(Clock, u64, u64, u64, u32, u16, u32)
+    st.builds(SubscribeReply, u16, u16, u64),
+    st.builds(DriveReply, u16, u16),
+    st.builds(ClockReply, u64, u64, u64, u32, u16, u32),
 )
-def test_replies(subscribed: Subscribed, driven: Driven, clock: Clock) -> None:
-    assert Subscribed.decode(subscribed.encode()) == subscribed
-    assert Driven.decode(driven.encode()) == driven
-    assert Clock.decode(clock.encode()) == clock
+def test_replies(subscribed: SubscribeReply, driven: DriveReply, clock: ClockReply) -> None:
+    assert SubscribeReply.decode(subscribed.encode()) == subscribed
+    assert DriveReply.decode(driven.encode()) == driven
+    assert ClockReply.decode(clock.encode()) == clock
 
 
 @given(st.binary(min_size=16, max_size=16), u8, u8, st.integers(1, 255), u16)
 def test_operate_and_arm(octets: bytes, life: int, action: int, channel: int, dead_man: int) -> None:
-    arm = Arm(octets, life, action)
-    assert Arm.decode(arm.command().payload) == arm
-    sensor, actuator = Operate(channel, octets, life), Operate(channel, octets, life, dead_man)
-    assert Operate.decode(channel, sensor.command().payload, actuator=False) == sensor
-    assert Operate.decode(channel, actuator.command().payload, actuator=True) == actuator
+    arm = ArmCommand(octets, life, action)
+    assert ArmCommand.decode(arm.command().payload) == arm
+    sensor, actuator = OperateCommand(channel, octets, life), OperateCommand(channel, octets, life, dead_man)
+    assert OperateCommand.decode(channel, sensor.command().payload, actuator=False) == sensor
+    assert OperateCommand.decode(channel, actuator.command().payload, actuator=True) == actuator
 
 
 @given(st.booleans(), st.dictionaries(st.integers(1, 255), st.tuples(u8.map(ChannelState), u8)))
@@ -179,14 +181,14 @@ def test_operation(measuring: bool, channels: dict[int, tuple[ChannelState, int]
     st.none() | st.integers(-128, 126),
 )
 def test_power(flags: int, level: int | None, mv: int | None, ma: int | None, celsius: int | None) -> None:
-    told = Power(flags, level, None if mv is None else mv / 1000, None if ma is None else ma / 1000, celsius)
-    assert Power.decode(told.encode()) == told
+    told = PowerReply(flags, level, None if mv is None else mv / 1000, None if ma is None else ma / 1000, celsius)
+    assert PowerReply.decode(told.encode()) == told
 
 
 @given(u64, u8, st.binary(max_size=100), u32)
 def test_samples_and_drive_values(tick: int, flags: int, data: bytes, until: int) -> None:
-    told = Sampled(tick, flags, data)
-    assert Sampled.decode(told.encode(), len(data)) == told
+    told = SampleReply(tick, flags, data)
+    assert SampleReply.decode(told.encode(), len(data)) == told
     values = DriveValues(until, data)
     assert DriveValues.decode(values.encode()) == values
     assert drive_length(len(data)) == 4 + len(values.encode()) + 8
@@ -195,19 +197,26 @@ def test_samples_and_drive_values(tick: int, flags: int, data: bytes, until: int
 @given(st.binary(max_size=60))
 def test_no_octets_of_a_node_do_harm(octets: bytes) -> None:
     """A reply is read or it is GarbledError; nothing else comes out."""
-    for decode in (Subscribed.decode, Driven.decode, Clock.decode, OperationReply.decode, Power.decode, decode_stopped):
+    for decode in (
+        SubscribeReply.decode,
+        DriveReply.decode,
+        ClockReply.decode,
+        OperationReply.decode,
+        PowerReply.decode,
+        decode_stopped,
+    ):
         with contextlib.suppress(GarbledError):
             decode(octets)
     for width in (0, 1, 8):
         with contextlib.suppress(GarbledError):
-            Sampled.decode(octets, width)
+            SampleReply.decode(octets, width)
         with contextlib.suppress(GarbledError):
             assert len(decode_data_set(octets, width)) == width
 
 
 @given(st.binary(max_size=60))
 def test_no_octets_of_a_station_do_harm(octets: bytes) -> None:
-    for decode in (Subscribe.decode, Arm.decode, lambda o: Operate.decode(1, o, actuator=True)):
+    for decode in (SubscribeCommand.decode, ArmCommand.decode, lambda o: OperateCommand.decode(1, o, actuator=True)):
         with contextlib.suppress(CommandRefusedError):
             decode(octets)
 

@@ -11,7 +11,7 @@ from teds_provision.protocol.operation.driving import Driver
 from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
     NONE,
-    Driven,
+    DriveReply,
     drive,
 )
 from teds_provision.protocol.operation.subscription import TickBounds
@@ -25,7 +25,7 @@ class Wheel:
 
     def __init__(self, bench: Bench, dead_man: int = 500) -> None:
         self.bench = bench
-        reply = Driven.decode(bench.send(drive([4, 6])).payload)
+        reply = DriveReply.decode(bench.send(drive([4, 6])).payload)
         self.layout = Layout((4, 6), (2, 2))
         self.driver = Driver(self.layout, reply, bench.sessions["can:f1"].message_key, dead_man=dead_man)
         self.assembly_segments: list[bytes] = []

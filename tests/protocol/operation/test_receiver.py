@@ -15,10 +15,10 @@ from teds_provision.protocol.operation.stream_commands import (
     SOON,
     WAITS,
     Action,
-    Clock,
-    Driven,
+    ClockReply,
+    DriveReply,
     StreamKind,
-    Subscribed,
+    SubscribeReply,
 )
 from teds_provision.protocol.operation.subscription import (
     MOST_HELD,
@@ -44,7 +44,7 @@ def plan(**changes: object) -> StreamPlan:
 
 def receiver(run: int = 1, *, start: int = START, previous: Receiver | None = None, **changes: object) -> Receiver:
     made = plan(**changes)
-    return Receiver(made, Subscribed(run, made.length, start), K_M, previous=previous)
+    return Receiver(made, SubscribeReply(run, made.length, start), K_M, previous=previous)
 
 
 def sealed(counter: int, run: int = 1, *, flags: int = 0, body: bytes = bytes(4)) -> bytes:
@@ -116,7 +116,7 @@ def test_a_message_from_the_future_or_held_back_is_dropped() -> None:
 
 def test_the_consumer_may_set_another_age() -> None:
     made = plan()
-    taker = Receiver(made, Subscribed(1, made.length, START), K_M, oldest=5 * MS)
+    taker = Receiver(made, SubscribeReply(1, made.length, START), K_M, oldest=5 * MS)
     assert taker.take(sealed(0), TickBounds(START + 16 * MS, START + 16 * MS)) is None
     counted(taker, stale=1)
 
@@ -181,7 +181,7 @@ def test_a_tick_that_jumps_is_no_time_of_a_sample(jump: int) -> None:
 )
 def test_a_start_that_was_not_asked_is_reported(asked: int, start: int, good: bool) -> None:
     made, now = plan(start=asked), TickBounds(START, START)
-    reply = Subscribed(1, made.length, start).encode()
+    reply = SubscribeReply(1, made.length, start).encode()
     if good:
         assert made.accept(reply, now).start == start
     else:
@@ -192,9 +192,9 @@ def test_a_start_that_was_not_asked_is_reported(asked: int, start: int, good: bo
 def test_a_length_that_was_not_computed_is_reported() -> None:
     made = plan()
     with pytest.raises(NotAuthenticError, match="18 octets a message; 17"):
-        made.accept(Subscribed(1, 18, START).encode(), LATER)
+        made.accept(SubscribeReply(1, 18, START).encode(), LATER)
     with pytest.raises(NotAuthenticError, match="run 0"):
-        made.accept(Subscribed(0, 17, START).encode(), TickBounds(START, START))
+        made.accept(SubscribeReply(0, 17, START).encode(), TickBounds(START, START))
     with pytest.raises(GarbledError):
         made.accept(bytes(11), LATER)
 
@@ -202,14 +202,14 @@ def test_a_length_that_was_not_computed_is_reported() -> None:
 def test_a_run_that_was_there_before_is_reported() -> None:
     """Its key is that of the run before, so messages of that one would count again."""
     made, now = plan(), TickBounds(START, START)
-    assert made.accept(Subscribed(4, made.length, START).encode(), now, after=3).run == 4
+    assert made.accept(SubscribeReply(4, made.length, START).encode(), now, after=3).run == 4
     for run in (3, 2):
         with pytest.raises(NotAuthenticError, match=f"run {run} after run 3"):
-            made.accept(Subscribed(run, made.length, START).encode(), now, after=3)
+            made.accept(SubscribeReply(run, made.length, START).encode(), now, after=3)
     layout = Layout((1,), (2,))
     with pytest.raises(NotAuthenticError, match="run 3 after run 3"):
-        Driver(layout, Driven(3, 18), K_M, dead_man=100, after=3)
-    assert Driver(layout, Driven(4, 18), K_M, dead_man=100, after=3).run == 4
+        Driver(layout, DriveReply(3, 18), K_M, dead_man=100, after=3)
+    assert Driver(layout, DriveReply(4, 18), K_M, dead_man=100, after=3).run == 4
 
 
 def test_how_many_instants_fit() -> None:
@@ -228,8 +228,8 @@ def test_how_many_instants_fit() -> None:
 # -- clock -------------------------------------------------------------------------------------------------------------
 
 
-def clock(received: int, sent: int) -> Clock:
-    return Clock(received, sent, 0, 1000, 50, NONE)
+def clock(received: int, sent: int) -> ClockReply:
+    return ClockReply(received, sent, 0, 1000, 50, NONE)
 
 
 def test_a_clock_that_lies_is_caught() -> None:
@@ -268,7 +268,7 @@ def test_tokens_are_new_each_time_and_marks_are_held_against_the_frame() -> None
 
 
 def test_a_drive_message_holds_no_longer_than_the_dead_man() -> None:
-    driver = Driver(Layout((4,), (2,)), Driven(3, 18), K_M, dead_man=50)
+    driver = Driver(Layout((4,), (2,)), DriveReply(3, 18), K_M, dead_man=50)
     opener = DatagramSealer(drive_key(K_M, 3))
     for hold, until in [(None, 50), (20 * MS, 20), (80 * MS, 50)]:
         plain = opener.open(driver.seal((b"ab",), TickBounds(START, START + 5 * MS), hold=hold))
@@ -281,7 +281,7 @@ def test_a_drive_message_holds_no_longer_than_the_dead_man() -> None:
     with pytest.raises(GarbledError, match="used up"):
         driver.seal((b"ab",), LATER)
     with pytest.raises(NotAuthenticError, match="19 octets; 18"):
-        Driver(Layout((4,), (2,)), Driven(3, 19), K_M, dead_man=50)
+        Driver(Layout((4,), (2,)), DriveReply(3, 19), K_M, dead_man=50)
 
 
 @pytest.mark.parametrize(

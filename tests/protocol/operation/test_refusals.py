@@ -6,9 +6,9 @@ import pytest
 
 from teds_provision.protocol.messages.frames import Command, Function, Reason, security_command
 from teds_provision.protocol.operation.commands import (
-    Operate,
-    Power,
+    OperateCommand,
     PowerFlag,
+    PowerReply,
     idle,
     read_data_set,
     run_self_test,
@@ -21,9 +21,9 @@ from teds_provision.protocol.operation.stream_commands import (
     CLOCK,
     WAITS,
     Action,
-    Arm,
+    ArmCommand,
     StreamKind,
-    Subscribe,
+    SubscribeCommand,
     drive,
     stop,
 )
@@ -43,7 +43,7 @@ def sent(bench: Bench, rows: list[tuple[str, Command, int | None]], link: str = 
 
 
 def operate(channel: int, *, digest: bytes = DIGEST, lease: int = 10, dead_man: int | None = None) -> Command:
-    return Operate(channel, digest, lease, dead_man).command()
+    return OperateCommand(channel, digest, lease, dead_man).command()
 
 
 def test_operate_in_the_order_of_section_1() -> None:
@@ -98,7 +98,7 @@ def test_operate_0_where_no_sensor_is_left_gets_6_and_with_no_power_23() -> None
     bench.hardware.faults = {1, 2, 3, 5}
     assert bench.reason(operate(0)) == Reason.DIGEST_MISMATCH
     bench.hardware.faults.clear()
-    bench.hardware.charge = Power(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
+    bench.hardware.charge = PowerReply(PowerFlag.BATTERY | PowerFlag.TOO_LOW)
     assert bench.reason(operate(0)) == Reason.FAULT
     only_actuators = Bench()
     only_actuators.hardware.channels = {4: channels()[4]}
@@ -219,7 +219,7 @@ def subscribe(**changes: object) -> Command:
     asked: dict[str, object] = {
         "stream": 0, "kind": StreamKind.PERIODIC, "n": 2, "gap": 0, "period": 10 * MS, "start": 0, "channels": (1,)
     }  # fmt: skip
-    return Subscribe(**{**asked, **changes}).command()  # type: ignore[arg-type]
+    return SubscribeCommand(**{**asked, **changes}).command()  # type: ignore[arg-type]
 
 
 def raw_subscribe(stream: int, kind: int, n: int, *numbers: int) -> Command:
@@ -293,7 +293,7 @@ def test_speriod_as_it_may_stand(period: float, shortest: int | None) -> None:
 
 def test_links_that_do_not_offer_all() -> None:
     bench = Bench().open("nfc").operate(1, 4, link="nfc")
-    arm = Arm(bytes(16), 10, Action.MARK).command()
+    arm = ArmCommand(bytes(16), 10, Action.MARK).command()
     sent(
         bench,
         [
@@ -301,7 +301,7 @@ def test_links_that_do_not_offer_all() -> None:
             ("Subscribe over NFC, not claimed", subscribe(channels=(2,)), U.DOES_NOT_FIT),
             ("Drive over NFC, not claimed", drive([6]), U.DOES_NOT_FIT),
             ("Arm over NFC", arm, U.DOES_NOT_FIT),
-            ("Arm over NFC, life 61", Arm(bytes(16), 61, 0).command(), U.OUT_OF_RANGE),
+            ("Arm over NFC, life 61", ArmCommand(bytes(16), 61, 0).command(), U.OUT_OF_RANGE),
             ("Sample over NFC", sample([1]), None),
             ("Clock over NFC", CLOCK, None),
         ],
@@ -343,11 +343,11 @@ def test_stop_drive_and_arm() -> None:
             ("drive of a sensor", drive([4, 1]), U.NOT_PERMITTED),
             ("drive", drive([4]), None),
             ("arm too short", R(0, 128, 17, bytes(17)), U.BAD_FORM),
-            ("arm, life 61", Arm(bytes(16), 61, 0).command(), U.OUT_OF_RANGE),
-            ("arm, action 3", Arm(bytes(16), 60, 3).command(), U.OUT_OF_RANGE),
-            ("disarm, action 3", Arm(bytes(16), 0, 3).command(), U.OUT_OF_RANGE),
-            ("arm", Arm(bytes(16), 60, 2).command(), None),
-            ("disarm", Arm(bytes(16), 0, 2).command(), None),
+            ("arm, life 61", ArmCommand(bytes(16), 61, 0).command(), U.OUT_OF_RANGE),
+            ("arm, action 3", ArmCommand(bytes(16), 60, 3).command(), U.OUT_OF_RANGE),
+            ("disarm, action 3", ArmCommand(bytes(16), 0, 3).command(), U.OUT_OF_RANGE),
+            ("arm", ArmCommand(bytes(16), 60, 2).command(), None),
+            ("disarm", ArmCommand(bytes(16), 0, 2).command(), None),
         ],
     )
 

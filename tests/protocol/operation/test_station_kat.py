@@ -23,11 +23,11 @@ from teds_provision.protocol.operation.commands import (
     OPERATION,
     POWER,
     ChannelState,
-    Operate,
+    OperateCommand,
     OperationReply,
-    Power,
     PowerFlag,
-    Sampled,
+    PowerReply,
+    SampleReply,
     decode_data_set,
     idle,
     read_data_set,
@@ -43,11 +43,11 @@ from teds_provision.protocol.operation.stream_commands import (
     NONE,
     WAITS,
     Action,
-    Clock,
-    Driven,
+    ClockReply,
+    DriveReply,
     StreamKind,
-    Subscribe,
-    Subscribed,
+    SubscribeCommand,
+    SubscribeReply,
     decode_stopped,
     drive,
     stop,
@@ -80,7 +80,7 @@ def plan_of(stream: dict) -> StreamPlan:
 @pytest.mark.parametrize("stream", STREAMS)
 def test_messages_are_opened_as_published(stream: dict) -> None:
     plan = plan_of(stream)
-    reply = Subscribed(stream["run"], stream["length"], stream["start"])
+    reply = SubscribeReply(stream["run"], stream["length"], stream["start"])
     assert plan.accept(reply.encode(), TickBounds(stream["start"], stream["start"])) == reply
     receiver = Receiver(plan, reply, MESSAGE_KEY, oldest=1 << 62)
     for entry in stream["messages"]:
@@ -138,7 +138,7 @@ def test_keys_of_runs_are_those_of_the_vectors() -> None:
 def test_drive_messages_are_sealed_as_published() -> None:
     told = KAT["drive"]
     layout = Layout(tuple(told["channels"]), tuple(WIDTHS[channel] for channel in told["channels"]))
-    driver = Driver(layout, Driven(told["run"], told["length"]), MESSAGE_KEY, dead_man=10_000)
+    driver = Driver(layout, DriveReply(told["run"], told["length"]), MESSAGE_KEY, dead_man=10_000)
     for entry in told["messages"]:
         driver.next = entry["counter"]
         values = tuple(value.to_bytes(2, "big") for value in entry["values"])
@@ -191,14 +191,14 @@ def test_every_command_is_built_as_published() -> None:
     built = {
         1: OPERATION,
         2: sample([1]),
-        3: Operate(0, bytes(16), 10).command(),
-        4: Operate(0, digest, 61).command(),
+        3: OperateCommand(0, bytes(16), 10).command(),
+        4: OperateCommand(0, digest, 61).command(),
         5: CLOCK,
-        6: Operate(0, digest, 60).command(),
+        6: OperateCommand(0, digest, 60).command(),
         7: read_data_set(1),
         8: sample([3, 1]),
         9: write_data_set(1, bytes(2)),
-        10: Operate(4, digest, 60, 10_000).command(),
+        10: OperateCommand(4, digest, 60, 10_000).command(),
         12: write_data_set(4, (1000).to_bytes(2, "big")),
         14: set_values([(4, (2000).to_bytes(2, "big")), (6, (3000).to_bytes(2, "big"))]),
         30: run_self_test(1),
@@ -213,8 +213,8 @@ def test_every_command_is_built_as_published() -> None:
     for stream in KAT["streams"]:
         entry = next(e for e in KAT["commands"] if e["name"] == f"Subscribe: {stream['name']}")
         assert plan_of(stream).command() == inner(entry["counter"])
-        assert Subscribe.decode(inner(entry["counter"]).payload) == plan_of(stream).subscribe
-        assert Subscribed.decode(payload(entry["counter"])) == Subscribed(
+        assert SubscribeCommand.decode(inner(entry["counter"]).payload) == plan_of(stream).subscribe
+        assert SubscribeReply.decode(payload(entry["counter"])) == SubscribeReply(
             stream["run"], stream["length"], stream["start"]
         )
         ended = next(e for e in KAT["commands"] if e["name"] == f"Stop {stream['stream']}: {stream['name']}")
@@ -229,21 +229,21 @@ def test_every_reply_is_read_as_published() -> None:
     claimed = OperationReply.decode(payload(41))
     assert claimed.measuring
     assert claimed.channels[4] == (ChannelState.ACTUATOR | ChannelState.CLAIMED_HERE, STATION)
-    assert Clock.decode(payload(5)) == Clock(67_900_000, 67_900_000, 0, 1000, 50, NONE)
-    assert Clock.decode(payload(34)).mark == KAT["trigger"]["mark"]
-    assert Clock.decode(payload(40)).last == KAT["drive"]["messages"][-1]["counter"]
+    assert ClockReply.decode(payload(5)) == ClockReply(67_900_000, 67_900_000, 0, 1000, 50, NONE)
+    assert ClockReply.decode(payload(34)).mark == KAT["trigger"]["mark"]
+    assert ClockReply.decode(payload(40)).last == KAT["drive"]["messages"][-1]["counter"]
     assert decode_data_set(payload(7), 2) == bytes.fromhex("0046")
-    assert Sampled.decode(payload(8), 6) == Sampled(72_100_000, 0, bytes.fromhex("000000d80048"))
-    assert Driven.decode(payload(37)) == Driven(9, 20)
-    assert Power.decode(payload(42)) == Power(PowerFlag.BATTERY, 87, 3.7, -0.012, 23)
+    assert SampleReply.decode(payload(8), 6) == SampleReply(72_100_000, 0, bytes.fromhex("000000d80048"))
+    assert DriveReply.decode(payload(37)) == DriveReply(9, 20)
+    assert PowerReply.decode(payload(42)) == PowerReply(PowerFlag.BATTERY, 87, 3.7, -0.012, 23)
     for counter in (1, 5, 8, 37, 42):
-        reply = {1: OperationReply, 5: Clock, 37: Driven, 42: Power}.get(counter)
+        reply = {1: OperationReply, 5: ClockReply, 37: DriveReply, 42: PowerReply}.get(counter)
         if reply is not None:
             assert reply.decode(payload(counter)).encode() == payload(counter)
 
 
 def test_a_clock_sample_bounds_the_offset() -> None:
-    clock = Clock(1_005_000, 1_006_000, 0, 1000, 50, NONE)
+    clock = ClockReply(1_005_000, 1_006_000, 0, 1000, 50, NONE)
     seen = ClockSample(10_000, 21_000, clock)
     assert seen.offset == ((1_005_000 - 10_000) + (1_006_000 - 21_000)) / 2
     assert seen.error(21_000) == (11_000 - 1_000) / 2 + 1000

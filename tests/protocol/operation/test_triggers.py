@@ -6,7 +6,7 @@ from teds_provision.protocol.operation.commands import ChannelState, write_data_
 from teds_provision.protocol.operation.stream_commands import (
     WAITS,
     Action,
-    Arm,
+    ArmCommand,
 )
 from teds_provision.protocol.operation.timing import TriggerToken
 
@@ -58,7 +58,7 @@ def test_one_trigger_per_action_and_life_0_disarms_that_action() -> None:
     first, second, start = armed(bench, Action.MARK), armed(bench, Action.MARK), armed(bench, Action.START)
     bench.tim.trigger("can:f1", first.octets, 1)
     assert clock(bench).mark == 0
-    assert bench.send(Arm(bytes(16), 0, Action.MARK).command()).ok
+    assert bench.send(ArmCommand(bytes(16), 0, Action.MARK).command()).ok
     bench.tim.trigger("can:f1", second.octets, 2)
     assert clock(bench).mark == 0
     bench.tim.trigger("can:f1", start.octets, 3)

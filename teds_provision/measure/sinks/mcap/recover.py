@@ -62,7 +62,7 @@ class Damage:
 
 
 @dataclass(frozen=True)
-class Recovered:
+class RecoveryResult:
     """What a recording holds: messages, the last one's time (unix seconds), whether it was whole before.
 
     ``cut`` octets at its end were of no use. ``damaged`` pieces inside are left out of ``output``, the new file; that
@@ -77,7 +77,7 @@ class Recovered:
     output: Path | None = None
 
 
-def recover(path: Path, output: Path | None = None) -> Recovered:
+def recover(path: Path, output: Path | None = None) -> RecoveryResult:
     """Make an MCAP whole: a torn end in place, or all but what is damaged inside as ``output`` (``FILE.recovered``).
 
     With ``output`` the file itself is never changed. Killed at any instant it can be run again. Raises NotFoundError,
@@ -127,7 +127,7 @@ def _no_mcap(path: Path) -> BadDataError:
     return BadDataError(f"{path} is not an MCAP file.", hint="Text and JSON-line recordings need no recovery.")
 
 
-def _finished(scan: _Scan, file: int, path: Path, output: Path | None) -> Recovered:
+def _finished(scan: _Scan, file: int, path: Path, output: Path | None) -> RecoveryResult:
     whole = scan.ended and not scan.damaged
     if whole or not (scan.damaged or output):
         summary = scan.assembled(None)
@@ -140,7 +140,7 @@ def _finished(scan: _Scan, file: int, path: Path, output: Path | None) -> Recove
     messages = sum(summary.counts.values())
     until = summary.last / 1e9 if messages else None
     cut = 0 if whole else len(scan.octets) - scan.end
-    return Recovered(messages, until, whole, cut, tuple(scan.damaged), None if whole else output)
+    return RecoveryResult(messages, until, whole, cut, tuple(scan.damaged), None if whole else output)
 
 
 def _end_in_place(scan: _Scan, summary: McapSummary, file: int, path: Path) -> None:

@@ -1,0 +1,171 @@
+"""Identify over CAN: one functional request, the answers of all, and what they mean."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+from teds_provision.errors import AddressConflictError, BadDataError, GarbledError, NodeSilentError, TedsProvisionError
+from teds_provision.links.can.bus_multiplexer import BroadcastReplies, BusMultiplexer, PendingBroadcast
+from teds_provision.links.can.isotp import FUNCTIONAL, Frame, single
+from teds_provision.links.can.link import conflict
+from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
+from teds_provision.protocol.messages.identity import Identity
+
+SILENCE_SECONDS: Final = 0.3
+LONGEST_SECONDS: Final = 3.0
+"""A station listens until 300 ms of silence, 3 s at most (profile.md, "CAN")."""
+
+AskOne = Callable[[int], Identity | None]
+"""Ask one address who is there: None where nobody answers in a way that can be read; raises AddressConflictError."""
+
+
+@dataclass
+class FunctionalAnswers:
+    """What one functional Identify came to: who answers where, and what remained unclear."""
+
+    identities: dict[int, Identity] = field(default_factory=dict)
+    conflicts: set[int] = field(default_factory=set)
+    unfinished: set[int] = field(default_factory=set)
+
+    def together(self, other: FunctionalAnswers) -> FunctionalAnswers:
+        """What two questions came to; what one of them made clear is clear."""
+        identities = self.identities | other.identities
+        unfinished = (self.unfinished | other.unfinished) - identities.keys()
+        return FunctionalAnswers(identities, self.conflicts | other.conflicts, unfinished)
+
+    def cleared_by(self, later: FunctionalAnswers) -> FunctionalAnswers:
+        """What a later question made of it: where two seemed to answer, they do if they did again."""
+        identities = {node: who for node, who in self.identities.items() if node not in later.conflicts}
+        identities |= later.identities
+        unclear = self.unfinished | self.conflicts | later.unfinished
+        return FunctionalAnswers(identities, later.conflicts, unclear - identities.keys() - later.conflicts)
+
+    @property
+    def twice(self) -> dict[bytes, list[int]]:
+        """UUIDs that answer under more than one address, with these: one of them is not who it says."""
+        places: dict[bytes, list[int]] = {}
+        for address, identity in sorted(self.identities.items()):
+            places.setdefault(identity.uuid, []).append(address)
+        return {uuid: addresses for uuid, addresses in places.items() if len(addresses) > 1}
+
+
+def ask_all(
+    bus: BusMultiplexer, transaction: int, *, silence: float, longest: float
+) -> Iterator[tuple[int, Identity] | FunctionalAnswers]:
+    """Send a functional Identify; yields each node as it answers, and at last all that was found.
+
+    Ends after ``silence`` seconds without a frame of an answer, ``longest`` at most. What came torn stands under
+    ``conflicts`` or ``unfinished``: it may be two nodes, or a lost frame. Raises LinkError.
+    """
+    fd = bus.spec.fd
+    with bus.gather(transaction) as asked:
+        body = bytes([transaction]) + IDENTIFY.encode()
+        bus.send(Frame(FUNCTIONAL | bus.own, single(body, fd=fd), fd))
+        told: set[int] = set()
+        for node in _news(bus, asked, silence, longest):
+            identity = _read(asked.gathering, node)
+            if identity is not None and node not in told:
+                told.add(node)
+                yield node, identity
+        gathering = asked.gathering
+    yield FunctionalAnswers(
+        _identities(gathering), set(gathering.conflicts), gathering.unfinished | _unreadable(gathering)
+    )
+
+
+def _news(bus: BusMultiplexer, asked: PendingBroadcast, silence: float, longest: float) -> Iterator[int]:
+    began = time.monotonic()
+    while True:
+        now = time.monotonic()
+        left = min(asked.heard_at + silence, began + longest) - now
+        node = asked.next(left)
+        bus.check()
+        if node is not None and node >= 0:
+            yield node
+        elif left <= 0 and time.monotonic() >= min(asked.heard_at + silence, began + longest):
+            return
+
+
+def settle(found: FunctionalAnswers, ask: AskOne, *, until: float) -> FunctionalAnswers:
+    """Ask each address that remained unclear by itself: a lost frame does not come twice, two nodes do.
+
+    ``until`` is a monotonic time. Keeps as ``conflicts`` where two really answer, as ``unfinished`` where nobody does.
+    """
+    identities, conflicts, unfinished = dict(found.identities), set[int](), set[int]()
+    for address in sorted(found.conflicts | found.unfinished):
+        if time.monotonic() >= until:
+            (conflicts if address in found.conflicts else unfinished).add(address)
+            continue
+        try:
+            identity = ask(address)
+        except AddressConflictError:
+            identities.pop(address, None)
+            conflicts.add(address)
+            continue
+        if identity is not None:
+            identities[address] = identity
+        else:
+            (conflicts if address in found.conflicts else unfinished).add(address)
+    return FunctionalAnswers(identities, conflicts, unfinished)
+
+
+def read_identity(reply: bytes) -> Identity:
+    """Read a reply frame to Identify; raises GarbledError or BadDataError."""
+    answer = decode_reply(reply)
+    if not answer.ok:
+        raise GarbledError(
+            "The node refuses Identify, which no node is allowed to do.", hint="It does not follow the profile."
+        )
+    return Identity.decode(answer.payload)
+
+
+def ask_one(ask: Callable[[bytes], bytes]) -> Identity | None:
+    """Who is there, by ``ask`` (a command frame to its reply); None for nobody, or nobody that can be understood."""
+    torn = 0
+    while torn < 2:
+        try:
+            return read_identity(ask(IDENTIFY.encode()))
+        except (NodeSilentError, BadDataError):
+            return None
+        except GarbledError:
+            torn += 1
+    return None
+
+
+def conflict_text(node: int) -> str:
+    """One sentence that names the address."""
+    return conflict(node).message
+
+
+def twice_text(uuid: bytes, addresses: list[int]) -> str:
+    """One sentence that names the UUID and where it answers."""
+    where = " and ".join(f"0x{address:02X}" for address in addresses)
+    return f"Node {uuid.hex()} answers at {where}: one of them is an impostor."
+
+
+def unfinished_text(nodes: set[int]) -> str:
+    """One sentence that names the addresses whose answers came in part."""
+    where = ", ".join(f"0x{node:02X}" for node in sorted(nodes))
+    return f"The answer of {where} was incomplete; try again."
+
+
+def _read(gathering: BroadcastReplies, node: int) -> Identity | None:
+    if node in gathering.conflicts or node not in gathering.answers:
+        return None
+    try:
+        return read_identity(gathering.answers[node])
+    except TedsProvisionError:
+        return None
+
+
+def _identities(gathering: BroadcastReplies) -> dict[int, Identity]:
+    """Who answered in a way that can be read, addresses with two nodes left out."""
+    read = {node: _read(gathering, node) for node in sorted(gathering.answers)}
+    return {node: identity for node, identity in read.items() if identity is not None}
+
+
+def _unreadable(gathering: BroadcastReplies) -> set[int]:
+    return {node for node in gathering.answers if node not in gathering.conflicts and _read(gathering, node) is None}

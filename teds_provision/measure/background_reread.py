@@ -1,0 +1,96 @@
+"""The rest of a datasheet, read behind the measurement: what was kept stands in for it until then, and no longer.
+
+Every session reads the Security TEDS. Where the node has started since its other TEDS were read, it is measured at once
+by the signed copy, and they are read again in what data leave free: one node at a time on a bus, the frames of a reply
+apart from each other, and after each exchange a pause that is longer than it took.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from datetime import UTC, datetime
+from typing import Final
+
+from teds_provision.errors import BadDataError, BadDatasheetError, GarbledError, NodeRefusedError, NodeSilentError
+from teds_provision.measure.buses import MeasuredBus
+from teds_provision.measure.verified_session import VerifiedSession
+from teds_provision.station.station import Station
+from teds_provision.steps import readings
+from teds_provision.steps.teds_read import read_in_between
+from teds_provision.steps.verify import known_of
+from teds_provision.store.records import iso
+from teds_provision.teds.image import Image
+
+GAP: Final = 1  # ms between the frames of a reply: of a bus of 500 kbit/s three quarters stay free meanwhile
+SPARING: Final = 4.0  # times as long as an exchange took nothing more is read
+FIRST: Final = 1.0  # seconds from the first value on in which nothing is read: others on the bus are still beginning
+AGAIN: Final = 10.0  # seconds until it is begun anew where the node did not answer, or was busy
+TRIES: Final = 5
+
+
+class BackgroundReread:
+    """Reads the rest of one node's datasheet, a step at a time; :meth:`close` when the session ends before it does."""
+
+    def __init__(self, station: Station, trusted: VerifiedSession, bus: MeasuredBus, *, by: str) -> None:
+        self._station, self._trusted, self._bus, self._by = station, trusted, bus, by
+        self._steps = read_in_between(trusted.node, gap=GAP)
+        self._c = trusted.node.c
+        self._mine = False
+        self._began = time.time()
+        self._due = time.monotonic() + FIRST
+        self._left = TRIES
+
+    def step(self) -> bool:
+        """One exchange, if the bus is free for it now; False where nothing is left to do.
+
+        Raises BadDatasheetError where what was read is not what the values rest on; SessionLostError.
+        """
+        began = time.monotonic()
+        if began < self._due:
+            return True
+        if not self._mine:
+            self._mine = self._bus.reading.acquire(blocking=False)
+            if not self._mine:
+                return True
+        try:
+            next(self._steps)
+        except StopIteration as done:
+            self.close()
+            self._conclude(done.value)
+            return False
+        except (
+            NodeSilentError,
+            GarbledError,
+            NodeRefusedError,
+            BadDataError,
+        ):  # its data still come, or the keeper finds that they do not
+            self.close()
+            self._steps, self._due = read_in_between(self._trusted.node, gap=GAP), began + AGAIN
+            self._left -= 1
+            return self._left > 0
+        self._due = time.monotonic() + SPARING * (time.monotonic() - began)
+        return True
+
+    def close(self) -> None:
+        """Let another node of the bus have its turn."""
+        if self._mine:
+            self._mine = False
+            self._bus.reading.release()
+
+    def _conclude(self, image: Image) -> None:
+        trusted, uuid = self._trusted, self._trusted.sheet.uuid
+        known = known_of(self._station, uuid, trusted.node.proven)
+        verified = readings.keep(self._station, trusted.node, image, by=self._by, known=known, c=self._c).verified
+        same = hashlib.sha256(image.security or b"").hexdigest() == trusted.fingerprint
+        if same and verified.verdict in (
+            "authentic",
+            "unsigned" if trusted.unsigned or trusted.unverified else "authentic",
+        ):
+            return
+        failed = next((check.why for check in verified.checks if check.result == "failed"), "another Security TEDS")
+        raise BadDatasheetError(
+            f"The datasheet on the node is not the one used for the measurement: {failed}. "
+            f"Values recorded of it since {iso(datetime.fromtimestamp(self._began, UTC))} do not count.",
+            hint=f"See: teds-provision verify {uuid.hex()}",
+        )

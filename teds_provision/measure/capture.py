@@ -1,0 +1,103 @@
+"""``calibrate capture``: one point of a calibration from the running sensor, beside the reference that it stands at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from teds_provision.errors import NotFoundError, PolicyError
+from teds_provision.files import SHARED, read_text, write_whole
+from teds_provision.lazy import late
+from teds_provision.limits import LIMITS
+from teds_provision.links import LinkSettings
+from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, settle
+from teds_provision.measure.sources import beside
+from teds_provision.measure.verified_session import open_trusted
+from teds_provision.station.station import Station
+from teds_provision.steps.commands import at_node
+from teds_provision.talk.conversation import SessionLostError
+from teds_provision.talk.progress import Reporter, Steps
+from teds_provision.teds.calibration.points import Point, points_of, with_point
+from teds_provision.teds.calibration.zero import reading_of
+from teds_provision.teds.channel import Channel
+
+if TYPE_CHECKING:
+    import numpy as np
+else:
+    np = late("numpy")
+
+_NAME: Final = "calibrate capture"
+
+
+@dataclass(frozen=True)
+class CaptureResult:
+    """The new point, and all that the file holds now (values in its unit)."""
+
+    uuid: bytes
+    channel: Channel
+    point: Point
+    points: tuple[Mapping[str, float | int | None], ...]
+
+
+def capture_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    number: int,
+    reference: float,
+    file: Path,
+    reporter: Reporter,
+    *,
+    unit: str | None = None,
+    shown_unit_asked: bool = False,
+) -> CaptureResult:
+    """Put a point into a file: channel ``number`` of the node that ``node`` names reads so, and is at ``reference``.
+
+    A claim of somebody else's on the sensor is no hindrance: several may measure it. Raises PolicyError (too
+    restless, at the wrap of its raw values, a file of another node), BadDataError (unit, channel, file), NotFoundError
+    (folder).
+    """
+    uuid = station.nodes.resolve(node)
+    if not file.parent.is_dir():
+        raise NotFoundError(f"There is no folder {file.parent}.")
+    steps = Steps(reporter)
+    with (
+        beside(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
+        at_node(station, own, uuid, reporter) as visit,  # its turn is the file's too
+    ):
+        try:
+            trusted = open_trusted(station, visit.node, by=_NAME)
+            channel = trusted.channel(number)
+            si = reference_for(channel, reference, unit, shown_unit_asked=shown_unit_asked)
+            with steps.step("read") as step:
+                point = _point(settle(trusted, number), si)
+                step.detail = f"raw {point.raw:.8g}, {point.count} samples"
+        except SessionLostError as lost:
+            raise lost.cause from lost
+        text = read_text(file, LIMITS.text_file, "calibration") if file.exists() else ""
+        today = datetime.now().astimezone().date()
+        text = with_point(text, str(file), point, node=uuid.hex(), unit=channel.unit, today=today)
+        write_whole(file, (text.encode(),), mode=SHARED)
+    return CaptureResult(uuid, channel, point, tuple(points_of(text, str(file))))
+
+
+def _point(settled: SampleSeries, reference: float) -> Point:
+    """Mean and spread of the raw values; raises PolicyError where they say nothing of one place."""
+    channel = settled.interpreter.channel
+    raw, _ = settled.interpreter.reader.numbers(settled.raw)
+    if not np.isfinite(raw).all():
+        raise PolicyError(f"Channel {channel.number} delivers raw values that are not numbers.")
+    reading = reading_of(raw)
+    ends = channel.calibration.raw_range if channel.calibration is not None else None
+    ends = ends or settled.interpreter.reader.form.raw_range
+    if channel.full_turn and ends is not None and float(np.ptp(raw)) > (ends[1] - ends[0]) / 2:
+        raise PolicyError(
+            f"Channel {channel.number} is at the wrap of its raw values: some are at either end of the turn.",
+            hint="Turn it a little further and take the point there.",
+        )
+    if channel.calibration is not None and not settled.interpreter.problem:
+        require_still(settled)
+    return Point(channel.number, reading.mean, reference, reading.spread, reading.count)

@@ -1,0 +1,60 @@
+"""Which nodes answer now on the links of a station: one short question a bus, beside whatever runs there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from teds_provision.errors import NoNodeError, TedsProvisionError
+from teds_provision.links import LinkSettings, Notice, nfc, open_place
+from teds_provision.measure.sources import beside
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.station.station import Station
+
+_LISTEN_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class LinkSurvey:
+    """What one link says now. ``nodes`` are plain Identifies: hints, which nobody has proven.
+
+    ``state``: ``up``; ``listed`` for what carries no question without a tap or a connection; ``down`` with ``why`` and
+    its ``cure``. ``troubles``: what was heard that is not right, as two nodes at one address.
+    """
+
+    place: str
+    state: Literal["up", "listed", "down"]
+    why: str = ""
+    cure: str = ""
+    nodes: tuple[tuple[int, Identity], ...] = ()
+    troubles: tuple[str, ...] = field(default=())
+
+
+def readers() -> Iterator[LinkSurvey]:
+    """The NFC readers that are plugged in; none of them is opened."""
+    return (LinkSurvey(f"nfc:{path}", "listed") for path in nfc.reader.plugged_in())
+
+
+def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
+    """Ask everyone on each of these places, one after the other; at most a second each."""
+    for place in places:
+        if not place.startswith("can:"):
+            yield LinkSurvey(place, "listed")
+            continue
+        told: list[Notice] = []
+        try:
+            with beside(station, LinkSettings().at(place), "looking") as links:
+                port = open_place(links.places[0])
+                try:
+                    contacts = port.everyone(seconds=_LISTEN_SECONDS, notice=told.append)
+                finally:
+                    port.close()
+        except NoNodeError:
+            contacts = []
+        except TedsProvisionError as error:
+            yield LinkSurvey(place, "down", error.message, error.hint)
+            continue
+        nodes = tuple((contact.address or 0, contact.identity) for contact in contacts)
+        troubles = tuple(one.text for one in told if one.kind in ("conflict", "unfinished"))
+        yield LinkSurvey(place, "up", nodes=nodes, troubles=troubles)

@@ -1,0 +1,519 @@
+"""One node of a measurement: found, trusted, claimed, streaming; found again when it was lost; let go at the end.
+
+A thread of its own for each node, so the steps stay plain sequential code (operation.md section 7): Open, verify,
+Clock, Operate, Subscribe, then Clock every lease / 3. After an error again after 1 s, doubling to 30 s; after an
+Announce at once.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+
+from teds_provision.errors import (
+    BadDataError,
+    BadDatasheetError,
+    InternalError,
+    KeyStolenError,
+    LinkError,
+    NodeRefusedError,
+    NoRoomError,
+    NotAuthenticError,
+    PolicyError,
+    TedsProvisionError,
+)
+from teds_provision.links.ports import CancellableLink
+from teds_provision.measure.background_reread import BackgroundReread
+from teds_provision.measure.blocks import NodeReport, SetPointCommand, State
+from teds_provision.measure.buses import Buses, MeasuredBus
+from teds_provision.measure.clock import AT_FIRST, HostClock
+from teds_provision.measure.planning import BusTime, NodePlans, plan_node, sensors_of
+from teds_provision.measure.presence import Sighting
+from teds_provision.measure.request import Events, MeasurementRequest
+from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.running.retry_policy import RetryPolicy
+from teds_provision.measure.running.streams import NodeStreams, added
+from teds_provision.measure.standing import NodeStanding
+from teds_provision.measure.topic_actuators import TopicActuators
+from teds_provision.measure.verified_session import (
+    LEASE_EACH,
+    LONGEST_LEASE,
+    VerifiedSession,
+    claim,
+    open_trusted,
+    open_unverified,
+)
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.operation.commands import idle
+from teds_provision.protocol.operation.stream_commands import SOON
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation, SessionLostError
+from teds_provision.teds.sheet import Channel
+
+_log = logging.getLogger(__name__)
+FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
+LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
+WORKED_ON, TELL, LONGEST_WORK = 0.05, 0.5, 60.0
+"""Seconds between looks whether a command works on the node, until that is told, and until it is taken to hang."""
+LOOK = 0.2  # seconds between looks at how it does
+LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
+ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
+AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
+SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
+BUSY = 2.0  # seconds in which a busy node is asked again at once; then it is tried again as after any other error
+
+
+class NodeSupervisor:
+    """Keeps one node measuring until :meth:`stop`; ``error`` is what it ended with, None where all is well."""
+
+    def __init__(
+        self,
+        station: Station,
+        buses: Buses,
+        uuid: bytes,
+        request: MeasurementRequest,
+        host: HostClock,
+        events: Events,
+        common_start: CommonStart,
+    ) -> None:
+        self.uuid = uuid
+        self.error: TedsProvisionError | None = None
+        self.state: State = "waiting"
+        self.ever_ran = False
+        self.trusted: VerifiedSession | None = None
+        self.streams = NodeStreams(host, events.block)
+        self.turn = threading.Lock()  # of the session: one exchange at a time
+        self.ready = threading.Event()  # streams were asked for
+        self.done = threading.Event()
+        self._station, self._buses = station, buses
+        self.bus: MeasuredBus | None = None  # where it is, once it was found
+        self._request, self._events, self._common_start = request, events, common_start
+        self._stop = threading.Event()
+        self._anew = threading.Event()
+        self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
+        self._elsewhere = 0.0  # when it answered at another place
+        self._lost_at = 0.0
+        self._proven = True  # whether what failed last did so in a session
+        self._patience = RetryPolicy(None)
+        self._standing: NodeStanding | None = None  # of the present try
+        self.sighting: Sighting | None = None  # where it was last
+        self._halved = 0
+        self._lease, self._claimed = request.lease, [0]
+        self._driven: TopicActuators | None = None
+        self._told = ""
+        self._comes_back = False  # it is let go for a while, and its room is kept for it
+        self._why = ""  # why it was asked to end, for its last report
+        self._thread = self._new_thread()
+
+    def _new_thread(self) -> threading.Thread:
+        return threading.Thread(target=self._run, name=f"node {self.uuid.hex()[:8]}", daemon=True)
+
+    def start(self) -> None:
+        """Begin; one that has ended begins again, and its counts go on."""
+        if self.begun:
+            self._thread.join()
+            self._stop.clear()
+            self.done.clear()
+            self._why, self.error, self._comes_back = "", None, False
+            self._thread = self._new_thread()
+        self._thread.start()
+
+    def give_room_up(self) -> None:
+        """It does not come back."""
+        if self._comes_back:
+            self._comes_back = False
+            for bus in self._buses.all():
+                bus.share.leave(self.uuid)
+
+    @property
+    def begun(self) -> bool:
+        """Whether it was ever started."""
+        return self._thread.ident is not None
+
+    def stop(self, why: str = "", *, comes_back: bool = False) -> None:
+        """Ask it to end in order: Stop, Idle, Close; its last report says ``why``.
+
+        ``comes_back``: its room on the bus stays its own until it is started again, or :meth:`give_room_up`.
+        """
+        self._why, self._comes_back = why, comes_back
+        self._stop.set()
+        self._anew.set()
+
+    def command(self, command: SetPointCommand) -> None:
+        """A set point for one of its actuators; dropped while it is not there."""
+        driven = self._driven
+        if driven is not None:
+            driven.take(command)
+
+    def join(self, seconds: float) -> None:
+        """Wait for its end."""
+        if self.begun:
+            self._thread.join(seconds)
+
+    # -- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE
+        patience = self._patience = RetryPolicy(None if self._request.patient else self._request.timeout)
+        try:
+            while not self._stop.is_set():
+                self._anew.clear()
+                began = time.monotonic()
+                error = self._failure()
+                if error is None or self._stop.is_set():
+                    break
+                self.error = error
+                if self._request.newcomers:
+                    final = isinstance(error, (NotAuthenticError, PolicyError, BadDataError))
+                    if isinstance(error, NoRoomError):
+                        self._say("waiting", why="no room on the bus")
+                    else:
+                        self._say("refused" if final else "lost", error)
+                    return
+                decided = self._standing is not None and error is self._standing.ended
+                if patience.gives_up(error, proven=self._proven, decided=decided, elsewhere=self._is_elsewhere):
+                    self._say("refused", error)
+                    return
+                if time.monotonic() - began > LAST_PAUSE:
+                    pause = FIRST_PAUSE
+                lost: State = "refused" if isinstance(error, BadDatasheetError) else "lost"
+                self._say(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
+                self._wait(min(pause, patience.left), began)
+                pause = min(2 * pause, LAST_PAUSE)
+            self._say("ended", why=self._why)
+        finally:
+            self._common_start.gone(self.uuid)
+            if self._request.require is not None:
+                self._request.require.gone(self.uuid)
+            if not self._comes_back:
+                for bus in self._buses.all():
+                    bus.share.leave(self.uuid)
+            self.done.set()
+            self.ready.set()
+
+    def _is_elsewhere(self) -> bool:
+        return self._buses.sightings.elsewhere(self.uuid)
+
+    def _wait(self, pause: float, began: float) -> None:
+        """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
+        if self.sighting is not None:
+            self._buses.sightings.on_announce(self.sighting, self._anew.set)
+        self._anew.wait(pause)
+        self._buses.sightings.let_announce(self.uuid)  # from here on it is looked for
+        self._stop.wait(max(0.0, began + AT_ONCE - time.monotonic()))
+
+    def _failure(self) -> TedsProvisionError | None:
+        """Measure until the end or an error: what ended it, None for the end in order."""
+        try:
+            self._once()
+        except SessionLostError as lost:
+            return lost.cause
+        except TedsProvisionError as error:
+            return error
+        except Exception as bug:  # noqa: BLE001 - a thread that ends without a word looks like an end in order
+            _log.debug("Measuring node %s failed.", self.uuid.hex(), exc_info=True)
+            return InternalError(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
+        return None
+
+    def _let_others_finish(self) -> None:
+        """Wait while a command of this station works on the node: a claim in the middle would spoil what it does."""
+        passed, since, told = 0.0, time.monotonic(), False
+        while passed < LONGEST_WORK and self._station.turn(self.uuid).is_taken and not self._stop.wait(WORKED_ON):
+            passed = time.monotonic() - since
+            if passed > TELL and not told:
+                told = True
+                self._say("waiting", why="a command of this station is using it")
+
+    def _once(self) -> None:
+        self._let_others_finish()
+        standing = self._standing = NodeStanding(self._station, self.uuid)
+        standing.require_measurable()
+        seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._request.timeout, self._patience.left), 1))
+        sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
+        self.sighting = sighting
+        self.bus = self._buses.of(sighting)
+        for other in self._buses.all():
+            if other is not self.bus:
+                other.share.leave(self.uuid)
+        try:
+            self._in_session(self.bus, sighting, standing)
+        except NoRoomError:
+            raise
+        except BaseException as error:
+            self._lost_at = time.monotonic()
+            self._buses.sightings.let_announce(self.uuid)
+            # Under its key it said what it is refused for: it is there, and another measurement may want it now.
+            if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
+                self._buses.sightings.wrong(sighting)
+            raise
+
+    def _in_session(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:
+        self._announced = self._elsewhere = 0.0
+        self._buses.sightings.on_announce(sighting, self._heard_announce, self._seen_elsewhere)
+        with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
+            if isinstance(node.contact.link, CancellableLink):
+                node.contact.link.hopeless = self._is_gone
+            try:
+                trusted = (
+                    open_unverified(self._station, node, by=self._request.by)
+                    if self._request.unverified
+                    else open_trusted(self._station, node, by=self._request.by, unsigned=self._request.unsigned)
+                )
+            finally:
+                self._proven = node.sealed
+            if self._request.require is not None:
+                self._request.require.offer(self.uuid, trusted.sheet, self._stop)
+            self.trusted, self._announced = trusted, 0.0
+            answers = False
+            try:
+                self._measure(bus, trusted, sighting.address)
+                standing.drives = self._driven is not None
+                standing.unsigned = trusted.unsigned or trusted.unverified
+                self._keep(bus, trusted, standing)
+                answers = True
+            except (NotAuthenticError, PolicyError, BadDataError, KeyStolenError):
+                answers = True  # what it was asked for would go on until its lease ends
+                raise
+            finally:
+                self._end(bus, trusted, sighting.address, answers=answers or self._stop.is_set())
+
+    def _measure(self, bus: MeasuredBus, trusted: VerifiedSession, address: int) -> None:
+        """Clock, Operate, Subscribe; every stream is heard from then on."""
+        self.streams.new_session()
+        for _ in range(AT_FIRST):
+            self.streams.tell_time(trusted)
+        actuators = self._actuators(trusted)
+        channels = self._sensors(trusted.sheet.channels, actuators)
+        self._claim(trusted, channels)
+        plans = self._subscribe(bus, trusted, channels, address) if channels else NodePlans((), 0.0)
+        periods = plans.periods()
+        self._events.facts([trusted.facts(one, periods.get(one.number)) for one in (*channels, *actuators)])
+        self.streams.described()
+        if actuators:
+            self._driven = self._take_up(bus, trusted, actuators, address)
+        notes = [plans.slowed] if plans.slowed else []
+        notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
+        self.ever_ran, self.error = True, None
+        self._patience.has_run()
+        self._say("running", why="; ".join(note.removesuffix(".") for note in notes))
+        self.ready.set()
+
+    def _actuators(self, trusted: VerifiedSession) -> list[Channel]:
+        """Actuators that set points may come for: of a signed datasheet on the whitelist, with a way to raw values."""
+        if (
+            trusted.unsigned
+            or trusted.unverified
+            or not self._request.actuators
+            or self._station.pins.entry(self.uuid) is None
+        ):
+            return []
+        wanted = self._request.channels
+        return [
+            one
+            for one in trusted.sheet.channels
+            if one.actuator and not one.value_problem and (not wanted or one.number in wanted)
+        ]
+
+    def _sensors(self, every: Sequence[Channel], actuators: list[Channel]) -> list[Channel]:
+        """Sensors to measure; none where only actuators were asked for, or the node has nothing else."""
+        moved = {one.number for one in actuators}
+        asked = [number for number in self._request.channels if number not in moved]
+        nothing_else = all(one.actuator for one in every) or (self._request.channels and not asked)
+        if actuators and nothing_else:
+            return []
+        return sensors_of(every, asked, self._request.kind)
+
+    def _claim(self, trusted: VerifiedSession, channels: list[Channel]) -> None:
+        """Claim the sensors one by one, or the whole node at once where every sensor is measured."""
+        sensors = [one for one in trusted.sheet.channels if not one.actuator]
+        whole = bool(channels) and len(channels) == len(sensors)
+        self._claimed = [0] if whole else [one.number for one in channels]
+        self._lease = self._lease_now()
+        for number in self._claimed:
+            claim(trusted, number, lease=self._lease)
+
+    def _lease_now(self) -> int:
+        """The lease grows with the bus, and with it the pause between two Clocks, so that many nodes do not fill it."""
+        nodes = self.bus.share.nodes if self.bus is not None else 0
+        return min(LONGEST_LEASE, max(self._request.lease, math.ceil(LEASE_EACH * nodes)))
+
+    def _take_up(
+        self, bus: MeasuredBus, trusted: VerifiedSession, actuators: list[Channel], address: int
+    ) -> TopicActuators:
+        return TopicActuators(
+            trusted,
+            functools.partial(bus.drive, address),
+            tuple(sorted(one.number for one in actuators)),
+            dead_man=self._request.dead_man,
+            clock=self.streams.clock,
+            turn=self.turn,
+            mapping=self.streams.mapping,
+            echo=self._events.block,
+            tell=lambda why: self._say(self.state, why=why),
+        )
+
+    def _subscribe(
+        self, bus: MeasuredBus, trusted: VerifiedSession, channels: list[Channel], address: int
+    ) -> NodePlans:
+        rate, share = self._request.rate, bus.share
+        if rate is None:
+            share.want(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
+        start = self._common_start.start(self.uuid, self.streams.clock)
+        while True:
+            with share.lock:
+                time_left = bus.time_for(share.others(self.uuid, sharing=rate is None), address)
+                plans = self._plan(channels, time_left, start)
+                share.taken[self.uuid] = plans.load
+            try:
+                for plan in plans.streams:
+                    self.streams.subscribe(bus, trusted, plan, address, ahead=self._common_start.until(start))
+            except NodeRefusedError as refusal:
+                if refusal.reason == Reason.TOO_LATE and start != SOON:
+                    self._common_start.late(self.uuid)
+                    start = SOON
+                elif refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
+                    raise
+                else:
+                    self._halved += 1  # the firmware's shortest period is longer than the datasheet's: nobody says it
+                self.streams.stop(bus, trusted, address)
+                continue
+            return plans
+
+    def _plan(self, channels: list[Channel], bus: BusTime, start: int) -> NodePlans:
+        return plan_node(
+            channels,
+            bus,
+            rate=self._request.rate,
+            kind=self._request.kind,
+            test_pattern=self._request.test_pattern,
+            start=start,
+            slower=2**self._halved,
+            at_most=self._request.newcomers,
+        )
+
+    def _keep(self, bus: MeasuredBus, trusted: VerifiedSession, standing: NodeStanding) -> None:
+        """Clock every lease / 3 until the end, or until the node is lost, or may not be measured any more."""
+        rest = BackgroundReread(self._station, trusted, bus, by=self._request.by) if trusted.kept else None
+        try:
+            self._watch(bus, trusted, standing, rest)
+        finally:
+            if rest is not None:
+                rest.close()
+
+    def _watch(
+        self, bus: MeasuredBus, trusted: VerifiedSession, standing: NodeStanding, rest: BackgroundReread | None
+    ) -> None:
+        told = time.monotonic()
+        lied, mark = False, ""
+        while not self._stop.is_set():
+            self._anew.wait(LOOK)
+            standing.require()
+            if standing.mark != mark:
+                mark = standing.mark
+                self._say("running", why=mark)
+            now = time.monotonic()
+            if self._doubted(now) or now - told >= self._lease / 3:
+                with self.turn:
+                    self.streams.tell_time(trusted)
+                    if self._lease_now() > self._lease:
+                        self._lease = self._lease_now()
+                        for number in self._claimed:
+                            claim(trusted, number, lease=self._lease)
+                told = now
+            elif rest is not None:
+                with self.turn:
+                    rest = rest if rest.step() else None
+                if rest is None:
+                    self._events.read(self.uuid)
+            if self.streams.clock.lie and not lied:
+                lied = True
+                self._say("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")
+            silent = self.streams.silent(now)
+            if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
+                raise failure
+            if silent:
+                raise LinkError(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
+
+    def _is_gone(self) -> bool:
+        """Whether it is of no use to wait for its answer: it is silent, or was since it was seen at another place."""
+        now, since = time.monotonic(), self._elsewhere
+        if since and now - since > max(LOOK_FOR_DATA, self.streams.every() or 0.0):
+            return not self.streams.heard_since(since)
+        return bool(self.streams.silent(now))
+
+    def _seen_elsewhere(self) -> None:
+        self._elsewhere = time.monotonic()
+        self._heard_announce()
+
+    def _heard_announce(self) -> None:
+        self._announced = self._announced or time.monotonic()
+
+    def _doubted(self, now: float) -> bool:
+        """Whether to ask the node because it announced itself: then it has started anew, or moved.
+
+        But anyone can send an Announce. Data that still comes with good tags says more; where none comes, the session
+        is gone, and is opened again at once.
+        """
+        since = self._announced
+        if not since:
+            return False
+        every = self.streams.every()
+        if every is not None and every < LOOK_FOR_DATA:
+            if self.streams.heard_since(since):
+                self._announced = 0.0
+            elif now - since > LOOK_FOR_DATA:
+                self._announced = 0.0
+                self._anew.set()
+                raise LinkError("The node has restarted, or now answers elsewhere.")
+            return False
+        doubted = now - since >= ANNOUNCED
+        if doubted:
+            self._announced = 0.0
+        return doubted
+
+    def _end(self, bus: MeasuredBus, trusted: VerifiedSession, address: int, *, answers: bool) -> None:
+        """Let go in order, as far as the node still ``answers``."""
+        if self._driven is not None:
+            self._driven.close()
+            self._driven = None
+        self._buses.sightings.let_announce(self.uuid)
+        self.streams.stop(bus, trusted if answers else None, address)
+        if not self._comes_back:
+            with bus.share.lock:
+                bus.share.taken.pop(self.uuid, None)
+        if answers:
+            with suppress(TedsProvisionError, SessionLostError):
+                trusted.node.send(idle(0), "to let go")
+        else:
+            trusted.node.forget()
+        self.trusted = None
+
+    # -- telling ---------------------------------------------------------------------------------------------------
+
+    def report(self) -> NodeReport:
+        """How the node does now."""
+        sums = self.streams.summed()
+        errors = [one.clock_error for one in sums if one.clock_error is not None]
+        return NodeReport(
+            uuid=self.uuid.hex(),
+            state=self.state,
+            why=self._told,
+            samples=sum(one.samples for one in sums),
+            lost=sum(one.lost for one in sums),
+            late=sum(one.late for one in sums),
+            bad=sum(one.bad for one in sums),
+            invalid=sum(one.invalid for one in sums),
+            clock_error=max(errors) if errors else None,
+            time=time.time(),
+            invalid_why=added(*(one.invalid_why for one in sums)),
+        )
+
+    def _say(self, state: State, error: TedsProvisionError | None = None, more: str = "", *, why: str = "") -> None:
+        self.state = state
+        self._told = why or (error.message.rstrip(".") + more if error is not None else "")
+        self._events.report(self.report())

@@ -1,0 +1,212 @@
+"""Who was seen, where and when, on all links of a process: what the look-outs tell, and what waiting threads ask for.
+
+What is seen is a hint: a session says who it is.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from teds_provision.errors import LinkError, NoNodeError
+from teds_provision.links.ble.port import BlePort
+from teds_provision.links.can.identify_broadcast import conflict_text
+from teds_provision.links.can.link import conflict
+from teds_provision.links.can.port import CanPort
+from teds_provision.links.ports import Contact
+from teds_provision.protocol.announce import Announce, uuid_crc
+from teds_provision.protocol.messages.identity import Identity
+
+RECENT = 30.0  # seconds for which a conflict of addresses is the reason why a node is not found
+MOST = 1024  # UUIDs that are kept: a bus has 239 addresses, and at each of them anybody can give himself a new one
+TWIN = 0.5  # seconds in which the node itself may answer as well, where one that says it is it was not
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A node that answered: where, as what it says it is, and when (time.monotonic). Nobody has proven any of it.
+
+    ``address`` is its CAN address, over the air the number of its connection.
+    """
+
+    identity: Identity
+    address: int
+    port: CanPort | BlePort
+    at: float
+
+    @property
+    def uuid(self) -> bytes:
+        """10 octets."""
+        return self.identity.uuid
+
+    def contact(self) -> Contact:
+        """A line to it."""
+        link, trace, bus = self.port.link(self.address), self.port.trace, self.port.place
+        if isinstance(self.port, BlePort):
+            return Contact(self.identity, link, connection=self.address, trace=trace, bus=bus)
+        return Contact(self.identity, link, address=self.address, trace=trace, bus=bus)
+
+
+Place = tuple[str, int]
+
+
+@dataclass
+class Presence:
+    """What the look-outs of all buses saw; :meth:`find` waits for one node. Thread-safe.
+
+    A UUID may answer at two places, as anyone can send an Identify: one that turned out wrong goes behind the others.
+    """
+
+    news: Callable[[Sighting], None] = lambda _sighting: None
+    note: Callable[[str], None] = lambda _text: None
+    _seen: dict[bytes, dict[Place, Sighting]] = field(default_factory=dict)
+    _wrong: dict[bytes, dict[Place, float]] = field(default_factory=dict)
+    _conflicts: dict[Place, float] = field(default_factory=dict)
+    _announced: dict[bytes, tuple[Place, Callable[[], None], Callable[[], None]]] = field(default_factory=dict)
+    _missing: dict[bytes, int] = field(default_factory=dict)
+    _unseen: set[bytes] = field(default_factory=set)  # those that somebody waited for, and that were not seen since
+    _welcome: frozenset[int] = frozenset()  # CRCs of UUIDs that are measured as soon as they come
+    gone: int = 0  # how often a node that had been seen, or was never looked for, became missing
+    _turn: threading.Condition = field(default_factory=threading.Condition)
+
+    def saw(self, sighting: Sighting) -> None:
+        """Take what a look-out saw; who keeps this node at another place is told."""
+        place = (sighting.port.place, sighting.address)
+        with self._turn:
+            self._unseen.discard(sighting.uuid)
+            places = self._seen.pop(sighting.uuid, {})  # who was seen last stands last
+            places[place] = sighting
+            self._seen[sighting.uuid] = places
+            while len(self._seen) > MOST:
+                del self._seen[next(uuid for uuid in self._seen if uuid not in self._announced)]
+            self._turn.notify_all()
+            kept = self._announced.get(sighting.uuid)
+        if kept is not None and kept[0] != place:
+            kept[2]()
+        self.news(sighting)
+
+    def conflict(self, place: str, address: int) -> None:
+        """Two nodes answer under one address: nothing is opened there."""
+        with self._turn:
+            self._conflicts[place, address] = time.monotonic()
+            for places in self._seen.values():
+                places.pop((place, address), None)
+            self._turn.notify_all()
+        self.note(conflict_text(address))
+
+    def on_announce(
+        self, sighting: Sighting, tell: Callable[[], None], moved: Callable[[], None] | None = None
+    ) -> None:
+        """Call ``tell``, which returns at once, when something announces itself as this node, or from its address.
+
+        ``moved`` (else ``tell``): when it answers at another place. Both are hints: anyone can send them.
+        """
+        with self._turn:
+            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), tell, moved or tell)
+
+    def let_announce(self, uuid: bytes) -> None:
+        """Tell no more of it."""
+        with self._turn:
+            self._announced.pop(uuid, None)
+
+    def announced(self, place: str, announce: Announce) -> None:
+        """Take what a look-out heard; a hint that anyone can send."""
+        with self._turn:
+            told = [
+                tell
+                for uuid, (where, tell, _) in self._announced.items()
+                if where == (place, announce.address) or (where[0] == place and uuid_crc(uuid) == announce.crc)
+            ]
+        for tell in told:
+            tell()
+
+    def awaits(self, announce: Announce) -> bool:
+        """Whether somebody waits for the node that this says it is."""
+        with self._turn:
+            return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
+
+    def welcome(self, uuids: Iterable[bytes]) -> None:
+        """Nodes that are to be asked at once when they announce themselves: whoever waits for them, waits for none."""
+        self._welcome = frozenset(map(uuid_crc, uuids))
+
+    def is_welcome(self, announce: Announce) -> bool:
+        """Whether this says that it is such a node."""
+        return announce.crc in self._welcome
+
+    def seen_at(self, uuid: bytes) -> Sighting | None:
+        """Where a node was seen last; None where it was not, or turned out not to be."""
+        with self._turn:
+            return max(self._seen.get(uuid, {}).values(), key=lambda one: one.at, default=None)
+
+    def missing(self) -> bool:
+        """Whether somebody waits for a node."""
+        with self._turn:
+            return bool(self._missing)
+
+    def all(self) -> list[Sighting]:
+        """Every node that was seen, where it was seen last, by UUID."""
+        with self._turn:
+            return [max(places.values(), key=lambda one: one.at) for _, places in sorted(self._seen.items()) if places]
+
+    def find(self, uuid: bytes, *, seconds: float, stop: threading.Event, fresh: float = 0.0) -> Sighting:
+        """Wait for a node that was seen after ``fresh`` (time.monotonic); raises NoNodeError, AddressConflictError."""
+        until = time.monotonic() + seconds
+        with self._turn:
+            self._missing[uuid] = self._missing.get(uuid, 0) + 1
+            try:
+                while True:
+                    found = self._best(uuid, fresh)
+                    if found is not None:
+                        return found
+                    if uuid not in self._unseen:
+                        self._unseen.add(uuid)
+                        self.gone += 1
+                    left = until - time.monotonic()
+                    if left <= 0 or stop.is_set():
+                        raise self._nobody(uuid, seconds)
+                    self._turn.wait(min(left, 0.2))
+            finally:
+                self._missing[uuid] -= 1
+                if not self._missing[uuid]:
+                    del self._missing[uuid]
+
+    def wrong(self, sighting: Sighting) -> None:
+        """It was not that node, or it is gone from there: look again."""
+        place = (sighting.port.place, sighting.address)
+        with self._turn:
+            self._seen.get(sighting.uuid, {}).pop(place, None)
+            self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
+
+    def elsewhere(self, uuid: bytes) -> bool:
+        """Whether it answers, or ever answered, at more than one place; waits for the answer of a twin.
+
+        A place that was wrong counts: the node itself may have been silent there for a moment, which is when whoever
+        says that he is it comes into question, and refuses.
+        """
+
+        def other() -> bool:
+            return len(self._seen.get(uuid, {}).keys() | self._wrong.get(uuid, {}).keys()) > 1
+
+        with self._turn:
+            return self._turn.wait_for(other, TWIN)
+
+    def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
+        """Where to look for a node. A place that was wrong is not taken while another one may still answer."""
+        wrong, seen = self._wrong.get(uuid, {}), self._seen.get(uuid, {})
+        places = [one for one in seen.values() if one.at >= fresh]
+        best = min(places, key=lambda one: (wrong.get((one.port.place, one.address), 0.0), -one.at), default=None)
+        if best is None or (best.port.place, best.address) not in wrong or len(seen) == len(places):
+            return best
+        return best if time.monotonic() - best.at >= TWIN else None
+
+    def _nobody(self, uuid: bytes, seconds: float) -> LinkError:
+        recent = [address for (_, address), at in self._conflicts.items() if time.monotonic() - at < RECENT]
+        if recent:
+            return conflict(min(recent))
+        return NoNodeError(
+            f"Node {uuid.hex()} did not answer within {seconds:g} s.",
+            hint="Check its power, the bit rate and the address; teds-provision identify --via can lists the"
+            " nodes that answer.",
+        )

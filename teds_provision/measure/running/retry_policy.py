@@ -1,0 +1,62 @@
+"""How long a node is tried again after an error, and which errors no second try cures."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from teds_provision.errors import (
+    BadDataError,
+    BadDatasheetError,
+    InternalError,
+    NodeRefusedError,
+    NotAuthenticError,
+    PolicyError,
+    StoreError,
+    TedsProvisionError,
+)
+from teds_provision.protocol.messages.frames import Reason
+
+CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
+_FINAL = (NotAuthenticError, PolicyError, BadDataError, StoreError, InternalError)
+
+
+class RetryPolicy:
+    """Until its first value a node has ``timeout`` seconds (None: no end), from then on there is no end."""
+
+    def __init__(self, timeout: float | None) -> None:
+        self._until = math.inf if timeout is None else time.monotonic() + timeout
+        self._ends = timeout is not None
+
+    def has_run(self) -> None:
+        """Its first value is there: from now on anyone could have sent a refusal, so it is tried again for ever."""
+        self._until = math.inf
+
+    @property
+    def left(self) -> float:
+        """Seconds in which a first value has to come."""
+        return max(0.0, self._until - time.monotonic())
+
+    def again(self, pause: float) -> str:
+        """When it is tried again, and for how long that goes on."""
+        left = self.left
+        return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, giving up in {left:.0f} s"
+
+    def gives_up(
+        self, error: TedsProvisionError, *, proven: bool, elsewhere: Callable[[], bool], decided: bool = False
+    ) -> bool:
+        """True if no other try is worth it.
+
+        ``decided``: this station itself decided so, by a ban, its whitelist or its trust.
+        ``proven``: the error came in a session. Outside one anybody on the bus can have given himself the node's UUID
+        and refuse to open one: then it is looked for ``elsewhere``.
+        """
+        if self.left == math.inf:  # a datasheet that was changed under its values ends what has an end
+            return self._ends and (decided or (proven and isinstance(error, BadDatasheetError)))
+        if decided:
+            return True
+        passing = isinstance(error, NodeRefusedError) and error.reason in CURED_BY_TIME
+        if not isinstance(error, _FINAL) or passing:
+            return not self.left
+        return proven or not elsewhere()

@@ -1,0 +1,263 @@
+"""``calibrate zero``: "this is 0 now", where the sensor is mounted. Read, build, sign, write, verify: one step.
+
+The curve stays, and so does the date of its calibration; its zero offset moves, and the date of that stands beside it.
+The guard judges the result as it judges any calibration. What is on the node counts, no profile is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from teds_provision.errors import BadDataError, PolicyError
+from teds_provision.lazy import late
+from teds_provision.links import LinkSettings
+from teds_provision.measure.held_actuator import unit_for
+from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, settle
+from teds_provision.measure.sources import beside
+from teds_provision.measure.verified_session import VerifiedSession, operation, trusted_from
+from teds_provision.protocol.datasheet import SignedNodeKey
+from teds_provision.protocol.operation.commands import ChannelState
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.build import guard
+from teds_provision.steps.commands import NodeVisit, at_node
+from teds_provision.steps.sign import sign
+from teds_provision.steps.verify_node import NodeVerification, look_in_session, verify_node
+from teds_provision.steps.write import Low, wait_for_charge, write
+from teds_provision.talk.conversation import SessionLostError
+from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.zero import offset_for, reading_of, shortest, turn_of, with_zero_offset
+from teds_provision.teds.channel import TURN, Channel, wrapped
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.diff import diff_blocks
+from teds_provision.teds.image import Image
+from teds_provision.teds.units import format_value
+
+if TYPE_CHECKING:
+    import numpy as np
+else:
+    np = late("numpy")
+
+_NAME = "calibrate zero"
+_AFTERWARDS: Final = 16
+"""Samples by the new datasheet, one after the other: each takes 6 ms of a bus of 500 kbit/s."""
+
+
+@dataclass(frozen=True)
+class ZeroOrder:
+    """Which channel reads ``value`` (None: 0) now, in ``unit`` (None: SI).
+
+    ``shown_unit_asked``: a person at a terminal has to name the unit where the one that is shown is not SI.
+    ``accept_calibration`` is the reason given for a result that the guard would refuse.
+    """
+
+    channel: int
+    value: float | None = None
+    unit: str | None = None
+    shown_unit_asked: bool = False
+    accept_calibration: str | None = None
+
+
+@dataclass(frozen=True)
+class ZeroResult:
+    """What was done, or with a dry run would be: numbers are in SI units, ``offset`` and ``moved`` are differences.
+
+    ``before`` is what the channel read, ``after`` what it reads now (for a dry run: will read). ``moved`` is 0 where
+    there was nothing to do.
+    """
+
+    uuid: bytes
+    channel: Channel
+    offset: float
+    moved: float
+    before: float
+    after: float
+    spread: float
+    count: int
+    sequence: int
+    changes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    steps: tuple[StepResult, ...]
+    written: bool
+
+
+def zero_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    order: ZeroOrder,
+    reporter: Reporter,
+    *,
+    dry_run: bool = False,
+    low: Low = wait_for_charge,
+) -> ZeroResult:
+    """Have a channel of the node that ``node`` names read ``order.value`` now.
+
+    A running `ncap` of this home that measures the node lets it go, and gets it back. Raises PolicyError (too
+    restless, no calibration whose offset could carry it, a value beyond the limits, the guard), NotAuthenticError where
+    the datasheet on the node is not good, and what reading, signing and writing raise.
+    """
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    writes = "" if dry_run else _NAME
+    with (
+        beside(station, links.after_agreeing(), f"{_NAME} {uuid.hex()}", shared=False) as own,
+        at_node(station, own, uuid, reporter, unlock="always", writes=writes) as visit,
+    ):
+        try:
+            return _ZeroRun(visit, order, Steps(reporter), low, dry_run=dry_run).run()
+        except SessionLostError as lost:
+            raise lost.cause from lost
+
+
+@dataclass(frozen=True)
+class _ZeroRun:
+    visit: NodeVisit
+    order: ZeroOrder
+    steps: Steps
+    low: Low
+    dry_run: bool
+
+    def run(self) -> ZeroResult:
+        station, node = self.visit.station, self.visit.node
+        require_session(station, node)
+        looked = look_in_session(station, node, by=_NAME)
+        image, trusted = looked.image, trusted_from(station, node, looked)
+        with self.steps.step("read") as step:
+            channel, own = _adjustable(trusted, self.order.channel)
+            wanted = self._wanted(channel, own)
+            turn = turn_of(own, full_turn=channel.full_turn)
+            settled = settle(trusted, channel.number)
+            reading = require_still(settled)
+            step.detail = f"{channel.show(_si(channel, own, reading.mean))}, {reading.count} samples"
+        offset = offset_for(own, reading.mean, wanted, turn)
+        moved = float(shortest(np.asarray(offset - own.zero_offset), turn))
+        identity = node.proven
+        assert identity is not None, "a look in the session asked for it"
+        found = ZeroResult(
+            node.uuid,
+            channel,
+            offset=offset * own.unit.scale,
+            moved=moved * own.unit.scale,
+            before=_si(channel, own, reading.mean),
+            after=_si(channel, own, reading.mean + moved),
+            spread=own.unit.difference_to_si(reading.spread),
+            count=reading.count,
+            sequence=identity.sequence,
+            changes=(),
+            warnings=self._warnings(settled, own),
+            steps=(),
+            written=False,
+        )
+        if abs(moved) <= reading.doubt:
+            return replace(found, offset=own.zero_offset * own.unit.scale, moved=0.0, steps=tuple(self.steps.done))
+        with self.steps.step("build") as step:
+            at = (channel.number, int(AccessCode.CALIBRATION))
+            octets = with_zero_offset(image.blocks[at], offset, datetime.now(UTC).replace(microsecond=0))
+            wanted_image = Image(node.uuid, {**image.unsigned_blocks(), at: octets})
+            record = not self.dry_run
+            told = guard(
+                station, wanted_image, image, self.order.accept_calibration, record=record, expected=("changed",)
+            )
+            changes = tuple(one.text for one in diff_blocks(image.unsigned_blocks(), wanted_image.unsigned_blocks()))
+            found = replace(found, changes=changes, warnings=(*found.warnings, *told))
+            step.detail = f"zero offset {channel.show(found.offset, difference=True)}"
+        if self.dry_run:
+            return replace(found, steps=tuple(self.steps.done))
+        if not node.tapped:  # a tap ends the claims of others by itself
+            _require_nobody_else(trusted)
+        return self._bring(wanted_image, found)
+
+    def _wanted(self, channel: Channel, own: Calibration) -> float:
+        """What the channel is to read, in the calibrated unit; raises PolicyError beyond its limits."""
+        order = self.order
+        si = reference_for(channel, order.value, order.unit, shown_unit_asked=order.shown_unit_asked)
+        if not channel.full_turn:
+            slack = max(channel.stated_uncertainty, 0.0) if math.isfinite(channel.stated_uncertainty) else 0.0
+            if si < channel.low - slack or si > channel.high + slack:
+                said = unit_for(channel, order.unit) if order.unit is not None else channel.shown
+                asked, low, high = (format_value(each, said) for each in (si, channel.low, channel.high))
+                raise PolicyError(
+                    f"{asked} exceeds the limits of channel {channel.number}, {low} to {high}.",
+                    hint="Limits come from the signed datasheet and cannot be exceeded.",
+                )
+        return own.unit.from_si(si)
+
+    def _warnings(self, settled: SampleSeries, own: Calibration) -> tuple[str, ...]:
+        out = []
+        if settled.extrapolated:
+            first, last = own.inputs[0].boundaries[0], own.inputs[0].boundaries[-1]
+            out.append(f"The reading lies outside the calibrated range (raw {first:.8g} to {last:.8g}).")
+        if self.visit.station.nodes.draft(self.visit.node.uuid) is not None:
+            out.append("This node has a draft, which does not include this zero offset; to drop it: draft drop UUID.")
+        return tuple(out)
+
+    def _bring(self, image: Image, found: ZeroResult) -> ZeroResult:
+        """Sign, write, verify, and read once more by the new datasheet."""
+        station, node, who = self.visit.station, self.visit.node, self.visit.who
+        identity = node.proven
+        assert identity is not None
+        keys = SignedNodeKey(node.uuid, who.point, who.key_signature)
+        with self.steps.step("sign") as step:
+            signed = sign(station, keys, image, epoch=identity.epoch, node_sequence=identity.sequence)
+            step.detail = f"sequence {signed.sequence}"
+        with self.steps.step("write") as step:
+            record = station.nodes.get(node.uuid)
+            facts: Mapping[str, object] = {"profile": record.profile} if record is not None and record.profile else {}
+            written = write(
+                station, node, signed.image, progress=self.steps.reporter.written, facts=facts, low=self.low
+            )
+            step.result = DONE if written.octets else NOTHING
+            step.detail = f"{written.octets} octets"
+        with self.steps.step("verify") as step:
+            judged = verify_node(station, node, written.on_node, who.point, by=_NAME, c=node.c)
+            step.detail = judged.verified.verdict
+            trusted = trusted_from(station, node, NodeVerification(written.on_node, judged))
+            channel, own = _adjustable(trusted, found.channel.number)
+            turn = turn_of(own, full_turn=channel.full_turn)
+            after = reading_of(settle(trusted, channel.number, count=_AFTERWARDS, seconds=0.0).calibrated(), turn)
+        said = {"channel": channel.number, "offset": found.offset, "unit": channel.si_unit}
+        station.audit("zero", node.uuid, "done", **said, sequence=signed.sequence)
+        return replace(
+            found,
+            after=_si(channel, own, after.mean),
+            sequence=signed.sequence,
+            steps=tuple(self.steps.done),
+            written=True,
+        )
+
+
+def _require_nobody_else(trusted: VerifiedSession) -> None:
+    """Raise PolicyError where another session claims a channel: the node would refuse what was signed by then."""
+    claimed = [one for one in operation(trusted.node).channels.values() if one[0] & ChannelState.CLAIMED_BY_OTHER]
+    if claimed:
+        raise PolicyError(
+            f"Node {trusted.uuid} is being measured by another station, source address 0x{claimed[0][1]:02X}.",
+            hint="End that measurement first. A running ncap of this home releases the node by itself.",
+        )
+
+
+def _adjustable(trusted: VerifiedSession, number: int) -> tuple[Channel, Calibration]:
+    """A sensor and its calibration; raises PolicyError where there is no offset that could be moved."""
+    channel = trusted.channel(number)
+    if channel.actuator:
+        raise BadDataError(f"Channel {number} of node {trusted.uuid} is an actuator, not a sensor.")
+    own = channel.calibration
+    if own is None:
+        why = channel.calibration_problem or "it has none."
+        raise PolicyError(
+            f"Channel {number} has no calibration with an offset that can be changed: {why}",
+            hint="Calibrate it first: calibrate capture, then provision with --calibration FILE.",
+        )
+    return channel, own
+
+
+def _si(channel: Channel, own: Calibration, value: float) -> float:
+    """A reading in the calibrated unit, in SI units, as it is shown: within its turn."""
+    si = own.unit.to_si(value)
+    return float(wrapped(np.asarray(si), channel.low, channel.high, TURN)) if channel.full_turn else si

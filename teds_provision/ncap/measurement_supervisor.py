@@ -1,0 +1,758 @@
+"""The measurements of the daemon: kept in the store, carried on after every start, ended in order.
+
+Each is a :class:`MeasurementJob` of the room ``measure``; here it gets its nodes (nothing else is done with them
+meanwhile), its watchers (the live channel, the roster), and the sinks that the daemon was started with.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final
+
+from teds_provision.errors import (
+    FrozenError,
+    LinkError,
+    NodeBusyError,
+    NotFoundError,
+    PolicyError,
+    TedsProvisionError,
+    UsageError,
+)
+from teds_provision.measure.blocks import ChannelFacts, NodeReport, SetPointCommand, StationFacts
+from teds_provision.measure.buses import Buses
+from teds_provision.measure.discovery import CanDiscovery
+from teds_provision.measure.matching import ListedNodes, NodeMatch, UnsignedNodes
+from teds_provision.measure.planning import period_of, sensors_of
+from teds_provision.measure.request import MeasurementRequest
+from teds_provision.measure.runner import Watcher
+from teds_provision.measure.running.measurement_job import MeasurementJob
+from teds_provision.measure.sinks import Sink
+from teds_provision.measure.sinks.base import BUDGET
+from teds_provision.measure.standing import require_measurable, why_not_measured
+from teds_provision.measure.verified_session import DEAD_MAN, VerifiedSession
+from teds_provision.ncap.dynamic_membership import DynamicMembership
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.nodes.directory import NodeDirectory
+from teds_provision.ncap.nodes.inspection import as_problem
+from teds_provision.ncap.nodes.node_jobs import NodeLocks
+from teds_provision.ncap.sinks import DaemonSinks, sink_json
+from teds_provision.protocol.operation.stream_commands import StreamKind
+from teds_provision.station.station import Station
+from teds_provision.store import KeptMeasurement
+from teds_provision.teds.image import Image
+from teds_provision.teds.sheet import Sheet
+
+_ADOPTED: Final = "adopted"
+NCAP: Final = "ncap"
+LETTING_GO: Final = 4.0  # seconds for a node's session to end in order; whoever asks waits 5
+ANSWERING: Final = 1.0  # seconds for a node that has another address now
+LONGEST_LOAN: Final = 900.0  # seconds after which a node is measured again, whatever its writer does
+SCALAR_RATE: Final = 10.0
+"""Values a second on a topic of one value, where a measurement does not say."""
+
+
+@dataclass
+class RunningMeasurement:
+    """One measurement that runs, or tries to."""
+
+    kept: KeptMeasurement
+    uuids: tuple[str, ...]  # of one that takes in whoever comes: those that are in
+    newcomers: DynamicMembership | None = None
+    job: MeasurementJob | None = None
+    state: str = "starting"
+    why: str = ""
+    reports: dict[str, dict[str, Any]] = field(default_factory=dict)
+    past: set[str] = field(default_factory=set)  # whose reports say nothing of now
+    stop: threading.Event = field(default_factory=threading.Event)
+    thread: threading.Thread | None = None
+
+
+@dataclass(eq=False)
+class NodeLoan:
+    """A node (UUID in hex) that is let go to a writer, and why in half a sentence."""
+
+    uuid: str
+    why: str
+    ended: bool = False
+
+
+class MeasurementSupervisor:
+    """All of them. ``admits`` says of a set point that came by a topic whether it may pass.
+
+    ``dead_man`` in ms holds for a measurement that is begun without one.
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        roster: NodeDirectory,
+        live: Live,
+        turns: NodeLocks,
+        buses: Buses,
+        sinks: DaemonSinks,
+        admits: Callable[[SetPointCommand], bool],
+        *,
+        dead_man: int = DEAD_MAN,
+    ) -> None:
+        self._station, self._roster, self._live, self._turns = station, roster, live, turns
+        self._unverified: UnsignedNodes | None = None
+        self._adopted: set[bytes] = set()
+        self._buses, self._sinks, self._admits = buses, sinks, admits
+        self._dead_man = dead_man
+        self._running: dict[str, RunningMeasurement] = {}
+        self._loans: dict[str, list[NodeLoan]] = {}
+        self._lending = threading.Lock()
+        self._guard = threading.Lock()
+        self._messages: tuple[float, int] = (time.monotonic(), 0)
+        self._rate = 0.0
+
+    # -- its life ----------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Carry on what is kept."""
+        for kept in self._station.measurements.due():
+            self._begin(kept)
+
+    def match(self, expression: str, *, rate: float | None = None, frozen: bool = False) -> None:
+        """Measure whoever comes and is meant, for the life of this process (``ncap run --measure``).
+
+        Raises UsageError, NotFoundError for an expression that says nothing, or names a group that is not there.
+        """
+        NodeMatch.parse(expression).require_groups(self._station)
+        same = (expression, rate, frozen)
+        if any((one.match, one.rate, one.frozen) == same for one in self._station.measurements.due()):
+            return  # it is kept already
+        self._begin(KeptMeasurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
+
+    def unverified(self, *, rate: float | None = None) -> None:
+        """Measure every node that describes itself by what nobody has signed, marked so (``--adopt --unverified``).
+
+        One that is signed meanwhile is measured on as what it is then, where no other measurement takes it.
+        """
+        self._unverified = UnsignedNodes()
+        for name in (self._unverified.text, _ADOPTED):
+            self._begin(KeptMeasurement(name, match=name, rate=rate, dead_man=self._dead_man))
+
+    @contextmanager
+    def apart(self, uuid: str, why: str) -> Iterator[None]:
+        """A node that is measured unverified is nobody's for the length of the block, in which it may be signed."""
+        loan = NodeLoan(uuid, why)
+        with self._guard:
+            every = [one for one in self._running.values() if one.newcomers is not None and uuid in one.uuids]
+        mine = [one.newcomers for one in every if one.kept.id == UnsignedNodes.text and one.newcomers is not None]
+        with self._lending:
+            self._loans.setdefault(uuid, []).append(loan)
+        try:
+            for newcomers in mine:
+                newcomers.part(uuid, why)
+            until = time.monotonic() + LETTING_GO
+            while mine and self.of(uuid) is not None and time.monotonic() < until:
+                time.sleep(0.05)
+            yield
+        finally:
+            self.give_back(loan)
+
+    def saw(self, uuid: str) -> None:
+        """A node answered on a bus; called before anybody else looks at it."""
+        with self._guard:
+            every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
+        for newcomers in every:
+            newcomers.saw(uuid)
+
+    def look_who_is_meant(self) -> None:
+        """Who may be measured, or what an expression names, changed in this process: a group, a key, a datasheet."""
+        with self._guard:
+            every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
+        for newcomers in every:
+            newcomers.look_who_is_meant()
+
+    def stop(self) -> None:
+        """End all of them in order; what is kept stays kept."""
+        with self._guard:
+            every = list(self._running.values())
+        for one in every:
+            one.stop.set()
+        for one in every:
+            self._end(one)
+
+    # -- what the API asks -------------------------------------------------------------------------------------------
+
+    def add(
+        self,
+        *,
+        group: str | None = None,
+        uuids: Sequence[str] = (),
+        match: str | None = None,
+        frozen: bool = False,
+        channels: Sequence[int] = (),
+        rate: float | None = None,
+        kind: Any = None,
+        trigger: bool = False,
+        sinks: Sequence[str] = (),
+        actuators: bool = True,
+        dead_man: int | None = None,
+        scalar_rate: float = SCALAR_RATE,
+        owner: str = NCAP,
+    ) -> dict[str, Any]:
+        """Measure from now on, after every restart too, until it is deleted; ``owner`` is who asked for it.
+
+        Raises UsageError (no node, a sink that cannot be named so), NotFoundError (the group), NodeBusyError (one of
+        the nodes is measured already).
+        """
+        if sum((group is not None, bool(uuids), match is not None)) != 1:
+            raise UsageError(
+                "A measurement needs a group, nodes, or an expression.", hint='Give "group", "uuids" or "match".'
+            )
+        if match is not None:
+            NodeMatch.parse(match).require_groups(self._station)
+            if trigger and not frozen:
+                raise UsageError(
+                    "Nodes that join one by one cannot start together.", hint='Omit the trigger, or set "frozen".'
+                )
+        kept = KeptMeasurement(
+            "",
+            group=group,
+            uuids=tuple(bytes.fromhex(uuid) for uuid in dict.fromkeys(uuids)),
+            channels=tuple(dict.fromkeys(channels)),
+            rate=rate,
+            kind=kind,
+            trigger=trigger,
+            sinks=tuple(dict.fromkeys(self._sinks.whole(spec) for spec in sinks)),
+            actuators=actuators and match is None,  # actuators are never claimed for whoever comes
+            match=match,
+            frozen=frozen,
+            dead_man=self._dead_man if dead_man is None else dead_man,
+            scalar_rate=scalar_rate,
+            owner=owner,
+        )
+        # What can never be measured is refused before it is kept: it would be tried for ever, after each restart too.
+        nodes = self._station.measurements.nodes_of(kept)
+        if not nodes and match is None:
+            raise UsageError(f"Group {group!r} is empty.", hint="Add a node to it first.")
+        for uuid in nodes:
+            self._require_unmeasured(uuid)
+            self._require_plan(uuid, kept)
+        for spec in kept.sinks:
+            self._sinks.open(spec)
+        with self._station.lock("measure"):  # of two requests at once for one node, or its group, one is refused
+            for uuid in self._station.measurements.nodes_of(kept):
+                self._require_unmeasured(uuid)
+                self._require_plan(uuid, kept)  # it may have been removed meanwhile
+            with self._station.durable("measure"):
+                kept = self._station.measurements.keep(kept)
+                self._station.audit(
+                    "measure", None, "begun", id=kept.id, group=group or match, nodes=[one.hex() for one in nodes]
+                )
+            return self._json(self._begin(kept))
+
+    def _require_unmeasured(self, uuid: bytes) -> None:
+        other = self.of(uuid.hex())
+        if other is not None:
+            raise NodeBusyError(
+                f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first."
+            )
+
+    def _require_plan(self, uuid: bytes, kept: KeptMeasurement) -> None:
+        """Raise what :func:`require_measurable` does.
+
+        And BadDataError if the known datasheet can never be measured so.
+        """
+        require_measurable(self._station, uuid)
+        image = self._station.nodes.datasheet(uuid)
+        if image is None:
+            return
+        kind = None if kept.kind is None else StreamKind[kept.kind.upper()]
+        channels = Sheet.of(image).channels
+        if self._sinks.moves(kept) and channels and all(one.actuator for one in channels):
+            return  # it has nothing to measure; set points come for it
+        for channel in sensors_of(channels, kept.channels, kind):
+            period_of(channel, kept.rate)
+
+    def delete(self, measurement_id: str) -> None:
+        """End it, and forget it; raises NotFoundError, PolicyError for one that a command of this home runs."""
+        with self._guard:
+            one = self._running.pop(measurement_id, None)
+        if one is None:
+            kept = next((other for other in self._station.measurements.all() if other.id == measurement_id), None)
+            if kept is None:
+                raise NotFoundError(f"No measurement has the ID {measurement_id!r}.")
+            if not kept.lasting:
+                raise PolicyError(
+                    f"Measurement {measurement_id} belongs to the command measure (process {kept.pid}).",
+                    hint="End it there with Ctrl-C.",
+                )
+        if one is not None:
+            one.stop.set()
+            self._end(one)
+        with self._station.durable("measure"):
+            if not self._station.measurements.forget(measurement_id) and one is None:
+                raise NotFoundError(f"No measurement has the ID {measurement_id!r}.")
+            self._station.audit("measure", None, "ended", id=measurement_id)
+        self._live.event("measurement", state="deleted", id=measurement_id)
+
+    def all(self) -> list[dict[str, Any]]:
+        """Return every one: those that run here, then those that commands of this home run."""
+        with self._guard:
+            every = list(self._running.values())
+        return [*(self._json(one) for one in every), *(self._json(one) for one in self._of_commands())]
+
+    def _of_commands(self) -> list[RunningMeasurement]:
+        """Return those of commands that live, to be shown; the nodes of one whose group is gone are not known."""
+        found = []
+        for kept in self._station.measurements.of_commands():
+            with suppress(NotFoundError):
+                uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
+                why = f"measured by the command measure (process {kept.pid})"
+                found.append(RunningMeasurement(kept, uuids, state="running", why=why))
+        return found
+
+    def of(self, uuid: str) -> str | None:
+        """The measurement that has a node."""
+        with self._guard:
+            return next((key for key, one in self._running.items() if uuid in one.uuids), None)
+
+    def is_measured(self, uuid: str) -> bool:
+        """Whether a node is in a session of a measurement now."""
+        job = self._job_of(uuid)
+        return job is not None and job.measurement is not None and self._turns.holder(uuid) is not None
+
+    def facts_of(self, uuid: str) -> StationFacts | None:
+        """What the sinks of the running measurement of a node were told of the station's names; None: none runs."""
+        job = self._job_of(uuid)
+        measurement = job.measurement if job is not None else None
+        return measurement.facts if measurement is not None else None
+
+    def group_is_measured(self, name: str) -> bool:
+        """Whether a measurement of this group runs."""
+        with self._guard:
+            return any(one.kept.group == name for one in self._running.values())
+
+    def _job_of(self, uuid: str) -> MeasurementJob | None:
+        with self._guard:
+            return next((one.job for one in self._running.values() if uuid in one.uuids), None)
+
+    @contextmanager
+    def session(self, uuid: str) -> Iterator[VerifiedSession | None]:
+        """The session in which a node is measured, for one more command; None where there is none now."""
+        job = self._job_of(uuid)
+        measurement = job.measurement if job is not None else None
+        if measurement is None:
+            yield None
+            return
+        with measurement.session(bytes.fromhex(uuid)) as trusted:
+            yield trusted
+
+    # -- nodes that a command of this home writes to -----------------------------------------------------------------
+
+    def let_go(self, loan: NodeLoan) -> bool:
+        """Let a node go until :meth:`give_back`, so that somebody can write to it; False where nobody measures it.
+
+        It may be let go to several at once, who take turns at the node. Raises NodeBusyError where its session did not
+        end in order within :data:`LETTING_GO` seconds; then it is measured on.
+        """
+        with self._lending:
+            if loan.ended:
+                return False
+            job = self._job_of(loan.uuid)
+            if job is None:  # and nobody begins to meanwhile
+                self._loans.setdefault(loan.uuid, []).append(loan)
+                return False
+            if job.kept.frozen:
+                raise FrozenError(
+                    f"Node {loan.uuid} is in a frozen measurement ({job.kept.id}).", hint="End the measurement first."
+                )
+            self._loans.setdefault(loan.uuid, []).append(loan)
+            if job.let_go(bytes.fromhex(loan.uuid), loan.why, LETTING_GO):
+                return True
+        self.give_back(loan)
+        raise NodeBusyError(
+            f"Node {loan.uuid} is being measured and was not released within {LETTING_GO:g} s.", hint="Try again."
+        )
+
+    def give_back(self, loan: NodeLoan) -> None:
+        """Measure it again, unless somebody else still has it."""
+        self._ask_where_it_is(bytes.fromhex(loan.uuid))
+        with self._lending:
+            loan.ended = True
+            loans = self._loans.get(loan.uuid, [])
+            if loan not in loans:
+                return
+            loans.remove(loan)
+            if loans:
+                return
+            del self._loans[loan.uuid]
+            job = self._job_of(loan.uuid)
+            if job is not None:
+                job.take_back(bytes.fromhex(loan.uuid))
+                return
+        if self._roster.seen(loan.uuid).present:
+            self.saw(loan.uuid)
+
+    def _ask_where_it_is(self, uuid: bytes) -> None:
+        """A node that was given another address does not announce it: it is asked there, as the store knows it."""
+        seen, record = self._buses.sightings.seen_at(uuid), self._station.nodes.get(uuid)
+        if seen is None or record is None or record.can_address in (None, seen.address):
+            return
+        lookout = self._buses.of(seen).lookout
+        if isinstance(lookout, CanDiscovery):
+            with suppress(LinkError):
+                lookout.ask(record.can_address, ANSWERING)
+
+    def sheet(self, uuid: str) -> Image | None:
+        """The datasheet of a node that is measured: the one that its session verified, and that nobody may change."""
+        with self.session(uuid) as trusted:
+            if trusted is None:
+                return None
+        return self._station.nodes.datasheet(bytes.fromhex(uuid))
+
+    def sinks(self) -> list[dict[str, Any]]:
+        """Every sink with what became of what it was given."""
+        with self._guard:
+            jobs = [(key, one.job) for key, one in self._running.items() if one.job is not None]
+        return [sink_json(key, sink) for key, job in jobs for sink in job.sinks]
+
+    def budget(self) -> dict[str, Any]:
+        """Messages a second that go to ROS and MQTT now, and how many are known to be carried."""
+        now, sent = time.monotonic(), sum(one["messages"] for one in self.sinks() if not one["recorder"])
+        before, count = self._messages
+        if now - before >= 1.0:
+            self._rate = max(0, sent - count) / (now - before)
+            self._messages = now, sent
+        return {"used": round(self._rate, 1), "limit": BUDGET}
+
+    def clock_error(self) -> float | None:
+        """The worst bound of a node's clock, seconds; None where nothing is measured."""
+        with self._guard:
+            reports = [report for one in self._running.values() for report in one.reports.values()]
+        found = [report.get("clock_error") for report in reports if report["state"] == "running"]
+        return max((one for one in found if one is not None), default=None)
+
+    def _json(self, one: RunningMeasurement) -> dict[str, Any]:
+        kept = one.kept
+        with self._guard:
+            left = [uuid for uuid in one.reports if uuid not in one.past] if one.newcomers is not None else []
+        return {
+            "id": kept.id,
+            "group": kept.group,
+            "match": kept.match,
+            "frozen": kept.frozen,
+            "uuids": list(one.uuids),
+            "channels": list(kept.channels),
+            "rate": kept.rate,
+            "kind": kept.kind,
+            "trigger": kept.trigger,
+            "sinks": list(kept.sinks),
+            "actuators": self._sinks.moves(kept),
+            "dead_man": kept.dead_man,
+            "created": kept.created,
+            "scalar_rate": kept.scalar_rate,
+            "owner": kept.owner,
+            "process": None if kept.pid is None else {"id": kept.pid, "started": kept.started},
+            "state": one.state,
+            "why": one.why,
+            "nodes": [
+                one.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""})
+                for uuid in (dict.fromkeys((*one.uuids, *left)) if kept.lasting else ())
+            ],
+            "files": [str(file) for sink in (one.job.sinks if one.job is not None else ()) for file in sink.files],
+        }
+
+    # -- running -----------------------------------------------------------------------------------------------------
+
+    def _begin(self, kept: KeptMeasurement) -> RunningMeasurement:
+        uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
+        one = RunningMeasurement(kept, uuids)
+        comes = kept.match is not None and not kept.frozen
+        with self._guard:
+            self._running[kept.id] = one
+        work = self._run_open if comes else self._run
+        one.thread = threading.Thread(target=work, args=(one,), name=f"begin {kept.id}", daemon=True)
+        one.thread.start()
+        return one
+
+    def _run(self, one: RunningMeasurement) -> None:
+        """Measure until it is stopped or its time is over; again from the start after its nodes were replaced."""
+        while self._run_with_members(one):
+            if not self._take_new_members(one):
+                return
+
+    def _take_new_members(self, one: RunningMeasurement) -> bool:
+        """Read again which nodes a measurement has; False if it is not kept any more, because none is left."""
+        try:
+            kept = self._station.measurements.get(one.kept.id)
+            uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
+        except NotFoundError as error:
+            self._say(one, "ended", error.message)
+            with self._guard:
+                self._running.pop(one.kept.id, None)
+            self._live.event("measurement", state="deleted", id=one.kept.id)
+            return False
+        with self._guard:
+            one.kept, one.uuids = kept, uuids
+            one.reports = {uuid: report for uuid, report in one.reports.items() if uuid in uuids}
+        return True
+
+    def _has_other_members(self, one: RunningMeasurement, job: MeasurementJob) -> bool:
+        """True if `replace` or `decommission` changed the nodes of a measurement in the store."""
+        if one.kept.match is not None or one.kept.frozen:
+            return False
+        kept = next((kept for kept in self._station.measurements.all() if kept.id == one.kept.id), None)
+        if kept is None:  # deleted by `decommission`, unless it came to its end
+            return job.kept.ends is None and not one.stop.is_set()
+        try:
+            return {uuid.hex() for uuid in self._station.measurements.nodes_of(kept)} != set(one.uuids)
+        except NotFoundError:
+            return True
+
+    def _run_with_members(self, one: RunningMeasurement) -> bool:
+        """Take the nodes, then measure; True if the measurement has other nodes now, and is to begin again."""
+        taken: list[str] = []
+        try:
+            self._wait_for_members(one)
+            for uuid in one.uuids:
+                self._wait_for_turn(one, uuid)
+                if one.stop.is_set():
+                    return False
+                taken.append(uuid)
+                self._roster.note(uuid, measurement=one.kept.id)
+            job = one.job = self._new_job(one)
+            self._say(one, "starting")
+            job.start(self._buses, self._watcher(one))
+            while job.alive and not one.stop.wait(0.5):
+                self._say(one, *_state_of(one, job))
+                if self._has_other_members(one, job):
+                    job.stop()
+                    return True
+            job.stop()
+            self._say(one, "ended")
+        except TedsProvisionError as error:
+            self._say(one, "failed", error.message)
+        finally:
+            for uuid in taken:
+                self._turns.give(uuid)
+                self._roster.note(uuid, "idle", measurement=None, report=None)
+        return False
+
+    def _who(self, kept: KeptMeasurement) -> NodeMatch | UnsignedNodes | ListedNodes:
+        if self._unverified is not None and kept.id in (UnsignedNodes.text, _ADOPTED):
+            return self._unverified if kept.id == UnsignedNodes.text else ListedNodes(self._adopted)
+        return NodeMatch.parse(kept.match or "")
+
+    def _is_for(self, uuid: str, one: RunningMeasurement) -> bool:
+        """Whether a node is another measurement's: what nobody has signed is that of what is unverified."""
+        if self._unverified is None or one.kept.id == UnsignedNodes.text:
+            return False
+        return not self._unverified.why_not(self._station, bytes.fromhex(uuid))
+
+    def _new_job(self, one: RunningMeasurement, *, unverified: bool = False) -> MeasurementJob:
+        return MeasurementJob(
+            self._station,
+            one.kept,
+            more=lambda take: self._sinks.more(one.kept, take),
+            admits=self._admits if self._sinks.moves(one.kept) else None,
+            request=MeasurementRequest(patient=True, by="ncap", unverified=unverified),
+            opened=self._sinks.open,
+        )
+
+    def _wait_for_members(self, one: RunningMeasurement) -> None:
+        """Who is meant by a frozen expression, as soon as somebody is: then they stay."""
+        if one.kept.match is None:
+            return
+        match = NodeMatch.parse(one.kept.match)
+        while not one.stop.is_set():
+            found = dict.fromkeys(uuid for uuid, *_ in self._station.keys.each_name())
+            meant = [
+                uuid
+                for uuid in found
+                if not why_not_measured(self._station, uuid)
+                and not match.why_not(self._station, uuid)
+                and self._station.nodes.datasheet(uuid) is not None
+                and self.of(uuid.hex()) is None
+            ]
+            if meant:
+                one.uuids = tuple(uuid.hex() for uuid in meant)
+                one.kept = replace(one.kept, match=None, uuids=tuple(meant), actuators=False)
+                return
+            self._say(one, "waiting", match.unknown_type(self._station) or "no known node matches")
+            one.stop.wait(1.0)
+
+    def _run_open(self, one: RunningMeasurement) -> None:
+        """Measure whoever comes until it is stopped.
+
+        One measurement whose nodes come and go, so that its recordings and topics go on: one for each node would make
+        a file each, and have no budget in common.
+        """
+        assert one.kept.match is not None
+
+        def joined(uuid: str) -> None:
+            with self._guard:
+                one.uuids = (*one.uuids, uuid)
+                one.past.discard(uuid)
+            self._roster.note(uuid, measurement=one.kept.id)
+            if unverified:  # signed later, it is measured on by the other of the two that unverified() begins
+                self._adopted.add(bytes.fromhex(uuid))
+
+        def left(uuid: str) -> None:
+            with self._guard:
+                there = uuid in one.uuids
+                one.uuids = tuple(other for other in one.uuids if other != uuid)
+            if there:
+                self._roster.note(uuid, "idle", measurement=None, report=None)
+
+        def past(uuid: str) -> None:
+            with self._guard:
+                one.past.add(uuid)
+
+        def waiting(uuid: str, why: str) -> None:
+            with self._guard:
+                one.past.discard(uuid)
+            one.reports[uuid] = {"uuid": uuid, "state": "waiting", "why": why}
+            self._live.event("measurement", state="waiting", id=one.kept.id, uuid=uuid, why=why)
+
+        try:
+            unverified = one.kept.id == UnsignedNodes.text
+            job = one.job = self._new_job(one, unverified=unverified)
+            live = [sink for sink in job.sinks if not sink.recorder]  # a file takes what comes: no budget is for it
+            newcomers = DynamicMembership(
+                self._station,
+                self._roster,
+                self._turns,
+                self._buses,
+                job,
+                self._who(one.kept),
+                elsewhere=lambda uuid: self.of(uuid) is not None or uuid in self._loans or self._is_for(uuid, one),
+                joined=joined,
+                left=left,
+                waiting=waiting,
+                past=past,
+                budget=BUDGET if live else None,
+                rows=any(sink.wants_rows for sink in live),
+            )
+            one.newcomers = newcomers
+        except TedsProvisionError as error:
+            self._say(one, "failed", error.message)
+            return
+        self._say(one, "starting")
+        job.start(self._buses, self._watcher(one))
+        unknown = NodeMatch.parse(one.kept.match).unknown_type(self._station)
+        try:
+            while job.alive and not one.stop.is_set():
+                newcomers.work()
+                self._say(one, *_state_of_open(one, job, unknown))
+        finally:
+            job.stop()
+            newcomers.end()
+            self._say(one, "ended")
+
+    def _wait_for_turn(self, one: RunningMeasurement, uuid: str) -> None:
+        while not one.stop.is_set():
+            try:
+                self._turns.take(uuid, f"measurement {one.kept.id}", frozen=True)
+                return
+            except TedsProvisionError as error:
+                self._say(one, "waiting", error.message)
+                one.stop.wait(1.0)
+
+    def _end(self, one: RunningMeasurement) -> None:
+        thread = one.thread
+        if thread is not None:
+            thread.join(20.0)
+        with self._guard:
+            self._running.pop(one.kept.id, None)
+
+    def _say(self, one: RunningMeasurement, state: str, why: str = "") -> None:
+        if (one.state, one.why) != (state, why):
+            one.state, one.why = state, why
+            self._live.event("measurement", state=state, id=one.kept.id, group=one.kept.group, why=why)
+
+    # -- what it hears -----------------------------------------------------------------------------------------------
+
+    def _watcher(self, one: RunningMeasurement) -> Watcher:
+        def report(said: NodeReport) -> None:
+            self._report(one, said)
+
+        def facts(said: Sequence[ChannelFacts]) -> None:
+            self._live.learn(said)
+            for uuid in {fact.uuid for fact in said}:
+                self._roster.show_sheet(uuid, None)
+                self._roster.refresh([uuid])
+
+        def sink(failed: Sink) -> None:
+            self._live.event("sink", **sink_json(one.kept.id, failed))
+
+        def note(text: str) -> None:
+            self._live.event("measurement", state="note", id=one.kept.id, why=text)
+
+        def read(uuid: bytes) -> None:
+            self._roster.refresh([uuid.hex()])
+            self._roster.note(uuid.hex(), "verified", looked=time.time())
+
+        return Watcher(self._live.block, facts, report, sink, note, read)
+
+    def _report(self, one: RunningMeasurement, said: NodeReport) -> None:
+        names = ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid", "clock_error")
+        report = {name: getattr(said, name) for name in names}
+        report["invalid_why"] = [asdict(one) for one in said.invalid_why]
+        before = one.reports.get(said.uuid, {})
+        one.reports[said.uuid] = report
+        changed = (before.get("state"), before.get("why")) != (said.state, said.why)
+        if changed:
+            self._tell_who_comes(one, said, before.get("state"))
+        facts: dict[str, Any] = {"report": report}
+        if said.state == "running":
+            facts |= {"present": True, "seen": time.time(), "problem": None}
+            if before.get("state") != "running":
+                facts |= {"heard": None, "looked": time.time()}  # in a session: what it said outside one is past
+        elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, one):
+            facts["problem"] = as_problem(TedsProvisionError(said.why))
+        if changed:
+            self._roster.refresh([said.uuid])
+        self._roster.note(said.uuid, said.state if changed else None, **facts)
+        if changed and one.job is not None and not one.stop.is_set() and one.newcomers is None:
+            self._say(one, *_state_of(one, one.job))
+
+    def _is_of(self, uuid: str, one: RunningMeasurement) -> bool:
+        """Whether a node is this measurement's, or nobody's: what one that it has left says of it is past."""
+        return self.of(uuid) in (None, one.kept.id)
+
+    def _tell_who_comes(self, one: RunningMeasurement, said: NodeReport, before: str | None) -> None:
+        """An event for each node that begins to be measured, is not any more, or waits, and why."""
+        if said.state == "running" and before != "running":
+            state = "joined"
+        elif said.state != "running" and before == "running":
+            state = "left"
+        elif said.state in ("waiting", "refused") and said.why:
+            state = "waiting"
+        else:
+            return
+        ended = state == "left" and one.stop.is_set()
+        why = said.why or ("the measurement ended" if ended else "")
+        self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=why)
+
+
+def _state_of_open(one: RunningMeasurement, job: MeasurementJob, unknown: str) -> tuple[str, str]:
+    if any(one.reports.get(uuid, {}).get("state") == "running" for uuid in one.uuids):
+        return "running", ""
+    if job.error is not None:
+        return "waiting", job.error.message
+    taken = one.newcomers.taken if one.newcomers is not None else 0
+    if taken:
+        return "waiting", f"{taken} matching node{'s are' if taken > 1 else ' is'} measured by another measurement"
+    return "waiting", (unknown if not one.reports else "") or "no matching node is present"
+
+
+def _state_of(one: RunningMeasurement, job: MeasurementJob) -> tuple[str, str]:
+    states = {report["state"] for report in one.reports.values()}
+    if "running" in states:
+        lacking = [uuid for uuid in one.uuids if one.reports.get(uuid, {}).get("state") != "running"]
+        return "running", f"{len(lacking)} of {len(one.uuids)} nodes are missing" if lacking else ""
+    if job.error is not None:
+        return "waiting", job.error.message
+    refused = sum(report["state"] == "refused" for report in one.reports.values())
+    if refused:
+        return "waiting", f"{refused} of {len(one.uuids)} nodes are refused"
+    return ("waiting", "no node has answered yet") if states else ("starting", "")

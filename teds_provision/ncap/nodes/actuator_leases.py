@@ -1,0 +1,347 @@
+"""Actuators: a set point is held for as long as it was asked for, then let go, and the node says that it is safe.
+
+What keeps an actuator moving is that somebody asks again. Each request holds it for some tenths of a second or some
+seconds; when the next one does not come (the page is closed, the browser died, the network is gone) the daemon lets go,
+and when the daemon dies the node's dead-man does (operation.md section 2). One thread for each actuator that is held.
+"""
+
+from __future__ import annotations
+
+import contextvars
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from teds_provision.api.bodies import LONGEST_HOLD
+from teds_provision.errors import (
+    LinkError,
+    NodeBusyError,
+    NodeRefusedError,
+    NoNodeError,
+    StoreError,
+    TedsProvisionError,
+)
+from teds_provision.links.ports import Notice
+from teds_provision.measure.blocks import SetPointCommand
+from teds_provision.measure.held_actuator import HeldActuator
+from teds_provision.measure.standing import NodeStanding, require_whitelisted
+from teds_provision.measure.verified_session import DEAD_MAN, VerifiedSession, open_trusted
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.nodes.node_jobs import NodeJobs, NodeLocks
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation, SessionLostError
+
+HOLD: Final = 1.0  # seconds, where a request does not say
+_STARTING: Final = 15.0
+_OPENING, _LOOK = 5.0, 0.05  # seconds for a session that is being opened, and between looks at it
+Measured = Callable[[str], AbstractContextManager[VerifiedSession | None]]
+
+
+@dataclass
+class _SetPointOrder:
+    value: float
+    unit: str | None
+    number: int
+
+
+@dataclass
+class _HeldActuator:
+    uuid: str
+    channel: int
+    until: float
+    order: _SetPointOrder
+    news: threading.Condition = field(default_factory=threading.Condition)
+    applied: dict[str, Any] | None = None
+    answered: int = 0
+    error: TedsProvisionError | None = None
+    safe: bool | None = None
+    ended: bool = False
+    let_go: bool = False  # it is on its way to its safe state: no later order is for this one
+    crossed: bool = False
+    before: _HeldActuator | None = None  # the same actuator, which is being let go still
+
+
+@dataclass
+class _SharedSession:
+    """The session of a node that is not measured, for all of its actuators that are held."""
+
+    turn: threading.RLock = field(default_factory=threading.RLock)
+    users: int = 0
+    trusted: VerifiedSession | None = None
+    stack: ExitStack = field(default_factory=ExitStack)
+
+    @contextmanager
+    def session(self, _uuid: str) -> Iterator[VerifiedSession | None]:
+        """One exchange at a time."""
+        with self.turn:
+            yield self.trusted
+
+
+class ActuatorLeases:
+    """The actuators that are held now, with a ``dead_man`` in ms.
+
+    ``measured`` gives the session of a node that is being measured.
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        live: Live,
+        desk: NodeJobs,
+        turns: NodeLocks,
+        measured: Measured,
+        is_measured: Callable[[str], bool],
+        *,
+        dead_man: int = DEAD_MAN,
+    ) -> None:
+        self._station, self._live, self._desk, self._turns = station, live, desk, turns
+        self._measured, self._is_measured, self._dead_man = measured, is_measured, dead_man
+        self._held: dict[tuple[str, int], _HeldActuator] = {}
+        self._shared: dict[str, _SharedSession] = {}
+        self._last: dict[tuple[str, int], dict[str, Any]] = {}
+        self._guard = threading.Lock()
+
+    def state(self, uuid: str, channel: int) -> dict[str, Any] | None:
+        """What an actuator was told last, and whether it is known to be safe."""
+        return self._last.get((uuid, channel))
+
+    def admits(self, command: SetPointCommand) -> bool:
+        """Whether a set point that came by a topic may pass: not while a request holds its actuator. Told once."""
+        with self._guard:
+            held = self._held.get((command.uuid, command.channel))
+        if held is None or held.ended:
+            return True
+        if not held.crossed:
+            held.crossed = True
+            self._live.event("actuator", uuid=command.uuid, state="refused", channel=command.channel,
+                             why="A set point arrived by topic while a request holds the actuator.")  # fmt: skip
+        return False
+
+    def put(self, uuid: str, channel: int, value: float, unit: str | None, hold: float | None) -> dict[str, Any]:
+        """Set and hold for ``hold`` seconds; again before they are over, it is held on. Returns when it was applied.
+
+        Raises PolicyError (whitelist, limits of the datasheet), NodeRefusedError (claimed by another), NoNodeError,
+        BadDataError.
+        """
+        try:
+            require_whitelisted(self._station, bytes.fromhex(uuid))
+        except TedsProvisionError as error:
+            with suppress(StoreError):
+                facts = {"channel": channel, "value": value, "unit": unit or "", "why": error.message}
+                self._station.audit("set", bytes.fromhex(uuid), error.code, **facts)
+            raise
+        seconds = HOLD if hold is None else min(hold, LONGEST_HOLD)
+        held, mine = self._ordered(uuid, channel, value, unit, seconds)
+        with held.news:
+            held.news.wait_for(lambda: held.answered >= mine or held.ended, _STARTING)
+            return self._answer(held, mine, seconds)
+
+    def _ordered(
+        self, uuid: str, channel: int, value: float, unit: str | None, seconds: float
+    ) -> tuple[_HeldActuator, int]:
+        """Give the order to the thread of this actuator, a new one where there is none; and its number there."""
+        while True:
+            held, fresh = self._held_for(uuid, channel, value, unit)
+            with held.news:
+                if held.let_go and not fresh:
+                    continue  # since we looked
+                held.until = time.monotonic() + seconds + (_STARTING if fresh else 0.0)
+                held.order = _SetPointOrder(value, unit, held.order.number + (not fresh))
+                held.news.notify_all()
+                if fresh:
+                    who = contextvars.copy_context()  # on whose word, for the audit log
+                    work = (self._run, held, value, unit)
+                    threading.Thread(target=who.run, args=work, name=f"hold {held.uuid[:8]}", daemon=True).start()
+                return held, held.order.number
+
+    def _held_for(self, uuid: str, channel: int, value: float, unit: str | None) -> tuple[_HeldActuator, bool]:
+        """The actuator as it is held now, or a new one; and whether it is new."""
+        key = (uuid, channel)
+        with self._guard:
+            held = self._held.get(key)
+            if held is not None and not held.let_go:
+                return held, False
+            held = self._held[key] = _HeldActuator(uuid, channel, 0.0, _SetPointOrder(value, unit, 1), before=held)
+            return held, True
+
+    @staticmethod
+    def _answer(held: _HeldActuator, mine: int, seconds: float) -> dict[str, Any]:
+        if held.error is not None and held.answered <= mine:
+            raise held.error
+        if held.let_go and held.answered < mine:
+            raise NodeBusyError("The actuator was released before it took this value.", hint="Set it again.")
+        if held.answered < mine or held.applied is None:
+            raise LinkError("The actuator did not answer in time.", hint="Its dead-man takes it to its safe state.")
+        held.until = time.monotonic() + seconds
+        return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
+
+    def let_go(self, uuid: str, channel: int) -> dict[str, Any]:
+        """Let go now; ``safe`` is what the node itself said, None where it did not say."""
+        with self._guard:
+            held = self._held.get((uuid, channel))
+        if held is None:
+            last = self._last.get((uuid, channel))
+            return {"applied": None, "until": None, "safe": last["safe"] if last else None}
+        with held.news:
+            held.let_go = True
+            held.news.notify_all()
+            held.news.wait_for(lambda: held.ended, _STARTING)
+            return {"applied": held.applied, "until": None, "safe": held.safe}
+
+    def end(self) -> None:
+        """Let go of all of them, in order."""
+        with self._guard:
+            every = list(self._held)
+        for uuid, channel in every:
+            self.let_go(uuid, channel)
+
+    # -- the thread of one actuator ----------------------------------------------------------------------------------
+
+    def _run(self, held: _HeldActuator, value: float, unit: str | None) -> None:
+        node, facts = bytes.fromhex(held.uuid), {"channel": held.channel}
+        try:
+            self._station.audit("set", node, "begun", value=value, unit=unit or "", **facts)
+            with self._session(held.uuid) as session:
+                self._wait_for_the_one_before(held)
+                self._hold(held, session)
+        except SessionLostError as lost:
+            held.error = LinkError(f"The session was lost: {lost.cause.message}", hint="It goes to its safe state.")
+        except TedsProvisionError as error:
+            held.error = error
+        finally:
+            outcome = "done" if held.error is None else held.error.code
+            with suppress(StoreError):  # a full disk must not keep who waits for this waiting
+                asked = {"value": held.order.value, "unit": held.order.unit or ""}
+                why = {} if held.error is None else {"why": held.error.message}
+                self._station.audit("set", node, outcome, safe=held.safe, **asked, **why, **facts)
+            self._tell(held, safe=held.safe)
+            with self._guard:
+                if self._held.get((held.uuid, held.channel)) is held:  # not the one after it
+                    del self._held[held.uuid, held.channel]
+            with held.news:
+                held.ended = held.let_go = True
+                held.news.notify_all()
+
+    @contextmanager
+    def _session(self, uuid: str) -> Iterator[Measured]:
+        """How to get at the node's session, again and again: the measurement's, or one of our own."""
+        if self._is_measured(uuid):
+            yield self._measured
+            return
+        with self._guard:
+            shared = self._shared.setdefault(uuid, _SharedSession())
+        with shared.turn:
+            if not shared.users:
+                shared.trusted = shared.stack.enter_context(self._own_session(uuid))
+            shared.users += 1
+        try:
+            yield shared.session
+        finally:
+            with shared.turn:
+                shared.users -= 1
+                if not shared.users:
+                    shared.trusted = None
+                    shared.stack.close()
+
+    @contextmanager
+    def _own_session(self, uuid: str) -> Iterator[VerifiedSession]:
+        contact = self._desk.contact(uuid)
+        if contact is None:
+            raise NoNodeError(f"Node {uuid} is not on any bus of this station.", hint="Connect it to a bus.")
+        with self._turns.of(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
+            yield open_trusted(self._station, node, by="ncap")
+
+    def _hold(self, held: _HeldActuator, session: Measured) -> None:
+        """Claim, feed until it is let go or nobody asks again, let go."""
+        actuator: HeldActuator | None = None
+        unit: str | None = None
+        answered = 0
+        standing = NodeStanding(self._station, bytes.fromhex(held.uuid))
+        standing.drives = True
+        self._until_there(held, session)
+        try:
+            while True:
+                with held.news:
+                    order = held.order
+                    if time.monotonic() >= held.until and answered >= order.number:
+                        held.let_go = True
+                    if held.let_go:  # whoever asks from now on has it claimed anew
+                        return
+                standing.require()
+                with session(held.uuid) as trusted:
+                    if trusted is None:
+                        raise LinkError("The node is not connected now.", hint="Connect it to a bus.")
+                    if actuator is None or order.unit != unit:
+                        actuator, unit = self._claimed(trusted, held, order, again=actuator is not None), order.unit
+                    applied = actuator.apply(order.value)
+                answered = order.number
+                with held.news:
+                    held.applied, held.answered = applied.as_json(), order.number
+                    held.news.notify_all()
+                self._tell(held, safe=False)
+                self._until_news(held, answered, actuator.pause)
+        finally:
+            if actuator is not None:
+                with session(held.uuid):
+                    actuator.__exit__(None, None, None)
+                held.safe = actuator.safe
+
+    @staticmethod
+    def _wait_for_the_one_before(held: _HeldActuator) -> None:
+        """Its claim ends first: two of one session cannot have an actuator, and it says that it is safe."""
+        before, held.before = held.before, None
+        if before is not None:
+            with before.news:
+                before.news.wait_for(lambda: before.ended, _STARTING)
+
+    @staticmethod
+    def _until_there(held: _HeldActuator, session: Measured) -> None:
+        """A measurement that was begun just now is opening its session."""
+        end = time.monotonic() + _OPENING
+        while time.monotonic() < end and not held.let_go:
+            with session(held.uuid) as trusted:
+                if trusted is not None:
+                    return
+            with held.news:
+                held.news.wait_for(lambda: held.let_go, _LOOK)
+
+    def _claimed(
+        self, trusted: VerifiedSession, held: _HeldActuator, order: _SetPointOrder, *, again: bool
+    ) -> HeldActuator:
+        """The actuator, claimed; the limits are looked at before anything is claimed."""
+        actuator = HeldActuator(trusted, held.channel, unit=order.unit, dead_man=self._dead_man)
+        actuator.octets_of(order.value)
+        if not again:
+            try:
+                actuator.__enter__()
+            except NodeRefusedError as refusal:
+                if refusal.reason != Reason.WRONG_STATE:
+                    raise
+                # It is claimed in this very session: by the set points of a topic, which only a measurement takes.
+                raise NodeBusyError(
+                    f"Channel {held.channel} is controlled by set points from a topic.",
+                    hint="Stop the publisher, then try again.",
+                ) from refusal
+        return actuator
+
+    @staticmethod
+    def _until_news(held: _HeldActuator, answered: int, pause: float) -> None:
+        """Wait until the value has to be sent again, there is another one, or it is to be let go."""
+        with held.news:
+            left = max(0.0, min(pause, held.until - time.monotonic()))
+            held.news.wait_for(lambda: held.let_go or held.order.number != answered, left)
+
+    def _tell(self, held: _HeldActuator, *, safe: bool | None) -> None:
+        applied = held.applied or {}
+        facts = {"value": applied.get("value"), "unit": applied.get("unit"), "safe": safe}
+        self._last[held.uuid, held.channel] = facts
+        self._live.event("actuator", uuid=held.uuid, state="held" if safe is False else "released",
+                         channel=held.channel, **facts)  # fmt: skip
+
+
+def _quiet(_notice: Notice) -> None:
+    """The request answers."""

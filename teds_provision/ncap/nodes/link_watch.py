@@ -1,0 +1,455 @@
+"""A thread for each link: it opens it, again and again if need be, and sees who comes and who leaves.
+
+A bus is asked by the look-out that measurements use as well, and its nodes are looked at by a few workers; at a reader
+the tap is served there and then, because the node may be taken away.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+from teds_provision.errors import AddressConflictError, FrozenError, LinkError, NodeBusyError, TedsProvisionError
+from teds_provision.links import Contact, Notice, Port, Trace
+from teds_provision.links.ble.port import BlePort
+from teds_provision.links.can.port import CanPort
+from teds_provision.links.opening import open_place
+from teds_provision.measure.buses import Buses
+from teds_provision.measure.discovery import POLL
+from teds_provision.measure.presence import Sighting
+from teds_provision.measure.sources import sole_user
+from teds_provision.measure.standing import is_listed
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.nodes.directory import NodeDirectory
+from teds_provision.ncap.nodes.inspection import NodeInspection, as_problem, look, read_anew
+from teds_provision.ncap.nodes.node_jobs import NodeLocks
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation, SessionLostError
+
+# Whether a node that was seen on a bus is still there: it is asked itself, twice, before it is said to have left.
+#
+# Everybody is asked every 30 s only (operation.md section 7), and on a busy machine an answer to that may come too
+# late. So a node that was silent for CHECK seconds gets an Identify of its own: at most MAX_PARALLEL a second, once in
+# 10 s each, the bound that the contract sets for nodes that announce themselves.
+
+CHECK: Final = 10.0
+MAX_PARALLEL: Final = 5
+PATIENCE: Final = (1.0, 3.0)  # seconds for the answer to the first question, and to the second
+
+
+class PresenceCheck:
+    """Asks the nodes of one bus. ``held`` says of whom others hear meanwhile: who is measured, or worked with."""
+
+    def __init__(self, port: CanPort, held: Callable[[str], bool]) -> None:
+        self._port, self._held = port, held
+        self._asked: dict[str, float] = {}
+        self._last = 0.0
+
+    def look(self, known: Mapping[str, Sighting]) -> Iterator[tuple[str, Sighting | None]]:
+        """Ask those whose turn has come: each with what it says now, None where it no longer answers."""
+        now = time.monotonic()
+        if now - self._last < 1.0:
+            return
+        due = [uuid for uuid, last in known.items() if now - max(last.at, self._asked.get(uuid, 0.0)) >= CHECK]
+        due.sort(key=lambda uuid: known[uuid].at)
+        silent = [uuid for uuid in due if not self._held(uuid)][:MAX_PARALLEL]
+        self._asked = {uuid: at for uuid, at in self._asked.items() if uuid in known} | dict.fromkeys(silent, now)
+        if not silent:
+            return
+        self._last = now
+        with ThreadPoolExecutor(len(silent), thread_name_prefix="still there") as askers:
+            yield from zip(silent, askers.map(self._ask, [known[uuid] for uuid in silent]), strict=True)
+
+    def _ask(self, last: Sighting) -> Sighting | None:
+        for seconds in PATIENCE:
+            try:
+                first = seconds == PATIENCE[0]
+                identity = self._port.identify(last.address, seconds=seconds, until_announced=first)
+            except AddressConflictError:  # somebody is there, and that two are is told by whoever finds out
+                return Sighting(last.identity, last.address, last.port, time.monotonic())
+            except LinkError:
+                return None
+            if identity is not None:
+                same = identity.uuid == last.uuid
+                return Sighting(identity, last.address, last.port, time.monotonic()) if same else None
+        return None
+
+
+_log = logging.getLogger(__name__)
+WORKERS: Final = 4
+STRANGERS: Final = 2
+"""Threads that look at nodes which are not on the whitelist: those that are on it never wait for a stranger."""
+MOST_KNOWN: Final = 512
+"""Nodes that are taken to be on a bus: it has 239 addresses, but anybody may say another UUID each time."""
+TELL_STRANGERS: Final = 10.0  # seconds between two words about how many strangers there are
+FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
+LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
+POLL_AIR: Final = 15.0
+GONE_POLLS: Final = 2.5
+LENDING: Final = 10.0
+LOOK: Final = 0.5
+
+
+class NodeObserver(Protocol):
+    """Who wants to know of a node that lies on a reader, or answers on a bus."""
+
+    def serve_node(self, node: Conversation) -> bool:
+        """Do what was asked for with this node; False where nothing was."""
+
+
+@dataclass
+class LinkState:
+    """A link as the API shows it."""
+
+    place: str
+    state: str = "opening"
+    problem: dict[str, str] | None = None
+    waiting: str = ""
+    since: float = field(default_factory=time.time)
+    told: str = ""
+
+
+class LinkWatch:
+    """Watches one link until ``stop``."""
+
+    def __init__(
+        self,
+        place: str,
+        station: Station,
+        roster: NodeDirectory,
+        live: Live,
+        turns: NodeLocks,
+        taps: NodeObserver,
+        transparent: Callable[[], bool],
+        buses: Buses,
+        trace: Trace | None = None,
+    ) -> None:
+        self.place = place
+        self.state = LinkState(place)
+        self.port: Port | None = None
+        self._station, self._roster, self._live, self._turns = station, roster, live, turns
+        self._taps, self._transparent, self._buses = taps, transparent, buses
+        self._trace = trace
+        self._known: dict[str, Sighting] = {}
+        self._looked_for: set[str] = set()  # asked for anew: to be looked at when they answer
+        self._stop, self._anew = threading.Event(), threading.Event()
+        self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
+        self._for_strangers = ThreadPoolExecutor(STRANGERS, thread_name_prefix=f"stranger {place[:20]}")
+        self._for_rest = ThreadPoolExecutor(1, thread_name_prefix=f"rest {place[:20]}")
+        self._strangers_told, self._strangers_at = 0, -TELL_STRANGERS
+        self._pending: set[str] = set()
+        self._guard = threading.Lock()
+        self._borrowers: set[int] = set()
+        self._free = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"watch {place}", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask it to end; see :meth:`join`."""
+        self._stop.set()
+        self._anew.set()
+
+    def join(self, seconds: float) -> None:
+        """Wait for its end, and close the link."""
+        self._thread.join(seconds)
+        for workers in (self._workers, self._for_strangers, self._for_rest):
+            workers.shutdown(wait=False, cancel_futures=True)
+        port, self.port = self.port, None
+        if port is not None:
+            port.close()
+
+    def look_at_all(self) -> None:
+        """Ask everyone now, and look at each of them anew."""
+        self._anew.set()
+
+    # -- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE
+        while True:
+            self._anew.clear()  # who stops or borrows after it is heard by what waits, who did before is seen here
+            if self._stop.is_set():
+                return
+            if self._borrowers:
+                self._lend()
+                continue
+            try:
+                if self.port is None:
+                    self.port = open_place(self.place, self._trace)
+                    pause = FIRST_PAUSE
+                self._say("up")
+                self._watch(self.port)
+            except TedsProvisionError as error:
+                self._down(error)
+            except Exception:  # noqa: BLE001 - a bug here must not end the watch on a link for good
+                _log.exception("Watching %s failed; starting again.", self.place)
+                self._down(TedsProvisionError("This link failed unexpectedly.", hint="See the log."))
+            if self.port is None:
+                self._anew.wait(pause)
+                pause = min(2 * pause, LAST_PAUSE)
+
+    def _down(self, error: TedsProvisionError) -> None:
+        self._say("down", error)
+        self._roster.forget_place(self.place)
+        self._close()
+
+    def _watch(self, port: Port) -> None:
+        """See who comes until the link fails or the daemon ends."""
+        if isinstance(port, CanPort):
+            with sole_user(self._station, [port], "ncap run"):
+                self._watch_bus(port, POLL)
+        elif isinstance(port, BlePort):
+            self._watch_bus(port, POLL_AIR)
+        else:
+            self._watch_reader(port)
+
+    def _watch_reader(self, port: Port) -> None:
+        for contact in port.watch(stop=self._anew, notice=self._notice):
+            self._came(contact)
+
+    def _watch_bus(self, port: CanPort | BlePort, poll: float) -> None:
+        """The look-out tells of who answers (:meth:`saw`); here is seen who does not any more, and whether it works."""
+        bus = self._buses.add(port)
+        bus.lookout.poll(poll)
+        asked = PresenceCheck(port, self._is_held) if isinstance(port, CanPort) else None
+        while not self._stop.is_set():
+            if self._anew.is_set():
+                self._anew.clear()
+                self._look_for_all()
+                with suppress(LinkError):
+                    bus.lookout.discover()
+            failure = bus.lookout.failure
+            self._say("up" if failure is None else "down", failure)
+            if isinstance(port, CanPort) and failure is None:
+                port.tell_of_rivals(self._notice)
+            if asked is not None and failure is None:
+                for uuid, sighting in asked.look(dict(self._known)):
+                    if sighting is not None:
+                        self.saw(sighting)
+                    elif not self._is_held(uuid):
+                        self._gone(uuid)
+            else:
+                self._see_who_left(GONE_POLLS * POLL_AIR)
+            self._tell_of_strangers()
+            self._anew.wait(LOOK)
+
+    def _look_for_all(self) -> None:
+        """Look at all who answer from now on; who does not is still known, and so is seen to leave."""
+        self._looked_for = set(self._known)
+
+    def _is_held(self, uuid: str) -> bool:
+        return self._turns.holder(uuid) is not None
+
+    def saw(self, sighting: Sighting) -> None:
+        """A node answered on this bus; called from the look-out's thread."""
+        uuid, identity = sighting.uuid.hex(), sighting.identity
+        before = self._known.pop(uuid, None)  # who was seen last stands last
+        self._known[uuid] = sighting
+        if len(self._known) > MOST_KNOWN:
+            oldest, *_ = list(self._known)
+            self._gone(oldest)
+        if before is not None:
+            seen = self._roster.seen(uuid)
+            here = seen.place == self.place  # it may have been on another bus meanwhile
+            same = here and (before.address, before.identity.state) == (sighting.address, identity.state)
+            retry = seen.problem is not None and abs(time.time() - seen.seen) > LOOK_AGAIN
+            if same and not retry and uuid not in self._looked_for:
+                return
+        self._looked_for.discard(uuid)
+        self._came(sighting.contact())
+
+    def _see_who_left(self, silence: float) -> None:
+        now = time.monotonic()
+        for uuid, last in list(self._known.items()):
+            if now - last.at >= silence:
+                self._gone(uuid)
+
+    def _gone(self, uuid: str) -> None:
+        self._known.pop(uuid, None)
+        text = f"Node {uuid} no longer answers."
+        self._notice(Notice("node-left", text, uuid=bytes.fromhex(uuid)))
+
+    # -- a reader is one command's at a time ---------------------------------------------------------------------------
+
+    def borrow(self, who: object) -> bool:
+        """Lend the reader to a command of this machine until it is given back; False where this is no reader."""
+        if not self.place.startswith("nfc:"):
+            return False
+        self._borrowers.add(id(who))
+        self._anew.set()
+        self._free.wait(LENDING)
+        return True
+
+    def give_back(self, who: object) -> None:
+        """The command has ended."""
+        self._borrowers.discard(id(who))
+
+    def _lend(self) -> None:
+        """Close the reader for as long as somebody has it."""
+        self._close()
+        self._roster.forget_place(self.place)
+        self._say("lent")
+        self._free.set()
+        while self._borrowers and not self._stop.is_set():
+            while self._borrowers and not self._stop.wait(0.1):
+                pass
+            self._free.clear()
+            if self._borrowers:  # who came in that instant was told that the reader is free
+                self._free.set()
+
+    def _close(self) -> None:
+        port, self.port = self.port, None
+        if port is not None:
+            port.close()
+
+    def _notice(self, notice: Notice) -> None:
+        if notice.kind == "node-left" and notice.uuid is not None:
+            self._left(notice.uuid.hex())
+        elif notice.kind == "reader-lost":
+            self._say("down", LinkError(notice.text))
+            self._roster.forget_place(self.place)
+        elif notice.kind == "reader-ready":
+            self._say("up")
+        elif notice.kind == "waiting":
+            self.state.waiting = notice.text
+        elif notice.kind != "retry":
+            self._tell(notice)
+
+    def _left(self, uuid: str) -> None:
+        if self._roster.stranger(self.place, uuid, there=False) or self._turns.holder(uuid) is not None:
+            return
+        if self._roster.seen(uuid).place == self.place:  # else it was carried to another link
+            self._roster.note(uuid, "left", present=False)
+
+    def _tell(self, notice: Notice) -> None:
+        """Something else that a person should know of, once."""
+        if notice.text != self.state.told:
+            self.state.told = notice.text
+            self._live.event("link", place=self.place, state=notice.kind, text=notice.text)
+
+    def _say(self, state: str, error: TedsProvisionError | None = None) -> None:
+        problem = as_problem(error) if error is not None else None
+        if (self.state.state, self.state.problem) != (state, problem):
+            self.state.state, self.state.problem, self.state.since = state, problem, time.time()
+            self._live.event("link", place=self.place, state=state, problem=problem)
+
+    # -- nodes -------------------------------------------------------------------------------------------------------
+
+    def _came(self, contact: Contact) -> None:
+        uuid = contact.identity.uuid.hex()
+        facts: dict[str, Any] = {
+            "place": self.place, "address": contact.address, "present": True, "seen": time.time(),
+            "says": contact.identity.state.name.lower(),
+        }  # fmt: skip
+        if contact.link.capabilities.tapped:
+            self._roster.note(uuid, "tapped", tapped=time.time(), **facts)
+            self._serve(contact)
+            return
+        if not self._wanted(contact):
+            self._roster.stranger(self.place, uuid, there=True)
+            return
+        self._roster.note(uuid, "came", **facts)
+        with self._guard:
+            if uuid in self._pending:
+                return
+            self._pending.add(uuid)
+        listed = is_listed(self._station, contact.identity.uuid)
+        (self._workers if listed else self._for_strangers).submit(self._serve_known, contact)
+
+    def _serve_known(self, contact: Contact) -> None:
+        """Look at a node whose turn has come, if it is still there."""
+        uuid = contact.identity.uuid.hex()
+        if uuid in self._known:
+            self._serve(contact)
+            if uuid not in self._known:  # it left, or others came, while it was looked at
+                self._left(uuid)
+            return
+        with self._guard:
+            self._pending.discard(uuid)
+
+    def _tell_of_strangers(self) -> None:
+        """How many there are that whitelist mode does not look at, where that is news, and not too often."""
+        count, now = self._roster.strangers(self.place), time.monotonic()
+        if count != self._strangers_told and now - self._strangers_at >= TELL_STRANGERS:
+            self._strangers_told, self._strangers_at = count, now
+            self._live.event("link", place=self.place, state="strangers", count=count)
+
+    def _wanted(self, contact: Contact) -> bool:
+        """Whether detection shows this node at all: whitelist mode shows others as a count."""
+        return self._transparent() or is_listed(self._station, contact.identity.uuid)
+
+    def _serve(self, contact: Contact) -> None:
+        uuid = contact.identity.uuid.hex()
+        try:
+            with self._turns.of(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
+                if not self._taps.serve_node(node):
+                    self._look(node)
+        except FrozenError:  # its measurement verified it, and says how it does
+            if contact.identity.state == NodeState.FACTORY:  # so it may be let go: who adopts looks at it then
+                self._looked_for.add(uuid)
+            return
+        except NodeBusyError as error:
+            self._roster.note(uuid, problem=as_problem(error))
+        except SessionLostError as lost:
+            self._roster.note(uuid, "problem", problem=as_problem(lost.cause))
+        except TedsProvisionError as error:
+            self._roster.note(uuid, "problem", problem=as_problem(error))
+        except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
+            _log.exception("Looking at node %s failed.", uuid)
+            self._roster.note(
+                uuid, "problem", problem=as_problem(TedsProvisionError("Unexpected failure: see the log."))
+            )
+        finally:
+            with self._guard:
+                self._pending.discard(uuid)
+            self._roster.refresh([uuid])
+
+    def _look(self, node: Conversation) -> None:
+        if not self._wanted(node.contact):
+            return  # a tap shows who lies there, and no more
+        found: NodeInspection = look(self._station, node)
+        uuid = node.uuid.hex()
+        self._roster.show_sheet(uuid, found.sheet)
+        self._roster.refresh([uuid])
+        self._roster.note(
+            uuid,
+            "verified",
+            verdict=found.judged.verified.verdict,
+            heard=found.judged.to_json() if found.judged.origin == "plain" else None,
+            looked=time.time(),
+            power=found.power,
+            problem=None,
+        )
+        if found.judged.origin == "kept" and not node.contact.link.capabilities.tapped:
+            self._for_rest.submit(self._read_rest, node.contact)
+
+    def _read_rest(self, contact: Contact) -> None:
+        """Read all of a node that has started since it was read, one node of the link at a time.
+
+        One that is measured meanwhile is read by its measurement, in what its data leave free.
+        """
+        uuid = contact.identity.uuid.hex()
+        try:
+            with (
+                self._turns.of(uuid, "the rest of its datasheet is read"),
+                Conversation(contact, notice=self._notice) as node,
+            ):
+                found = read_anew(self._station, node)
+        except (TedsProvisionError, SessionLostError):
+            return  # it was not read: what is shown stays as it was kept, and is read at the next look
+        except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
+            _log.exception("Reading the rest of node %s failed.", uuid)
+            return
+        self._roster.refresh([uuid])
+        if found is not None:
+            self._roster.note(uuid, "verified", verdict=found[1].verified.verdict, looked=time.time())

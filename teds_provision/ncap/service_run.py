@@ -1,0 +1,158 @@
+"""From start to end: one daemon per home, its socket and servers, its signals, its lines on stdout."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import os
+import signal
+import socket
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+from teds_provision.client import SOCKET
+from teds_provision.errors import StoreLockedError
+from teds_provision.files import listen_alone, open_lock
+from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.settings import Settings, require_safe
+from teds_provision.ncap.web.app import build
+from teds_provision.ncap.web.guard import Guard, front
+from teds_provision.ncap.web.server import Servers, listen
+from teds_provision.station.station import Station
+from teds_provision.vault.master_socket import MasterSocket
+
+LOCK: Final = "ncap.lock"
+
+
+class DaemonLock:
+    """``with Presence(home):`` is the one daemon of this home; raises StoreLockedError if there is one, StoreError."""
+
+    def __init__(self, home: Path) -> None:
+        self._home = home
+        self._descriptor = -1
+
+    def __enter__(self) -> DaemonLock:
+        descriptor = open_lock(self._home / LOCK)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            pid = os.pread(descriptor, 20, 0).decode(errors="replace").strip()
+            os.close(descriptor)
+            raise StoreLockedError(
+                f"A base station is already running for {self._home} (pid {pid or 'unknown'}).",
+                hint="Show it: teds-provision ncap status. Stop it: kill -TERM PID.",
+            ) from None
+        with suppress(OSError):  # who holds it is for people; a full disk has its own, better messages
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        self._descriptor = descriptor
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(OSError):
+            (self._home / SOCKET).unlink()
+        with suppress(OSError):
+            os.ftruncate(self._descriptor, 0)
+        os.close(self._descriptor)
+
+    def listen(self) -> socket.socket:
+        """The listening Unix socket, for this user alone; what a killed daemon left is replaced."""
+        return listen_alone(self._home / SOCKET, 128)
+
+
+Tell = Callable[[dict[str, Any]], None]
+
+
+def run(station: Station, settings: Settings, tell: Tell) -> None:
+    """Run until SIGTERM or Ctrl-C; ``tell`` gets the line that it is ready, then a line for each event.
+
+    Raises StoreLockedError where this home has a daemon, LinkError where the address is taken, UsageError.
+    """
+    require_safe(settings)
+    station.released = lambda _uuid, _command: nullcontext()  # in this process the turns of each node see to that
+    with DaemonLock(station.home) as presence:
+        local = presence.listen()
+        tcp = listen(*settings.http) if settings.http is not None else None
+        daemon = Daemon(station, settings)
+        try:
+            with MasterSocket(station.home, station.accept_masters):
+                asyncio.run(_serve(daemon, local, tcp, tell))
+        finally:
+            for listener in (local, tcp):
+                if listener is not None:
+                    listener.close()
+
+
+async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None, tell: Tell) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, _ending(stop))
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # its terminal was closed; under nohup it is ignored
+        loop.add_signal_handler(signal.SIGHUP, stop.set)
+    servers = Servers()
+    watchdog = asyncio.create_task(_watchdog())
+    app = build(daemon)
+    early: list[dict[str, Any]] = []
+    daemon.live.told = early.append  # the first line says that it is ready
+
+    async def begin() -> None:
+        await servers.serve(Guard(app, daemon.tokens, None), local)
+        if tcp is not None:
+            host, port = tcp.getsockname()[:2]
+            tls = daemon.settings.certificate is not None
+            named = front(daemon.settings.allow, port, tls=tls)
+            await servers.serve(Guard(app, daemon.tokens, named), tcp, daemon.settings)
+            allowed = daemon.settings.allow  # on every address, people call it by the first name that is allowed
+            name = allowed[0] if allowed and host in ("0.0.0.0", "::") else host
+            daemon.url = f"{'https' if tls else 'http'}://{f'[{name}]' if ':' in name else name}:{port}"
+        socket_path = str(Path(daemon.station.home) / SOCKET)
+        links = list(daemon.settings.places)
+        tell({"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid(), "links": links})
+        daemon.live.told = tell
+        for event in early:
+            tell(event)
+        notify("READY=1")
+
+    try:
+        with daemon.running():
+            await daemon.serve(begin, stop)
+            notify("STOPPING=1")
+            await servers.stop()
+    finally:
+        watchdog.cancel()
+        await servers.stop()
+
+
+def _ending(stop: asyncio.Event) -> Callable[[], None]:
+    """The first signal ends in order, a second one at once."""
+
+    def end() -> None:
+        if stop.is_set():
+            os._exit(130)
+        stop.set()
+
+    return end
+
+
+async def _watchdog() -> None:
+    """Tell systemd that the loop lives, twice in the time that WATCHDOG_USEC allows."""
+    allowed = os.environ.get("WATCHDOG_USEC", "")
+    while allowed.isdecimal() and int(allowed) > 0:
+        notify("WATCHDOG=1")
+        await asyncio.sleep(int(allowed) / 2e6)
+
+
+def notify(state: str) -> None:
+    """Tell systemd (sd_notify): one datagram to the socket that NOTIFY_SOCKET names; without one nothing."""
+    where = os.environ.get("NOTIFY_SOCKET", "")
+    if not where.startswith(("/", "@")):
+        return
+    address = "\0" + where[1:] if where.startswith("@") else where
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+        out.sendto(state.encode(), address)

@@ -1,0 +1,149 @@
+"""One node's seat on a CAN bus: a line for each base station, its answer to everyone, its Announces.
+
+Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`StationState.answer` and
+:meth:`StationState.begin_anew` run in the line's turns.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.isotp import Pair
+from teds_provision.node.handler import JobQueue, MeasuringHandler, NodeHandler, WorkerPool
+from teds_provision.protocol.announce import AddressClaim, Announce, uuid_crc
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.repetition import Repetition
+
+_MOST_WAITING: Final = 4
+"""Requests of one station in the queue: a well-behaved one waits for each reply, so that more are of no use to it."""
+
+
+BUS: Final = "can"
+"""What stands before the colon in the names of lines: streams of one bus share a node's budget."""
+
+
+def link_name(station: int) -> str:
+    """Name of the link to a station, as sessions hang on it."""
+    return f"{BUS}:{station:02x}"
+
+
+class EndpointRequest(NamedTuple):
+    """A whole request: transaction ‖ command; whether it came by CAN FD, and its tick (0 for a node without clock)."""
+
+    body: bytes
+    fd: bool
+    received: int
+
+
+class StationState:
+    """One base station's line to one node: its own session (by name) and stored reply.
+
+    A link is one pair of addresses: with a new own address it begins anew. ``pairs`` keeps the old Pair as long as it
+    still sends.
+    """
+
+    def __init__(self, seat: CanEndpoint, station: int, turns: JobQueue) -> None:
+        self.seat, self.station, self.turns = seat, station, turns
+        self.name = link_name(station)
+        self.pairs: dict[int, Pair] = {}
+        self.waiting = 0
+        self.gone = False
+        self.replying: Pair | None = None
+        self._repetition = Repetition()
+
+    def put(self, job: Callable[[], None]) -> None:
+        """Queue a request; a station that asks on and on without waiting loses what does not fit."""
+        if self.waiting < _MOST_WAITING:
+            self.waiting += 1
+            self.turns.put(job)
+
+    def begin_anew(self) -> None:
+        """The pair of addresses is another one, or the bus was lost: session and stored reply are gone."""
+        self._repetition.forget()
+        self.seat.handler.lost(self.name)
+
+    def reply_left(self) -> None:
+        """The reply is through, or was given up: from now on it is kept for who asks again."""
+        self.replying = None
+        self._repetition.left(time.monotonic())
+
+    def answer(self, request: EndpointRequest) -> bytes:
+        """Run a request and return transaction ‖ reply; raises what the node raises."""
+        seat, body = self.seat, request.body
+
+        def run(frame: bytes) -> bytes:
+            tapped = seat.counts_as_tapped()
+            if seat.measuring is None:
+                return seat.handler.request(self.name, frame, tapped=tapped)
+            return seat.measuring.request_received(
+                self.name, frame, tapped=tapped, fd=request.fd, received=request.received
+            )
+
+        return body[:1] + self._repetition.answer(body[0], body[1:], run, now=time.monotonic())
+
+
+class CanEndpoint:
+    """One node on the bus. ``send`` puts one of its frames on the bus; ``claim`` is made anew with each start."""
+
+    def __init__(
+        self,
+        handler: NodeHandler,
+        counts_as_tapped: Callable[[], bool],
+        crew: WorkerPool,
+        send: Callable[[CanEndpoint, Frame], None],
+        measuring: MeasuringHandler | None = None,
+    ) -> None:
+        self.handler, self.counts_as_tapped, self._crew = handler, counts_as_tapped, crew
+        self._send = send
+        self.measuring = measuring
+        self.address = handler.can_address()
+        identity = Identity.decode(handler.identify())
+        self.uuid, self.max_message = identity.uuid, identity.max_message
+        self.claim = AddressClaim(uuid_crc(identity.uuid))
+        self.lines: dict[int, StationState] = {}
+        self.spoken_from: set[int] = set()
+
+    def announce(self) -> None:
+        """Announce the present address."""
+        state = Identity.decode(self.handler.identify()).state
+        announce = Announce(self.address, state, self.claim.crc)
+        self._send(self, Frame(announce.identifier, announce.encode()))
+        self.claim.announced(time.monotonic())
+
+    def pair(self, station: int, own: int) -> tuple[StationState, Pair]:
+        """The pair of ``own`` and ``station``, made where there is none yet."""
+        line = self.lines.get(station)
+        if line is None:
+            line = self.lines[station] = StationState(self, station, self._crew.turns())
+        pair = line.pairs.get(own)
+        if pair is None:
+            if line.pairs:
+                line.turns.put(line.begin_anew)
+            line.pairs = {at: old for at, old in line.pairs.items() if old.sending}
+            pair = line.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
+        return line, pair
+
+    def reply_left(self, line: StationState) -> None:
+        """The reply that left this line is through, or was given up: data may follow."""
+        line.reply_left()
+        if self.measuring is not None:
+            self.measuring.reply_left(line.name)
+
+    def move(self, address: int) -> None:
+        """Have another address from now on, because another node claimed this one: sessions of the old one end."""
+        self.handler.take_can_address(address)
+        self.address = address
+        for line in self.lines.values():
+            if line.pairs:
+                line.pairs.clear()
+                line.turns.put(line.begin_anew)
+
+    def lose_lines(self) -> None:
+        """The bus is gone: so are sessions and stored replies."""
+        lines, self.lines = self.lines, {}
+        for line in lines.values():
+            line.gone = True
+            line.turns.put(line.begin_anew)

@@ -1,0 +1,406 @@
+"""Rosters and pages into the store, and what follows from them: the fold of ``protocol/plant`` over a store's rows.
+
+Every step is one transaction and leaves a state from which the next fold goes on: some pages with their claims; then, a
+few hundred at a time, the nodes that are to be judged anew (contract/plant.md sections 2 and 3).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Final, NamedTuple
+
+from teds_provision.errors import PolicyError, TedsProvisionError
+from teds_provision.handover import deny
+from teds_provision.protocol.fingerprints import is_whole, same_key
+from teds_provision.protocol.handover.revocation import open_revocation
+from teds_provision.protocol.handover.strict_json import load_exact
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.chain import counting
+from teds_provision.protocol.plant.claim import Claim
+from teds_provision.protocol.plant.document import join, split
+from teds_provision.protocol.plant.event import Event
+from teds_provision.protocol.plant.fold import BY_CONTACT, BanStatement, LocalState, MergedClaims, view
+from teds_provision.protocol.plant.page import Page
+from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, Taking, open_roster, taking
+from teds_provision.station.station import Station
+from teds_provision.store import KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.store.tables.plant import Alarm, Chain, PageRow, RosterRow
+
+AT_ONCE: Final = 500
+"""Nodes that are judged in one transaction: others write in between."""
+EVENTS_AT_ONCE: Final = 2000
+
+
+def now() -> datetime:
+    """The clock of this station."""
+    return datetime.now(UTC)
+
+
+def require_roster(station: Station) -> Roster:
+    """The roster that counts here; raises PolicyError where no registry was joined."""
+    roster = station.plant.roster
+    if roster is None:
+        raise PolicyError(
+            "This station has joined no registry.", hint="Join one: teds-provision registry connect --files DIR"
+        )
+    return roster
+
+
+def alarm(station: Station, code: str, about: str, n: int, why: str) -> None:
+    """Keep an alarm; one that is there already keeps its time. Other stations are told of a new one."""
+    with station.transaction():
+        if station.plant.tables.put_alarm(Alarm(code, about, n, why)):
+            station.audit("registry", None, f"alarm: {code}", about=about[:16], n=n, why=why)
+            station.plant.tell("alarm", code=code, about=about or None, n=n)
+
+
+# -- rosters -----------------------------------------------------------------------------------------------------------
+
+
+def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster, Taking, str]]:
+    """Take the best of the rosters that somebody carries; those that the CA did not sign are passed over.
+
+    Everything that follows from a roster (who counts, up to which page) is brought in order in its transaction. Returns
+    what was taken or refused, and why; two rosters of one version are an alarm.
+    """
+    joined = station.plant.joined
+    registry = joined.registry if joined is not None else ""
+    told: list[tuple[Roster, Taking, str]] = []
+    read: dict[str, Roster] = {}
+    for octets in found:
+        try:
+            roster = open_roster(octets, station.ca)
+        except TedsProvisionError:  # a post holds what anybody put there
+            continue
+        if roster.registry == registry:
+            read.setdefault(roster.hash, roster)
+    known = {row.hash for row in station.plant.tables.rosters()}
+    for roster in sorted(read.values(), key=lambda one: (one.version, one.hash)):
+        own = station.plant.roster
+        how, why = taking(roster, own, registry)
+        if roster.created > now() + MOST_AHEAD:
+            how, why = "refused", "it is dated in the future: check this machine's clock"
+        if how in ("same", "older") and (how == "same" or roster.hash in known):
+            continue
+        told.append((roster, how, why))
+        if how.startswith("taken"):
+            put_roster(station, roster)
+        elif how == "two rosters":
+            station.plant.tables.put_roster(RosterRow(roster.version, roster.hash, roster.octets, False, utc_now()))
+        if "two rosters" in how:
+            alarm(station, "two-rosters", "", roster.version, why)
+    held = station.plant.roster
+    if held is not None:  # the next version is the cure
+        for one in station.plant.tables.alarms():
+            if one.code == "two-rosters" and one.n < held.version and not one.seen:
+                station.plant.tables.end_alarm(one)
+    return told
+
+
+def put_roster(station: Station, roster: Roster) -> None:
+    """Have a roster count from now on, and bring in order which pages of each station count by it."""
+    before = station.plant.roster
+    with station.transaction():
+        mac = station.seals.note("roster", roster.hash)
+        station.plant.tables.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, utc_now(), mac))
+        for member in roster.members:  # so that it can be handed keys without the CA key being here
+            station.identity.keep_certificate(station.ca, member.point, member.certificate)
+        station.audit("registry", None, "roster", version=roster.version, hash=roster.hash)
+        for one, chain in station.plant.tables.chains().items():
+            if before is None or _last(before, one) != _last(roster, one):
+                recount(station, chain, roster)
+        station.plant.tables.queue_judging_of_all()
+
+
+def _last(roster: Roster, station: str) -> tuple[int, str] | None:
+    removed = roster.removed_one(station)
+    return removed.last if removed is not None else None
+
+
+# -- pages -------------------------------------------------------------------------------------------------------------
+
+
+def take_pages(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
+    """Keep pages of one station (their signatures were checked) and fold what counts of them, in one transaction."""
+    if not pages:
+        return
+    tables = station.plant.tables
+    with station.transaction():
+        chain = tables.chain(pages[0].station)
+        for page in pages:
+            tables.add_page(chain.chain, row_of(page))
+            tables.put_heads(chain.chain, page.heads)
+        fresh = recount(station, chain, roster)
+        for page in pages:
+            if (page.n, page.hash) not in fresh:  # on no branch that counts; what it bans is banned all the same
+                _keep_bans(station, chain, page.events, counts=False)
+
+
+def row_of(page: Page) -> PageRow:
+    """A page as the store keeps it."""
+    return PageRow(page.n, page.hash, page.previous, page.created, page.home, *split(page.octets))
+
+
+def recount(station: Station, chain: Chain, roster: Roster) -> set[tuple[int, str]]:
+    """Say anew which pages of a chain count, and fold them; from the first one where what was folded counts no more.
+
+    Returns the pages that were folded now.
+    """
+    tables = station.plant.tables
+    names = tables.page_names(chain.chain)
+    counts = counting(names, last=_last(roster, chain.station), accepted=chain.accepted)
+    if counts.two is not None:
+        why = "two histories part at this page" if chain.station != station.fingerprint else "of this very station"
+        alarm(station, "two-histories", chain.station, counts.two, why)
+    else:
+        tables.end_alarms("two-histories", chain.station)
+    folded = chain.folded
+    if folded[0] and folded not in counts.pages:
+        tables.forget_claims(chain.chain)
+        folded = (0, "")
+        for n, hash, _ in names:
+            if (n, hash) not in counts.pages and (page := tables.page(chain.chain, n, hash)) is not None:
+                _keep_bans(station, chain, _events_of(page), counts=False)
+    fresh = [place for place in counts.pages if place[0] > folded[0]]
+    for n, hash in fresh:
+        row = tables.page(chain.chain, n, hash)
+        assert row is not None
+        _fold_page(station, chain, n, _events_of(row))
+    if counts.newest != chain.counted or counts.newest != chain.folded:
+        tables.put_chain(replace(chain, counted=counts.newest, folded=counts.newest))
+    return set(fresh)
+
+
+def _events_of(page: PageRow) -> list[object]:
+    events = load_exact(page.content, "A page").get("events", [])
+    return events if isinstance(events, list) else []
+
+
+def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object]) -> None:
+    """Add the events of the next page that counts to what its station claims."""
+    tables = station.plant.tables
+    read = [one for one in map(event.read, values) if one is not None]
+    wrong = [one for one in read if isinstance(one, str)]
+    events = [one for one in read if isinstance(one, Event)]
+    known = tables.known_ids(chain.chain, [_number(one.id) for one in events])
+    by_node: dict[bytes, list[Event]] = {}
+    digests: list[tuple[bytes, int, bool, bytes | None]] = []
+    for one in events:
+        number = _number(one.id)
+        if number in known:
+            wrong.append(f"{one.act}: an id that stood before")
+            continue
+        known.add(number)
+        if one.act in ("signed", "vouched"):
+            digest = one.members["teds_sha256"]
+            digests.append((bytes.fromhex(digest), n, one.act == "vouched", seal_of_digest(station, chain, n, one)))
+        elif one.act == "lifted":
+            hash = one.members["of"]
+            tables.put_lifting(hash, chain.chain, station.seals.note("plant lifted", f"{hash} {chain.station}"))
+        if one.uuid is not None:
+            by_node.setdefault(one.uuid, []).append(one)
+    tables.add_ids(chain.chain, known)
+    tables.put_digests(chain.chain, digests)
+    _keep_bans(station, chain, events, counts=True)
+    there = tables.claims_of_chain(chain.chain, list(by_node))
+    claims: dict[bytes, str] = {}
+    for uuid, said in by_node.items():
+        claim = Claim.from_json(there[uuid]) if uuid in there else Claim()
+        for one in said:
+            claim.take(one)
+        claims[uuid] = claim.to_json()
+    tables.put_claims(chain.chain, claims)
+    if wrong:
+        why = f"{len(wrong)} events were skipped: {wrong[0]}"
+        alarm(station, "bad-event", chain.station, n, why)
+
+
+def _number(id: str) -> int:
+    """An event's id as SQLite keeps it: a signed integer of 64 bits."""
+    return int.from_bytes(bytes.fromhex(id), "big", signed=True)
+
+
+def seal_of_digest(station: Station, chain: Chain, n: int, one: Event) -> bytes:
+    """The seal of the row of a digest that was signed, or vouched for, on page ``n``."""
+    return station.seals.note("digest", f"{one.members['teds_sha256']} {chain.station} {n} {one.act}")
+
+
+def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, counts: bool) -> None:
+    for value in values:
+        one = value if isinstance(value, Event) else event.read(value)
+        if isinstance(one, Event) and one.act == "revoked" and one.uuid is not None:
+            text = one.members["statement"]
+            if text.isascii():
+                hash = event.hash_of_statement(text)
+                station.plant.tables.put_ban(hash, chain.chain, counts=counts, uuid=one.uuid, statement=text)
+
+
+def counted_places(station: Station, roster: Roster, chain: Chain) -> frozenset[tuple[int, str]]:
+    """Number and H of the pages of a chain that count; of another history none above where the two part."""
+    names = station.plant.tables.page_names(chain.chain)
+    return frozenset(counting(names, last=_last(roster, chain.station), accepted=chain.accepted).pages)
+
+
+def octets_of(row: PageRow) -> bytes:
+    """The octets of a page, as they came."""
+    return join(row.header, row.content, row.signature)
+
+
+# -- what follows for each node ----------------------------------------------------------------------------------------
+
+
+class _LocalRows(NamedTuple):
+    """What this station's own store says of a page of nodes."""
+
+    entries: dict[bytes, WhitelistEntry]
+    nodes: dict[bytes, NodeRecord]
+    keys: dict[bytes, KeyRecord]
+
+    @classmethod
+    def of(cls, station: Station, uuids: Sequence[bytes]) -> _LocalRows:
+        keys = {record.uuid: record for record in station.keys.of_page(uuids)}
+        return cls(station.pins.of_page(uuids), station.nodes.of_page(uuids), keys)
+
+    def own(self, station: Station, uuid: bytes, hashes: Sequence[tuple[str, str]]) -> LocalState:
+        """``hashes``: H and text of the statements about it."""
+        entry, node = self.entries.get(uuid), self.nodes.get(uuid)
+        pin, assurance = (entry.fingerprint, entry.assurance) if entry is not None else (None, "")
+        if assurance == "registry":
+            pin, assurance = None, ""
+        if not is_whole(pin) and node is not None and node.point is not None:
+            seen = fingerprint(node.point)
+            pin = seen if pin is None or same_key(pin, seen) else pin
+        holders: frozenset[str] = frozenset()
+        if hashes:
+            gone = station.policy.tombstone(uuid)
+            holders = frozenset(holder.fingerprint for holder in station.keys.holders(uuid))
+            holders |= {gone.to_fingerprint} if gone is not None else set()
+        return LocalState(
+            station.fingerprint,
+            pin,
+            assurance,
+            met=assurance in BY_CONTACT,
+            holds=uuid in self.keys,
+            holders=holders,
+            lifted=frozenset(hash for hash, text in hashes if station.policy.was_lifted(text)),
+        )
+
+
+def views(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[bytes, MergedClaims]:
+    """What the plant says of nodes, at most a page of them, by today's rows; nothing is written."""
+    return {uuid: seen for uuid, (seen, _) in _judged(station, roster, uuids, _LocalRows.of(station, uuids)).items()}
+
+
+def _judged(
+    station: Station, roster: Roster, uuids: Sequence[bytes], here: _LocalRows
+) -> dict[bytes, tuple[MergedClaims, list[BanStatement]]]:
+    tables = station.plant.tables
+    claims = tables.claims_of(uuids)
+    said: dict[bytes, list[BanStatement]] = {}
+    for uuid, hash, page_of, counts, text in tables.bans_of(uuids):
+        try:
+            read = open_revocation(text, lambda kid: roster.point_of(kid) or station.policy.station_points().get(kid))
+        except TedsProvisionError:  # of nobody known, or not what it seems: it bans nothing
+            continue
+        if read.uuid == uuid:
+            said.setdefault(uuid, []).append(BanStatement(hash, page_of, counts, read))
+    lifted = {one.hash: _lifters(station, one.hash) for every in said.values() for one in every}
+    judged = {}
+    for uuid in uuids:
+        statements = said.get(uuid, [])
+        own = here.own(station, uuid, [(one.hash, one.said.statement) for one in statements])
+        node = {one: Claim.from_json(claim) for one, claim in claims.get(uuid, {}).items()}
+        judged[uuid] = view(roster, node, own, statements, lifted), statements
+    return judged
+
+
+def _lifters(station: Station, hash: str) -> set[str]:
+    rows = station.plant.tables.liftings_of(hash)
+    return {one for one, mac in rows if station.seals.noted("plant lifted", f"{hash} {one}", mac)}
+
+
+def apply_claims(station: Station) -> int:
+    """Bring whitelist, deny list and conflicts in order for every node of which something new was said; how many.
+
+    Rule 2: no pin, key or right of this station's own goes; what the registry pinned, or a page banned, comes and goes.
+    """
+    done = 0
+    while uuids := station.plant.tables.to_judge(AT_ONCE):
+        roster = require_roster(station)
+        with station.transaction():
+            here = _LocalRows.of(station, uuids)
+            judged = _judged(station, roster, uuids, here)
+            station.plant.tables.put_conflicts({uuid: seen.conflicts for uuid, (seen, _) in judged.items()})
+            _pin(station, judged, here)
+            for uuid, (seen, statements) in judged.items():
+                if statements or station.policy.revocation(uuid) is not None:
+                    _ban(station, uuid, seen, statements)
+            station.plant.tables.note_judged(uuids)
+        done += len(uuids)
+    return done
+
+
+def _pin(station: Station, judged: dict[bytes, tuple[MergedClaims, list[BanStatement]]], here: _LocalRows) -> None:
+    """Have what all keepers pin on the whitelist, where there is nothing of one's own; and off it when they do not."""
+    put: list[WhitelistEntry] = []
+    for uuid, (seen, _) in judged.items():
+        entry, node = here.entries.get(uuid), here.nodes.get(uuid)
+        if entry is not None and entry.assurance != "registry":
+            continue
+        other = node is not None and node.point is not None and fingerprint(node.point) != seen.pin
+        wanted = None if other or seen.bans else seen.pin
+        if entry is not None and wanted is None:
+            station.pins.remove(uuid)
+        elif wanted is not None and (entry is None or entry.fingerprint != wanted):
+            put.append(WhitelistEntry(uuid, wanted, assurance="registry"))
+    if put:
+        station.pins.put(*put)
+
+
+def _ban(station: Station, uuid: bytes, seen: MergedClaims, statements: Sequence[BanStatement]) -> None:
+    """Have one row on the deny list where any statement bans the node, and none where those of pages do no more."""
+    entry = station.policy.revocation(uuid)
+    if entry is not None and entry.statement:
+        hash = event.hash_of_statement(entry.statement)
+        from_pages = any(one.hash == hash for one in statements)
+        counts = any(one.hash == hash for one in seen.bans)
+        if counts or (not from_pages and not _is_lifted(station, entry.statement, hash)):
+            return
+        station.policy.forgive(uuid)
+        station.audit("revoke", uuid, "lifted", by="registry", why=entry.why)
+    for one in seen.bans[:1]:
+        deny.deny(station, one.said, key=station.pins.pinned(uuid))
+
+
+def _is_lifted(station: Station, statement: str, hash: str) -> bool:
+    """Whether a ban that came in a bundle, or was made here, was lifted in a page by a keeper or by its own signer."""
+    roster = require_roster(station)
+    try:
+        signer = open_revocation(statement, lambda kid: roster.point_of(kid) or _own(station, kid)).sender
+    except TedsProvisionError:
+        return False
+    return any(one == signer or "keeper" in roster.roles_of(one) for one in _lifters(station, hash))
+
+
+def _own(station: Station, kid: str) -> bytes | None:
+    return station.point if kid == station.fingerprint else station.policy.station_points().get(kid)
+
+
+# -- where everybody stands --------------------------------------------------------------------------------------------
+
+
+def heads_digest(station: Station) -> tuple[str, int]:
+    """First 16 digits of the SHA-256 over the newest page that counts of every chain, and how many chains.
+
+    Two stations that have all pages have the same one.
+    """
+    lines = sorted(
+        f"{one} {chain.counted[0]} {chain.counted[1]}\n".encode()
+        for one, chain in station.plant.tables.chains().items()
+        if chain.counted[0]
+    )
+    return hashlib.sha256(b"".join(lines)).hexdigest()[:16], len(lines)

@@ -1,0 +1,81 @@
+"""Where a station's registry is, and the connection to it: a folder, or PostgreSQL."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
+
+from teds_provision.errors import NotMemberError, PolicyError
+from teds_provision.plant import postgres
+from teds_provision.plant.folder_transport import FolderTransport
+from teds_provision.plant.membership import FILES
+from teds_provision.plant.transport import Transport
+from teds_provision.station.station import Station
+
+
+def post_of(station: Station) -> Transport | None:
+    """What carries for this station, by what it joined; None where nothing is known that does. Opens no connection."""
+    record = station.plant.joined
+    if record is None or record.url is None:
+        return None
+    if record.url.startswith(FILES):
+        return FolderTransport(Path(record.url.removeprefix(FILES)))
+    return database(station, record.url)
+
+
+def database(station: Station, url: str) -> postgres.PostgresTransport:
+    """The registry at a URL, by the login that this station's request named (the vault opens); not connected yet.
+
+    Raises UsageError (the URL, the driver), NotMemberError (no request was ever made).
+    """
+    return postgres.PostgresTransport(
+        postgres.Registry(_login(station, url)), postgres.where_of(url), station.fingerprint
+    )
+
+
+def listener(station: Station) -> postgres.Registry | None:
+    """A second connection that is told when somebody did something; None where a folder carries."""
+    record = station.plant.joined
+    if record is None or record.url is None or record.url.startswith(FILES):
+        return None
+    return postgres.Registry(_login(station, record.url))
+
+
+def check_database(station: Station, post: Transport) -> list[str]:
+    """Return what the database allows and should not, and keep it for ``registry status``; empty for a folder."""
+    if not isinstance(post, postgres.PostgresTransport):
+        return []
+    post.sweep()
+    doors, roster = post.open_doors(), station.plant.roster
+    left = {one.fingerprint: one.name for one in roster.removed} if roster is not None else {}
+    doors += [f"login of {left[one]}, which was removed" for one in post.open_logins() if one in left]
+    station.plant.tables.put_doors(doors)
+    return doors
+
+
+def absolute(url: str) -> str:
+    """A URL whose root certificate is found from any folder."""
+    parts = urlsplit(url)
+    words = [
+        (name, str(Path(value).absolute()) if name == "sslrootcert" and value != "system" else value)
+        for name, value in parse_qsl(parts.query, keep_blank_values=True)
+    ]
+    return urlunsplit(parts._replace(query=urlencode(words, quote_via=quote)))
+
+
+def require_registry(post: Transport, registry: str) -> None:
+    """Raise PolicyError where a database is of another registry than the roster that is to be joined."""
+    there = post.registry()
+    if there != registry:
+        raise PolicyError(f"{post.where} belongs to another registry ({there}) than the roster ({registry}).")
+
+
+def _login(station: Station, url: str) -> dict[str, object]:
+    kept = station.plant.login()
+    if kept is None:
+        raise NotMemberError(
+            "This station has no database login yet.",
+            hint="To get one: registry request --output FILE; the database's administrator then runs: registry"
+            " sql --member FILE | psql",
+        )
+    return postgres.parameters(url, station.fingerprint, kept[0])

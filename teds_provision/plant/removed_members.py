@@ -1,0 +1,215 @@
+"""A station left: whose keys it had, which are rotated now, and what no roster can heal (contract/plant.md section 7).
+
+Whoever had a key is taken from everybody's pages, its own beyond ``last`` too: what a thief says there counts for
+nothing else, but a key that he names he had.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from functools import lru_cache
+from typing import Final
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.plant.apply_pages import counted_places, views
+from teds_provision.protocol.handover.strict_json import load_exact
+from teds_provision.protocol.plant import event
+from teds_provision.protocol.plant.claim import Claim, Key
+from teds_provision.protocol.plant.roster import RemovedMember, Roster, open_roster
+from teds_provision.station.node_keys import STOLEN
+from teds_provision.station.station import Station
+from teds_provision.store import KeyRecord
+
+WHY: Final = "registry: "
+"""Begins the reason of a rotation that is due because somebody left."""
+OTHERS: Final = timedelta(hours=24)
+"""So long the station that made a key has to rotate it, before others do."""
+EVERY: Final = timedelta(hours=1)
+_PAGE: Final = 500
+_COMMAND: Final = "registry sync"
+
+
+@dataclass(frozen=True)
+class RemovalReview:
+    """What was found when it was looked last: ``of`` nodes whose key is held here; ``alone`` had only who left."""
+
+    at: str
+    removed: str
+    of: int
+    alone: int
+
+
+def review(station: Station, roster: Roster, now: datetime) -> RemovalReview | None:
+    """Mark for rotation what somebody who left has had; None where nobody left.
+
+    A look at every key costs seconds in a large plant, so it is done when the roster removes somebody else, and each
+    hour.
+    """
+    if not roster.removed:
+        return None
+    named = hashlib.sha256("".join(sorted(one.fingerprint for one in roster.removed)).encode()).hexdigest()
+    before = last(station)
+    if before is not None and before.removed == named and abs(now - datetime.fromisoformat(before.at)) < EVERY:
+        return before
+    ours = _first_removals(station)
+    beyond = _beyond(station, roster)
+    of = 0
+    for page in _pages(station):
+        keys = _keys_held(station, page)
+        of += len(keys)
+        _mark(station, roster, keys, beyond, now, ours)
+    found = RemovalReview(now.isoformat(), named, of, _alone(station, roster))
+    with station.durable(_COMMAND):
+        station.plant.parcels.put_review(json.dumps(asdict(found)))
+    return found
+
+
+def last(station: Station) -> RemovalReview | None:
+    """What the last look found."""
+    text = station.plant.parcels.review()
+    return None if text is None else RemovalReview(**json.loads(text))
+
+
+def due(station: Station) -> int:
+    """How many nodes this station has to rotate because somebody left."""
+    return sum(why.startswith(WHY) for why in station.keys.rotations_due().values())
+
+
+def _pages(station: Station) -> Iterable[list[bytes]]:
+    page: list[bytes] = []
+    seen: set[bytes] = set()
+    for uuid, _, _, _ in station.keys.each_name():
+        if uuid not in seen:
+            seen.add(uuid)
+            page.append(uuid)
+        if len(page) == _PAGE:
+            yield page
+            page = []
+    if page:
+        yield page
+
+
+def _keys_held(station: Station, page: Sequence[bytes]) -> dict[bytes, KeyRecord]:
+    """The key of each node: the active one, or the newest of those that no session has proven yet (copies)."""
+    found: dict[bytes, KeyRecord] = {}
+    for key in station.keys.of_page(page):
+        if key.uuid not in found or found[key.uuid].state != "active":
+            found[key.uuid] = key
+    return found
+
+
+def _mark(
+    station: Station,
+    roster: Roster,
+    keys: Mapping[bytes, KeyRecord],
+    beyond: Mapping[tuple[bytes, int, str], set[str]],
+    now: datetime,
+    ours: Mapping[str, datetime],
+) -> None:
+    """Mark those of a page of nodes whose key somebody had who left."""
+    claims = station.plant.tables.claims_of(list(keys))
+    marked = station.keys.due_of_page(list(keys))
+    wanted: dict[bytes, str] = {}
+    for uuid, key in keys.items():
+        already = station.keys.rotation_due(uuid) or "" if uuid in marked else None
+        if already is not None and (already.startswith(STOLEN) or not already.startswith(WHY)):
+            continue
+        said = {one: Claim.from_json(text) for one, text in claims.get(uuid, {}).items()}
+        had = beyond.get((uuid, key.epoch, key.key_id), set()) | {
+            holder.fingerprint for holder in station.keys.holders(uuid) if roster.removed_one(holder.fingerprint)
+        }
+        known = [one for one in roster.removed if one.fingerprint in had or _had(one, (key.epoch, key.key_id), said)]
+        why = _why_due(known, key, said, now, ours)
+        if why is not None:
+            wanted[uuid] = why
+    wanted = {uuid: why for uuid, why in wanted.items() if uuid not in marked or why.startswith(STOLEN)}
+    if wanted:
+        with station.durable(_COMMAND):
+            for uuid, why in wanted.items():
+                station.keys.demand_rotation(uuid, why)
+                station.audit("registry", uuid, "rotation due", why=why)
+
+
+def _why_due(
+    known: Sequence[RemovedMember],
+    key: KeyRecord,
+    said: Mapping[str, Claim],
+    now: datetime,
+    ours: Mapping[str, datetime],
+) -> str | None:
+    """Why a key that these removed stations have held is to be replaced; a stolen one goes before all others.
+
+    Who was retired and says that it forgot the key needs no rotation. A key that another station agreed is that
+    station's to rotate; this one does it when the removal has been known here for ``OTHERS``.
+    """
+    why = None
+    for one in known:
+        forgot = said[one.fingerprint].forgot if one.fingerprint in said else -1
+        if one.why == "retired" and forgot >= key.epoch:
+            continue
+        if key.source == "agreement" or now - ours.get(one.fingerprint, now) >= OTHERS:
+            if one.why == "stolen":
+                return f"{STOLEN}{one.name} has held this key"
+            why = f"{WHY}{one.name} ({one.why}) has held this key"
+    return why
+
+
+def _had(one: RemovedMember, key: Key, said: Mapping[str, Claim]) -> bool:
+    """Whether by anybody's claims of a node somebody who left has held this key of it."""
+    own = said.get(one.fingerprint)
+    if own is not None and key in ((own.agreed or ())[:2], own.took, *((e, k) for _, _, e, k, _ in own.gave)):
+        return True
+    return any((peer, e, k) == (one.fingerprint, *key) for claim in said.values() for _, peer, e, k, _ in claim.gave)
+
+
+def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], set[str]]:
+    """Keys (UUID, epoch, key id) that who left names on pages that do not count: later ones, and another history's."""
+    found: dict[tuple[bytes, int, str], set[str]] = {}
+    for one in roster.removed:
+        chain = station.plant.tables.chains().get(one.fingerprint)
+        if chain is None:
+            continue
+        counted = counted_places(station, roster, chain)
+        for n, hash, _ in station.plant.tables.page_names(chain.chain):
+            page = None if (n, hash) in counted else station.plant.tables.page(chain.chain, n, hash)
+            if page is None:
+                continue
+            for value in load_exact(page.content, "A page").get("events", ()):
+                read = event.read(value)
+                if isinstance(read, event.Event) and read.uuid is not None and "key_id" in read.members:
+                    key = read.uuid, read.members["epoch"], read.members["key_id"]
+                    found.setdefault(key, set()).add(one.fingerprint)
+    return found
+
+
+def _first_removals(station: Station) -> dict[str, datetime]:
+    """Since when the removal of each station that left is known here."""
+    since: dict[str, datetime] = {}
+    for row in station.plant.tables.rosters():
+        for one in _removed_in(row.octets, station.ca):
+            at = datetime.fromisoformat(row.at)
+            since[one] = min(since.get(one, at), at)
+    return since
+
+
+@lru_cache(maxsize=64)
+def _removed_in(octets: bytes, ca: bytes) -> frozenset[str]:
+    try:
+        return frozenset(one.fingerprint for one in open_roster(octets, ca).removed)
+    except TedsProvisionError:  # kept as proof of two of one version
+        return frozenset()
+
+
+def _alone(station: Station, roster: Roster) -> int:
+    """Nodes whose key nobody has any more but who left: only a tap gives them to anybody."""
+    count, after = 0, b""
+    while page := station.plant.tables.claimed_nodes(after, _PAGE):
+        after = page[-1]
+        held = _keys_held(station, page).keys()
+        seen = views(station, roster, page)
+        count += sum(not seen[uuid].held and bool(seen[uuid].left) and uuid not in held for uuid in page)
+    return count

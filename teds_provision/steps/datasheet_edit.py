@@ -1,0 +1,135 @@
+"""A datasheet out of an XML or JSON document onto a node that is being talked to: planned, guarded, signed, written.
+
+The document says all of the datasheet. What the node has beside it and calls read-only stays; what else it has and the
+document does not name goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from teds_provision.errors import BadDataError
+from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.board_type import differences, refuse
+from teds_provision.steps.build import guard, own_name, require_fit, teds_calibrations
+from teds_provision.steps.sign import known_node_keys, sign
+from teds_provision.steps.teds_read import NodeSnapshot, survey
+from teds_provision.steps.verify import Verification, require_authentic
+from teds_provision.steps.verify_node import verify_node
+from teds_provision.steps.write import write
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.teds.codec.model import AccessCode
+from teds_provision.teds.diff import Change, diff_blocks
+from teds_provision.teds.formats import stated_uuid, under
+from teds_provision.teds.image import BlockId, Image
+
+
+@dataclass(frozen=True)
+class SheetPlan:
+    """What a document would change on a node: ``image`` is what it is to have, without its Security TEDS."""
+
+    image: Image
+    changes: tuple[Change, ...]
+    warnings: tuple[str, ...]
+    present: NodeSnapshot
+
+
+@dataclass(frozen=True)
+class SheetEditResult:
+    """What was done, step by step, and what the node is worth now."""
+
+    plan: SheetPlan
+    steps: tuple[StepResult, ...]
+    verified: Verification
+
+
+def plan_sheet(
+    station: Station,
+    node: Conversation,
+    blocks: Mapping[BlockId, bytes],
+    *,
+    accept_calibration: str | None = None,
+    retype: bool = False,
+    record: bool = False,
+) -> SheetPlan:
+    """What writing these TEDS would change, in a session of the node; changes nothing.
+
+    Raises NotWhitelistedError, PolicyError (no key, the guard), BadDataError (damaged TEDS, another node's),
+    WrongBoardError where the board says that it is of another type, unless ``retype``: no document names the type that
+    it was given before.
+    """
+    station.policy.require_whitelisted(node.uuid)
+    for (channel, code), teds in blocks.items():
+        if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
+            raise BadDataError(f"TEDS {code} of channel {channel} is damaged, or is one that no node can store.")
+    meant = stated_uuid(blocks)
+    if meant is not None and meant != node.uuid:
+        raise BadDataError(
+            f"This datasheet belongs to node {meant.hex()}, not to {node.uuid.hex()}.",
+            hint="To use it for this node, remove the UUID from its Meta-TEDS (or set it to zeros).",
+        )
+    if not node.sealed:
+        require_session(station, node)
+    present = survey(node)
+    keep = {block: present.image.blocks[block] for block in present.read_only}
+    image = Image(node.uuid, {**keep, **under(blocks, node.uuid)})
+    told = () if retype else differences(present.image.blocks, image)
+    if told:
+        refuse(node.uuid, told)
+    same = {
+        number: one
+        for number, one in teds_calibrations(present.image).items()
+        if image.blocks.get((number, AccessCode.CALIBRATION)) == present.image.blocks[number, AccessCode.CALIBRATION]
+    }
+    require_fit(same, present.image, image)
+    warnings = guard(station, image, present.image, accept_calibration, record=record)
+    changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
+    return SheetPlan(image, changes, warnings, present)
+
+
+def write_sheet(
+    station: Station,
+    node: Conversation,
+    blocks: Mapping[BlockId, bytes],
+    reporter: Reporter,
+    *,
+    accept_calibration: str | None = None,
+    retype: bool = False,
+) -> SheetEditResult:
+    """Plan, sign, write, read back and verify; raises as the steps do, and NotAuthenticError if the end is not good."""
+    steps = Steps(reporter)
+    with steps.step("build") as step:
+        plan = plan_sheet(station, node, blocks, accept_calibration=accept_calibration, retype=retype, record=True)
+        step.result = DONE if plan.changes else NOTHING
+        step.detail = f"{len(plan.image.blocks)} TEDS"
+    present = plan.present
+    keys = known_node_keys(station, node.uuid, present.image)
+    with steps.step("sign") as step:
+        on_node = None if plan.changes else present.image.security
+        signed = sign(
+            station,
+            keys,
+            plan.image,
+            epoch=present.identity.epoch,
+            node_sequence=present.identity.sequence,
+            on_node=on_node,
+            keep_draft=True,
+        )
+        step.result = NOTHING if signed.reused else DONE
+        step.detail = f"sequence {signed.sequence}"
+    with steps.step("write") as step:
+        record = station.nodes.get(node.uuid)
+        name = own_name(station, signed.image, record.profile if record is not None else None)
+        facts = {} if name is None else {"name": name}
+        written = write(station, node, signed.image, present=present, progress=reporter.written, facts=facts)
+        step.result = DONE if written.octets else NOTHING
+        step.detail = f"{written.octets} octets" if written.octets else ""
+    with steps.step("verify") as step:
+        verified = verify_node(station, node, written.on_node, keys.key, by="write").verified
+        step.detail = verified.verdict
+    require_authentic(verified)
+    return SheetEditResult(plan, tuple(steps.done), verified)
