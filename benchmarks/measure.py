@@ -46,14 +46,14 @@ def sheet() -> Sheet:
     profile = load_profile("tactile-finger-sensor")
     calibration = read_calibrations("raw,value,channel\n0,0,1\n30000,5,1\n65535,10,1\n", "bench.csv", profile)
     uuid = bytes(9) + b"\1"
-    return Sheet.of(Image(uuid, profile.build(uuid, calibration=calibration).blocks))
+    return Sheet.from_image(Image(uuid, profile.build(uuid, calibration=calibration).blocks))
 
 
 class Stream:
     """Messages of a stream, and what hears them."""
 
     def __init__(self, known: Sheet) -> None:
-        self.plan = StreamPlan.of(0, ((1, 2),), n=N, period=PERIOD)
+        self.plan = StreamPlan.for_channels(0, ((1, 2),), n=N, period=PERIOD)
         chance, sealer = np.random.default_rng(1), DatagramSealer(stream_key(KEY, 1))
         bodies = (b"\0" + chance.integers(0, 65536, N).astype(">u2").tobytes() for _ in range(MESSAGES))
         self.messages = [sealer.seal(k, body) for k, body in enumerate(bodies)]

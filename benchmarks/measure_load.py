@@ -66,7 +66,7 @@ def node_address(node: int) -> int:
 
 def plan_of(stream: int) -> StreamPlan:
     """One of the two streams of each node."""
-    return StreamPlan.of(stream, tuple((number, 2) for number in HALVES[stream]), n=N, period=PERIOD)
+    return StreamPlan.for_channels(stream, tuple((number, 2) for number in HALVES[stream]), n=N, period=PERIOD)
 
 
 def sheet_of(node: int) -> Sheet:
@@ -77,7 +77,7 @@ def sheet_of(node: int) -> Sheet:
     lines = "".join(f"0,0,{n}\n30000,5,{n}\n65535,10,{n}\n" for n in range(1, CHANNELS + 1))
     uuid = (node + 1).to_bytes(10, "big")
     calibration = read_calibrations(f"raw,value,channel\n{lines}", "bench.csv", profile)
-    return Sheet.of(Image(uuid, profile.build(uuid, calibration=calibration).blocks))
+    return Sheet.from_image(Image(uuid, profile.build(uuid, calibration=calibration).blocks))
 
 
 # -- the nodes --------------------------------------------------------------------------------------------------------
@@ -223,7 +223,7 @@ class Machine:
         while self._for_grid:
             block = self._for_grid.popleft()
             self.load.values += block.value.size
-            self.grid.take(block)
+            self.grid.add_block(block)
         rows = self.grid.rows(time.time())
         if rows is not None:
             self.load.rows += len(rows.time)

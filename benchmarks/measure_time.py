@@ -71,7 +71,7 @@ def serve(can: str, folders: Sequence[str]) -> None:
     for folder in folders:
         node = VirtualNode(
             Path(folder),
-            board=lambda file: Board(Sheet.of(Image(file.load().uuid, file.hardware)), source="ramp:2"),
+            board=lambda file: Board(Sheet.from_image(Image(file.load().uuid, file.hardware)), source="ramp:2"),
             pulse=pulse,
         )
         server.add(node, measuring=node)

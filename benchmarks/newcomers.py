@@ -89,7 +89,7 @@ class Power:
         for name in names:
             node = VirtualNode(
                 self._folder / name,
-                board=lambda file: Board(Sheet.of(Image(file.load().uuid, file.hardware)), source="ramp:2"),
+                board=lambda file: Board(Sheet.from_image(Image(file.load().uuid, file.hardware)), source="ramp:2"),
                 pulse=self._pulse,
             )
             server.add(node, measuring=node)

@@ -56,8 +56,8 @@ def ring(channels: int) -> int:
         block = Block(f"{number:020x}", 1, (1,), 0, at, ticks, value, value, np.ones(value.shape, bool))
         past.block(block)
         if number % 100 == 99:
-            past.of(f"{number:020x}", 1)
-    past.of(f"{channels - 1:020x}", 1)
+            past.channel_history(f"{number:020x}", 1)
+    past.channel_history(f"{channels - 1:020x}", 1)
     assert len(past) == channels
     return resident() - before
 

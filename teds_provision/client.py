@@ -338,7 +338,7 @@ class Client:
         found: Applied = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", body)
         return found
 
-    def let_go(self, node: str, channel: int) -> bool | None:
+    def release_actuator(self, node: str, channel: int) -> bool | None:
         """Let an actuator go; whether the node reports that it is safe, None where it did not say."""
         found: Applied = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", {"hold": 0})
         return found["safe"]

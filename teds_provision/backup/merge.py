@@ -47,7 +47,7 @@ class Merge:
         self._marks()
         self._groups()
 
-    def told(self) -> list[str]:
+    def kept_sentences(self) -> list[str]:
         """What stayed, in sentences."""
         return [f"{what}: {count}" for what, count in self.kept.items() if count]
 
@@ -197,14 +197,14 @@ class Merge:
 
         What an older copy has and this store lacks may have been settled since.
         """
-        present = self.live.all_marks()
+        present = self.live.all_key_flags()
         wanted = {
             uuid: marks
-            for uuid, marks in self.copy.all_marks().items()
+            for uuid, marks in self.copy.all_key_flags().items()
             if present.get(uuid) != marks
             and (self.newer or (uuid not in present and not (self.older and uuid in self.held)))
         }
-        self.live.put_marks(wanted)
+        self.live.put_key_flags(wanted)
         self.back["marks"] += len(wanted)
 
 

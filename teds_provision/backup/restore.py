@@ -135,7 +135,7 @@ def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
     why = f"{RESTORED} of {content.created}: it may have been given away or replaced since"
     keys = Station(copy, ask).keys
     nodes = {record.uuid for record in keys.all()}
-    keys.mark({uuid: {"rotation": why} for uuid in nodes})
+    keys.set_flags({uuid: {"rotation": why} for uuid in nodes})
     return len(nodes)
 
 
@@ -246,7 +246,7 @@ def merge(store: Store, content: Content, *, dry_run: bool) -> RestoreResult:
         pass
     action = "merged" if back else "nothing"
     facts = store.facts()
-    return RestoreResult(action, how, back, tuple(work.told()), facts.keystore if facts is not None else "")
+    return RestoreResult(action, how, back, tuple(work.kept_sentences()), facts.keystore if facts is not None else "")
 
 
 def _check_inside(copy: Store, content: Content) -> None:

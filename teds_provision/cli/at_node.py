@@ -36,7 +36,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
     """
     stop = talk.meeting.IdleStop(None)
     if watch:
-        signal.signal(signal.SIGTERM, lambda *_: stop.ask())
+        signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
     several = len(links.places) > 1
     found: list[dict[str, Any]] = []
     for arrival in steps.commands.identify_at(

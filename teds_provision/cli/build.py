@@ -297,7 +297,7 @@ def write(
 
 
 def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
-    done = steps.commands.bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
+    done = steps.commands.restore_datasheet(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
     node, changes = done.uuid.hex(), [change.text for change in done.changes]
     lines = "".join(f"\n  {text}" for text in changes) or "\n  no changes"
     if done.written is None:

@@ -141,13 +141,13 @@ class App:
         """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
         if not self.quiet and not self.json and self.verbose >= level:
             self.live_line()
-            say(text)
+            print_message(text)
 
     def warn(self, text: str) -> None:
         """Warn on stderr, also with --json; only --quiet silences it."""
         self.live_line()
         if not self.quiet:
-            say(f"Warning: {text}")
+            print_message(f"Warning: {text}")
 
     def fail_line(self, error: TedsProvisionError, **of: object) -> None:
         """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr.
@@ -163,7 +163,7 @@ class App:
             where = ", ".join(f"row {value}" if name == "row" else str(value) for name, value in known.items())
             at = f" ({where})" if where else ""
             told_lines = f"Error{at}: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
-            say(told_lines)
+            print_message(told_lines)
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -187,10 +187,10 @@ class App:
                 else "This needs confirmation, but there is no terminal to ask on.",
                 hint=f"Add {named} --yes." if named else "Add --yes, or --dry-run to see the plan.",
             )
-        if not self.ask(question):
+        if not self.ask_yes_no(question):
             raise PolicyError("Cancelled. Nothing was changed.")
 
-    def ask(self, question: str) -> bool:
+    def ask_yes_no(self, question: str) -> bool:
         """Ask a person, yes or no; nothing that a node or a file brought steers the terminal."""
         self.live_line()
         return click.confirm(_as_question(question), err=True)
@@ -202,7 +202,7 @@ class App:
             self.note(f"Board {uuid.hex()} reports a different type from the one it would be given:")
             for text in differences:
                 self.note(f"  {text}")
-            if not self.ask("Change it to the new type?"):
+            if not self.ask_yes_no("Change it to the new type?"):
                 raise PolicyError(f"Cancelled. Board {uuid.hex()} keeps its type; nothing was written.")
 
         return ask if self.interactive and not yes else None
@@ -218,11 +218,11 @@ class App:
             label = station_room.label.read_label(said)
             digits = label[1] if label is not None else protocol.fingerprints.read_fingerprint(said)
             if digits is not None and not protocol.fingerprints.same_key(digits, fingerprint):
-                say("These digits belong to a different key.")
+                print_message("These digits belong to a different key.")
                 return False
             if digits is not None:
                 return True
-            say("Answer y or n, or type 32 to 64 digits of the fingerprint.")
+            print_message("Answer y or n, or type 32 to 64 digits of the fingerprint.")
 
     @property
     def has_passphrase(self) -> bool:
@@ -280,7 +280,7 @@ class App:
             self._closers.pop()()
 
 
-def say(text: str) -> None:
+def print_message(text: str) -> None:
     """Say something on stderr; what others wrote steers no terminal, and no word is broken at its edge."""
     with _TELLING:  # one line at a time, whatever threads there are
         sys.stderr.write(f"{folded(sanitize(text), sys.stderr)}\n")

@@ -83,7 +83,7 @@ def _plant(app: App) -> None:
 def _page(app: App, http: str | None) -> None:
     over = talk.meeting.IdleStop(None)
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: over.ask())
+        signal.signal(number, lambda *_: over.request_stop())
     with demo_room.page.page_demo(app.note, http) as shown:
         told = f"""Open {shown.url}
   (valid once, for five minutes; for another: teds-provision --home {shown.home} ncap open)

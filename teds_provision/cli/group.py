@@ -23,7 +23,7 @@ def group() -> None:
     """Manage groups of nodes that are measured together. A group cannot change while it is measured."""
 
 
-def _tell(app: App, groups: Sequence[Group]) -> None:
+def _print_groups(app: App, groups: Sequence[Group]) -> None:
     lines = [f"{one.name}: {', '.join(uuid.hex() for uuid in one.uuids) or 'no nodes yet'}" for one in groups]
     app.emit(
         {"groups": [{"name": one.name, "uuids": [uuid.hex() for uuid in one.uuids]} for one in groups]},
@@ -35,7 +35,7 @@ def _tell(app: App, groups: Sequence[Group]) -> None:
 @pass_app
 def list_groups(app: App) -> None:
     """List all groups."""
-    _tell(app, app.station().groups.all())
+    _print_groups(app, app.station().groups.all())
 
 
 @command("teds-provision group create hand 8d4d 91aa", name="create")
@@ -51,7 +51,7 @@ def create(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
         app.emit({"groups": [{"name": name, "uuids": [uuid.hex() for uuid in uuids]}]}, f"Would create group {name}.")
         return
     with station.lock("group create", app.note):
-        _tell(app, [station.groups.create(name, uuids)])
+        _print_groups(app, [station.groups.create(name, uuids)])
 
 
 @command("teds-provision group add hand 77f0", name="add")
@@ -86,10 +86,10 @@ def _change(
     station = app.station()
     uuids = [station.nodes.resolve(text) for text in nodes]
     if dry_run:
-        _tell(app, [station.groups.get(name)])
+        _print_groups(app, [station.groups.get(name)])
         return
     with station.lock(f"group {act}", app.note):
-        _tell(app, [change(station.groups, name, uuids)])
+        _print_groups(app, [change(station.groups, name, uuids)])
 
 
 @command("teds-provision group delete hand", name="delete")
@@ -102,7 +102,7 @@ def delete(app: App, name: str, *, dry_run: bool) -> None:
     if not dry_run:
         with station.lock("group delete", app.note):
             station.groups.delete(name)
-    _tell(app, station.groups.all())
+    _print_groups(app, station.groups.all())
 
 
 for one in (create, add, remove, delete):

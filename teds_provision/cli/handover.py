@@ -196,7 +196,7 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
 
 
 def _node_lines(chosen: Sequence[LeavingNode], station: Station) -> list[str]:
-    known = station.nodes.of_page([node.uuid for node in chosen])
+    known = station.nodes.get_many([node.uuid for node in chosen])
     return [f"  {node.uuid.hex()}  epoch {node.epoch}  {known[node.uuid].name or ''}".rstrip() for node in chosen]
 
 

@@ -42,7 +42,7 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
         return
     assert why is not None
     if dry_run:
-        keys = len(station.keys.of(octets))
+        keys = len(station.keys.keys_of(octets))
         app.emit(
             {"uuid": octets.hex(), "plan": "revoke", "keys": keys}, f"Plan: revoke {octets.hex()}, delete {keys} keys."
         )
@@ -145,7 +145,7 @@ def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, forc
     try:
         with (
             talk.meeting.meet(station, links, uuid, reporter_for(app)) as node,
-            station.turn(uuid),
+            station.node_lock(uuid),
             station.released(uuid, "reset"),
         ):
             return steps.agree.reset_node(station, node, steps.identify.identify(station, node))

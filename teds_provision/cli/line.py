@@ -315,7 +315,7 @@ def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
     to = plant.sign_requests.receivers(station, found)
     if not dry_run:
         station.unlock()
-        post = plant.sign_requests.post_of(station, files)
+        post = plant.sign_requests.transport_for(station, files)
         app.closing(post.close)
         plant.sign_requests.send_job(station, post, found)
     names = [roster.name_of(one) for one in to]
@@ -361,7 +361,7 @@ def status(app: App, which: str, evidence: Sequence[str], csv_file: Path | None)
     found = plant.jobs.find_job(station, which)
     names = json_files([Path(file) for file in evidence], "evidence")
     attempts = plant.yield_stats.attempts_of(station, found.id, (read_file(Path(name)) for name in names))
-    parts = plant.yield_stats.yields(station, found, attempts)
+    parts = plant.yield_stats.yield_stats(station, found, attempts)
     if csv_file is not None:
         write_file(csv_file, plant.yield_stats.to_csv(station, attempts))
     told = {**_to_json(station, found), "stations": [part.to_json() for part in parts]}
@@ -436,19 +436,19 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     station = app.station()
     ids = {plant.jobs.find_job(station, job).id for job in jobs}
     station.unlock()
-    post = plant.sign_requests.post_of(station, files)
+    post = plant.sign_requests.transport_for(station, files)
     app.closing(post.close)
     inbox = plant.sign_requests.Inbox(station, post, protocol.plant.document.SIGN_REQUEST)
     app.closing(inbox.close)
     stop = talk.meeting.IdleStop(None)
-    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
+    signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
     if seconds is not None:
         threading.Timer(seconds, stop.set).start()
     app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")
     while True:
         station.unlock()  # ends with vault-locked if another command changed passphrase and master key
         for one in plant.office.answer_all(station, post, inbox, ids, stop=stop.is_set):
-            _tell(app, station, one)
+            _print_answer(app, station, one)
         if stop.is_set():
             return
         inbox.wait(_MOST_WAIT_SECONDS, _LOOK_SECONDS)
@@ -490,10 +490,10 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
         write_file(output, sealed.decode())
     elif answered.security:
         write_file(output, request.image.with_block(teds.image.SECURITY, answered.security).to_json())
-    _tell(app, station, plant.office.AnsweredRequest(request, answered), end=True)
+    _print_answer(app, station, plant.office.AnsweredRequest(request, answered), end=True)
 
 
-def _tell(app: App, station: Station, one: AnsweredRequest, *, end: bool = False) -> None:
+def _print_answer(app: App, station: Station, one: AnsweredRequest, *, end: bool = False) -> None:
     request, answered = one.request, one.answer
     told: dict[str, Any] = {"uuid": request.uuid.hex(), "job": request.job, "from": request.signer}
     roster = station.plant.roster
@@ -544,7 +544,7 @@ def verify(app: App, files: tuple[str, ...], ca: Path, pins: Path | None, roster
     attempt. Prints one line each, then totals; exits with the worst: 4 for an invalid file, 8 for one that cannot be
     read.
     """
-    grounds = plant.verify_evidence.EvidenceAnchors.of(protocol.keys.from_pem(read_file(ca)), pins, roster)
+    grounds = plant.verify_evidence.EvidenceAnchors.from_files(protocol.keys.from_pem(read_file(ca)), pins, roster)
     names = json_files([Path(file) for file in files], "evidence")
     totals = plant.verify_evidence.EvidenceTotals()
     for lines, counted in plant.verify_evidence.verify_evidence(grounds, names, _json if app.json else _line):

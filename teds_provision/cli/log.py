@@ -134,7 +134,7 @@ def _tell_lines(app: App, entries: _CountedEntries, verdict: AuditVerdict, after
 def _follow(app: App, station: Station, choice: AuditFilter, verdict: AuditVerdict, after: int) -> None:
     """Give entries as they come, until SIGTERM (exit 0) or Ctrl-C (exit 130)."""
     stop = talk.meeting.IdleStop(None)
-    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
+    signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
     _require_intact(verdict)
     while True:
         for entry in station.audit_log.chosen(choice, after):

@@ -14,7 +14,7 @@ import click
 
 from teds_provision import __version__
 from teds_provision.cli.config_file import Defaults, anchored, config_path, read_config
-from teds_provision.cli.context import App, nowhere, say
+from teds_provision.cli.context import App, nowhere, print_message
 from teds_provision.cli.option_names import PARAMETERS
 from teds_provision.cli.table import COMMANDS, SECTIONS
 from teds_provision.errors import BadDataError, NotFoundError, StoreError, TedsProvisionError
@@ -246,7 +246,7 @@ def _untold(arguments: list[str], error: OSError) -> int:
     told = f"Cannot write the result to stdout: {error.strerror}."
     if _wants(arguments, "--json"):
         return _fail(arguments, StoreError.exit_code, StoreError.code, told, "")
-    _say(told)
+    _print_message(told)
     return 0
 
 
@@ -283,15 +283,15 @@ def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: s
         with contextlib.suppress(OSError):
             print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
     else:
-        _say(message if exit_code == INTERRUPTED else f"Error: {message}")
+        _print_message(message if exit_code == INTERRUPTED else f"Error: {message}")
         if hint:
-            _say(f"  → {hint}")
+            _print_message(f"  → {hint}")
     return exit_code
 
 
-def _say(text: str) -> None:
+def _print_message(text: str) -> None:
     with contextlib.suppress(OSError):
-        say(text)
+        print_message(text)
 
 
 # Global options may stand before or after the command: they are moved to the front before click reads the line.

@@ -81,7 +81,7 @@ class StdoutEvents(ThreadedSink):
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         """Nothing to open."""
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):
             self._put_out(b"".join(as_line(line) for line in data_lines(item, self._facts)))
         elif isinstance(item, NodeReport):

@@ -32,7 +32,7 @@ def names() -> None:
 @pass_app
 def list_names(app: App) -> None:
     """List the topic of every channel with a known datasheet."""
-    _tell(app, app.station())
+    _print_names(app, app.station())
 
 
 @command(
@@ -66,7 +66,7 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
         topics.require_free(uuid.hex(), channel, chosen)
     if not dry_run:
         _change(app, station, uuid, channel, chosen)
-    _tell(app, station)
+    _print_names(app, station)
 
 
 @command("teds-provision names reset 8d4d 1", name="reset")
@@ -83,7 +83,7 @@ def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
     uuid = _who(station, node)
     if not dry_run:
         _change(app, station, uuid, channel, None)
-    _tell(app, station)
+    _print_names(app, station)
 
 
 @command(
@@ -114,7 +114,7 @@ def set_frame(app: App, node: str, channel: int, frame: str, *, dry_run: bool) -
         with station.lock("names", app.note), station.transaction():
             station.measurements.set_frame(uuid, channel, frame or None)
             station.audit("frame", uuid, "done", channel=channel, frame=frame)
-    _tell(app, station)
+    _print_names(app, station)
 
 
 def _who(station: Station, node: str) -> bytes:
@@ -141,7 +141,7 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
         image = station.nodes.datasheet(record.uuid)
         if image is None:
             continue
-        sheet, judged = teds.sheet.Sheet.of(image), steps.readings.verdict_of(station, record.uuid)
+        sheet, judged = teds.sheet.Sheet.from_image(image), steps.readings.verdict_of(station, record.uuid)
         unsigned = judged is not None and judged.verified.verdict == "unsigned"  # it is called what it calls itself
         name = sheet.meta.name if unsigned else record.name or ""
         for one in sheet.channels:
@@ -150,7 +150,7 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
     return found
 
 
-def _tell(app: App, station: Station) -> None:
+def _print_names(app: App, station: Station) -> None:
     chosen = station.measurements.names
     facts = measure.running.measurement_job.station_facts(station)
     topics = measure.sinks.names.Topics(facts)

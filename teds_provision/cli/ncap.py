@@ -154,7 +154,7 @@ def run(
     station.unlock()  # nobody is asked for a passphrase later
     lines = DaemonLog(app)
     with tracing(trace) as opened:
-        service_run.run(station, replace(wanted, trace=opened), lines.tell)
+        service_run.run(station, replace(wanted, trace=opened), lines.write_event)
     if not lines.end():
         os._exit(0)  # all has ended in order; a line that nobody takes would hold the end of the process up for ever
 
@@ -175,7 +175,7 @@ class DaemonLog:
         self._thread = threading.Thread(target=self._run, name="lines", daemon=True)
         self._thread.start()
 
-    def tell(self, event: dict[str, Any]) -> None:
+    def write_event(self, event: dict[str, Any]) -> None:
         """One line, from whichever thread; returns at once."""
         with self._news:
             if len(self._waiting) >= MOST:

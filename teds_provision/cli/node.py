@@ -127,7 +127,7 @@ def create(
             "kind": channel.kind.word if channel.kind is not None else None,
             "unit": channel.unit.text,
         }
-        for channel in teds_room.sheet.Sheet.of_blocks(made.hardware).channels
+        for channel in teds_room.sheet.Sheet.from_blocks(made.hardware).channels
     ]
     app.emit(
         {
@@ -229,7 +229,7 @@ def run(
     ]
     stop = talk.meeting.IdleStop(None)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.ask())
+        signal.signal(number, lambda *_: stop.request_stop())
     signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes,)).start())
     running: list[Any] = []
     try:
@@ -271,10 +271,10 @@ def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) 
         if not hardware and percent is None:
             return None
         return hardware_room.board.Board(
-            teds.sheet.Sheet.of(teds.image.Image(uuid, hardware)),
+            teds.sheet.Sheet.from_image(teds.image.Image(uuid, hardware)),
             source=source,
             battery=None if percent is None else hardware_room.board.Battery(percent),
-            shown=lines.of(uuid.hex()),
+            shown=lines.observer_of(uuid.hex()),
             tell=app.warn,
         )
 
@@ -374,7 +374,7 @@ class ActuatorLines:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="actuators", daemon=True)
 
-    def of(self, uuid: str) -> Callable[[ActuatorReading], None]:
+    def observer_of(self, uuid: str) -> Callable[[ActuatorReading], None]:
         """Where the board of a node tells its states."""
 
         def shown(state: ActuatorReading) -> None:
@@ -412,12 +412,12 @@ class ActuatorLines:
             if self._told.get((uuid, channel)) != state:
                 self._told[uuid, channel] = state
                 try:
-                    self._tell(uuid, state)
+                    self._print_state(uuid, state)
                 except OSError:  # nobody reads, or the disk is full: the node runs on
                     self._stop.set()
                     return
 
-    def _tell(self, uuid: str, state: ActuatorReading) -> None:
+    def _print_state(self, uuid: str, state: ActuatorReading) -> None:
         name = state.name or f"channel {state.channel}"
         value = f"{state.value:g} {state.unit}".rstrip() if state.value is not None else f"raw {state.raw:g}"
         self._app.emit(

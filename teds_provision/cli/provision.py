@@ -153,7 +153,7 @@ def provision(
             line.scans = plant.line.Scans(sys.stdin, app.note)
             threading.Thread(target=line.scans.listen, name="scanner", daemon=True).start()
         if found is not None and found.office not in (None, base.identity.fingerprint):
-            post = plant.sign_requests.post_of(base, files)
+            post = plant.sign_requests.transport_for(base, files)
             line.office = office = plant.sign_requests.RemoteOffice(base, post, links.timeout)
             app.closing(office.close)
     elif any((calibrations, operator and report is None, files, only, label_to, scan)):
@@ -204,7 +204,7 @@ def _one(app: App, boards: BatchRun, questions: Questions) -> None:
         app.conclude({"findings": error.brought.findings}, None, error)
         return
     failure = steps_room.batch_sheet.BoardResult(done.who.uuid, 0.0, done).failure
-    _tell(app, done, error=failure, **_of_line(boards, done.who.uuid))
+    _print_result(app, done, error=failure, **_of_line(boards, done.who.uuid))
 
 
 def _of_line(boards: BatchRun, uuid: bytes) -> dict[str, Any]:
@@ -213,7 +213,7 @@ def _of_line(boards: BatchRun, uuid: bytes) -> dict[str, Any]:
 
 
 def _many(app: App, boards: BatchRun, questions: Questions, screen: Screen, *, totals: bool) -> None:
-    signal.signal(signal.SIGTERM, lambda *_: boards.stop.ask())
+    signal.signal(signal.SIGTERM, lambda *_: boards.stop.request_stop())
     try:
         for board in boards.many(questions):
             if boards.expected and not app.json:
@@ -268,7 +268,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
                 app.note(f"  {change.text}")
             if len(changes) > _CHANGES_SHOWN:
                 app.note(f"  and {len(changes) - _CHANGES_SHOWN} more")
-            if not app.ask("Write it?"):
+            if not app.ask_yes_no("Write it?"):
                 raise steps_room.batch_sheet.DeclinedError(f"Cancelled. Node {uuid.hex()} keeps its datasheet.")
 
     def low(question: str) -> None:
@@ -277,7 +277,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
 
     def take_over(question: str) -> None:
         with turn:  # whatever --yes says: it locks another station out, and no option of this command names that
-            if not app.ask(question):
+            if not app.ask_yes_no(question):
                 raise steps_room.batch_sheet.DeclinedError("Cancelled. The node keeps its key; nothing was changed.")
 
     asked = app.interactive
@@ -286,11 +286,11 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
     def adopt(brought: FactoryDatasheet) -> None:
         with turn:
             if not yes and not asked:
-                steps_room.adoption.nobody_adopts(brought)
+                steps_room.adoption.refuse_adoption(brought)
             _show_brought(app, brought)
             if yes:
                 return
-            if not app.ask("Sign this datasheet, and put the node in service?"):
+            if not app.ask_yes_no("Sign this datasheet, and put the node in service?"):
                 raise steps_room.batch_sheet.DeclinedError("Cancelled. The board's datasheet was not signed.")
 
     return steps_room.batch.Questions(
@@ -346,7 +346,7 @@ def _tell_plans(app: App, boards: BatchRun) -> None:
         raise click.exceptions.Exit(boards.worst.exit_code)
 
 
-def _tell(app: App, done: ProvisionResult, *, error: TedsProvisionError | None = None, **more: object) -> None:
+def _print_result(app: App, done: ProvisionResult, *, error: TedsProvisionError | None = None, **more: object) -> None:
     """Tell one node's end; ``error`` ends the command, ``more`` stands on the line of one of many."""
     for warning in done.warnings:
         app.warn(warning)
@@ -374,7 +374,7 @@ def _tell_board(app: App, board: BoardResult, **line: Any) -> None:
         failure = board.failure
         if failure is not None:  # an authentic board can fail: its type requires a calibration, a channel read nothing
             line["failure"] = {"code": failure.code, "message": failure.message, "hint": failure.hint}
-        _tell(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3), **line)
+        _print_result(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3), **line)
         if board.failure is not None and not app.json:
             app.fail_line(board.failure, uuid=board.uuid.hex(), time=board.time, row=board.row)
     elif board.error is not None:

@@ -52,7 +52,7 @@ def info(app: App, file: Path) -> None:
     recordings = measure_room.recordings
     recording, summary = recordings.opening.open_recording(file), recordings.summary.RecordingSummary()
     for entry in recording.entries():
-        summary.take(entry)
+        summary.add_entry(entry)
     result = summary.to_json(recording)
     app.emit(result, "\n".join(_lines(result, summary, recording)))
 
@@ -131,7 +131,7 @@ def show(app: App, file: Path, channels: tuple[int, ...], limit: int | None) -> 
     recording, summary = recordings.opening.open_recording(file), recordings.summary.RecordingSummary()
     left: float = limit or (math.inf if app.json else SHOWN)
     for entry in recording.entries():
-        summary.take(entry)
+        summary.add_entry(entry)
         if left > 0 and (cut := recordings.source.first_instants(entry, channels, left)) is not None:
             left -= len(cut.time)
             app.lines(list(_events(cut, summary) if app.json else _values(cut, summary)))

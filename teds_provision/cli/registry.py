@@ -312,7 +312,7 @@ def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
         pages = plant.status.page_list(station, member.fingerprint)
         listed = "\n".join(f"  {n:>6}  {local_time(created)}  {hash[:16]}" for n, hash, created in pages)
         app.note(f"The newest pages of {member.name}:\n{listed or '  none'}")
-    _emit_change(app, station, plant.owner.without(station, name, why, last), **_named(how))
+    _emit_change(app, station, plant.owner.draft_removal(station, name, why, last), **_named(how))
 
 
 @command("teds-provision registry renew --days 90", name="renew")
@@ -463,7 +463,7 @@ def disconnect(app: App, yes: bool, dry_run: bool) -> None:
 
 def _post(station: Station, files: Path | None) -> tuple[Transport, bool]:
     """What carries, and whether it is what this station joined by."""
-    joined = plant.connecting.post_of(station)
+    joined = plant.connecting.open_transport(station)
     if files is not None:
         named = plant.folder_transport.FolderTransport(files)
         return named, joined is not None and joined.where == str(files.resolve())
@@ -559,7 +559,7 @@ def status(app: App) -> None:
         "synced": record.synced,
         "conflicts": found.conflicts,
         "alarms": [_alarm(station, one) for one in found.alarms],
-        "to_rotate": plant.removed_members.due(station),
+        "to_rotate": plant.removed_members.rotations_due(station),
         "heads": list(found.heads),
         "open_doors": station.plant.tables.doors(),
     }
@@ -593,7 +593,7 @@ def _shown(station: Station, found: PlantStatus) -> str:
         lines.append(f"{one.name:<{wide}}  {' '.join(one.roles):<{roles}}  page {one.n:>5}  {age:>8}  {one.state}")
     last = f"last sync {local_time(found.record.synced)}" if found.record.synced else "never synced"
     lines.append(f"{_count(found.conflicts, 'conflict')}, {_count(found.unsent, 'event')} unsent, {last}")
-    review, due = plant.removed_members.last(station), plant.removed_members.due(station)
+    review, due = plant.removed_members.last(station), plant.removed_members.rotations_due(station)
     if review is not None and due:
         tap = f"; {review.alone} need a tap" if review.alone else ""
         lines.append(f"to rotate: {due} of {review.of}{tap}")
@@ -707,7 +707,9 @@ def accept(app: App, name: str, page: str | None, files: Path | None, yes: bool,
     station = app.station()
     held = plant.apply_pages.require_roster(station)
     member = plant.owner.require_member(held, name)
-    post = plant.folder_transport.FolderTransport(files) if files is not None else plant.connecting.post_of(station)
+    post = (
+        plant.folder_transport.FolderTransport(files) if files is not None else plant.connecting.open_transport(station)
+    )
     if dry_run:
         n, hash = plant.membership.branch(station, member.fingerprint, page, post)
         app.emit(

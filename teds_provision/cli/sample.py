@@ -128,7 +128,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
         found = measure.verified_session.operation(trusted.node)
         try:
             power = operation.commands.PowerReply.decode(
-                trusted.node.send(operation.commands.POWER, "to tell its power")
+                trusted.node.request(operation.commands.POWER, "to tell its power")
             )
         except NodeRefusedError:
             power = None
@@ -270,11 +270,11 @@ def ending(stop: IdleStop) -> Iterator[None]:
     def end(*_: object) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
-        stop.ask()
+        stop.request_stop()
 
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
-        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, lambda *_: stop.ask())
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, lambda *_: stop.request_stop())
     try:
         yield
     finally:

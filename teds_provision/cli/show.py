@@ -103,14 +103,14 @@ def show(
             raise UsageError("--plot works with one file.", hint="Run show once per file.")
         channels = teds.plot.plot_blocks(placed(shown[0].blocks), plot)
         app.note(f"Plotted in {plot}: channel {', '.join(map(str, channels))}.")
-    _tell(app, shown, form)
+    _print_files(app, shown, form)
     if any(file.malformed for file in shown) or (strict and any(map(_has_errors, shown))):
         raise click.exceptions.Exit(_BAD_DATA)
     if strict and any(guarded.severity == "error" for file in shown for guarded in file.guard):
         raise click.exceptions.Exit(_POLICY)
 
 
-def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
+def _print_files(app: App, files: Sequence[ShownFile], form: str) -> None:
     for file in files:
         for note in file.notes:
             app.note(f"{file.name}: {note}")

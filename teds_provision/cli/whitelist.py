@@ -123,7 +123,7 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
 def list_entries(app: App) -> None:
     """List every entry: UUID, pinned key, how it was proven, when it was added, and the name."""
     station = app.station()
-    entries = station.pins.each()
+    entries = station.pins.all_entries()
     if app.json:
         print_json_list("whitelist", map(steps.whitelist.as_dict, entries))
         return
@@ -185,9 +185,9 @@ def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     station = app.station()
     form = steps.whitelist.form_of(file, form)
     if not dry_run:
-        write_file(file, steps.whitelist.render(station.pins.each(), form))
-    listed = [steps.whitelist.as_dict(entry) for entry in station.pins.each()] if app.json else []
-    count = len(listed) if app.json else sum(1 for _ in station.pins.each())
+        write_file(file, steps.whitelist.render(station.pins.all_entries(), form))
+    listed = [steps.whitelist.as_dict(entry) for entry in station.pins.all_entries()] if app.json else []
+    count = len(listed) if app.json else sum(1 for _ in station.pins.all_entries())
     verb = "Would write" if dry_run else "Wrote"
     app.emit({"whitelist": listed, "file": str(file), "format": form}, f"{verb} {count} entries as {form} to {file}.")
 

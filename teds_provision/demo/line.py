@@ -30,7 +30,7 @@ from teds_provision.protocol.plant.roster import Role
 from teds_provision.protocol.plant.signing import SignRequest
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
-from teds_provision.steps.provision import ProvisionResult, inspect, provision
+from teds_provision.steps.provision import ProvisionResult, provision, verify_only
 from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, SilentReporter, StepResult
@@ -58,7 +58,7 @@ class _LocalOffice:
     def __init__(self, station: Station) -> None:
         self._station = station
 
-    def ask(self, request: SignRequest) -> bytes | None:
+    def request_signature(self, request: SignRequest) -> bytes | None:
         return answer(self._station, request.octets)
 
 
@@ -97,7 +97,7 @@ def _run(demo: Demo) -> LineDemoResult:
             run_node(folders[name], "--nfc", demo.nfc) as uuid,
             meet(office, demo.over("nfc"), uuid, SilentReporter()) as node,
         ):
-            step.detail = inspect(office, node, tests, SilentReporter()).verified.verdict
+            step.detail = verify_only(office, node, tests, SilentReporter()).verified.verdict
     totals = _proof(demo, office, bench)
     return LineDemoResult(tuple(demo.steps.done), line.passed, totals.words, tuple(refused))
 

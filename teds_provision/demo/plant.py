@@ -158,7 +158,7 @@ class _Story:
         self._sync("north")
         with self.demo.steps.step("registry remove") as step:
             last = plant.status.page_list(north, west.fingerprint)[0][0]
-            self._change(plant.owner.without(north, "west", "stolen", last))
+            self._change(plant.owner.draft_removal(north, "west", "stolen", last))
             if self.server is not None:
                 self.server.psql(plant.schema.close_sql(west.fingerprint), _DATABASE)
             step.detail = f"west, stolen; its pages up to {last} count"

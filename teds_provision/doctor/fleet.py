@@ -120,7 +120,7 @@ def seals(system: System) -> Iterator[Finding]:
             yield Finding("seals", "skipped", why, "teds-provision --passphrase-fd 3 doctor 3<FILE")
             return
         station.unlock()
-        broken = list(station.seals.all_broken())
+        broken = list(station.row_macs.all_broken())
     except StoreChangedError as error:
         yield Finding("seals", "failed", error.message, error.hint)
         return

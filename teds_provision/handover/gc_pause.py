@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def put_off() -> Iterator[None]:
+def pause_gc() -> Iterator[None]:
     """Search for no cycles of objects in the block: rows make none, and each search would look at all of them."""
     was = gc.isenabled()
     gc.disable()

@@ -31,7 +31,7 @@ from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
-from teds_provision.store import BulkRows, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, pages, utc_now
+from teds_provision.store import BulkRows, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, chunks, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Reporter
 
@@ -67,7 +67,7 @@ class ImportedRows:
     def take_in(self, nodes: Iterable[PlannedNode]) -> None:
         """Write all of them."""
         self.station.keys.refresh()
-        for taken in pages(nodes):
+        for taken in chunks(nodes):
             self._turn_to([one.node.uuid for one in taken])
             back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
             self.station.policy.take_back(back)
@@ -99,10 +99,10 @@ class ImportedRows:
     def _turn_to(self, uuids: Sequence[bytes]) -> None:
         """Read what is known here of a page of nodes."""
         station = self.station
-        self.known = station.nodes.of_page(uuids)
-        self.pins = station.pins.of_page(uuids)
+        self.known = station.nodes.get_many(uuids)
+        self.pins = station.pins.get_many(uuids)
         self.slots = station.keys.slots_of(uuids)
-        self.cas = station.keys.cas_of_page(uuids)
+        self.cas = station.keys.cas_among(uuids)
 
     def _key(self, node: BundledNode) -> KeyRecord:
         return self.station.keys.wrapped(
@@ -219,7 +219,7 @@ class NothingImportedError(PolicyError):
         self.bundle, self.nodes = bundle, nodes
 
 
-@gc_pause.put_off()
+@gc_pause.pause_gc()
 def plan_import(station: Station, source: Source, now: datetime | None = None) -> ImportPlan | ImportResult:
     """Open and check a bundle (octets, or a file), and say what would become of each node; changes nothing.
 
@@ -237,7 +237,7 @@ def plan_import(station: Station, source: Source, now: datetime | None = None) -
     check_times(bundle, now or datetime.now(UTC))
     _check_certified(station, opened)
     denied, passed_over = _new_revocations(station, opened)
-    nodes = tuple(_Judge(station, denied, bundle).each(bundle.nodes))
+    nodes = tuple(_Judge(station, denied, bundle).judge_nodes(bundle.nodes))
     if nodes and all(node.decision == "refused" for node in nodes):
         raise NothingImportedError(bundle, nodes)
     return ImportPlan(opened, content, nodes, denied, _is_known_ca(station, bundle.ca), passed_over)
@@ -260,7 +260,7 @@ def _is_known_ca(station: Station, ca: bytes) -> bool:
     return station.policy.counts(ca) and (certified or ca in station.policy.trusted_cas())
 
 
-@gc_pause.put_off()
+@gc_pause.pause_gc()
 def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = None) -> ImportResult:
     """Take the bundle in, all of it in one transaction, and sign its receipt."""
     bundle = plan.opened.bundle
@@ -300,9 +300,11 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
         for one in plan.nodes if station.plant.joined is not None else ():
             node, told = one.node, {"peer": bundle.sender, "bundle": bundle.id}
             if one.decision == "refused":
-                station.plant.tell("refused", node.uuid, why=one.why, **told)
+                station.plant.record_event("refused", node.uuid, why=one.why, **told)
             elif one.decision != "same":
-                station.plant.tell("took", node.uuid, epoch=node.epoch, key_id=node.kid, mode=bundle.mode, **told)
+                station.plant.record_event(
+                    "took", node.uuid, epoch=node.epoch, key_id=node.kid, mode=bundle.mode, **told
+                )
         refused = {refused.uuid.hex() for refused in receipt.refused}
         taken = [uuid for uuid in notes.uuids if uuid not in refused]
         detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}
@@ -346,9 +348,9 @@ class _Judge:
         """Names that nodes of this bundle get."""
         self._turn_to([])
 
-    def each(self, nodes: Iterable[BundledNode]) -> Iterator[PlannedNode]:
+    def judge_nodes(self, nodes: Iterable[BundledNode]) -> Iterator[PlannedNode]:
         """Judge every node."""
-        for page in pages(nodes):
+        for page in chunks(nodes):
             self._turn_to(page)
             for node in page:
                 why = self._obstacle(node) or self._stale_key(node)
@@ -357,11 +359,11 @@ class _Judge:
     def _turn_to(self, page: Sequence[BundledNode]) -> None:
         """Read what is known here of a page of nodes, and who has their names."""
         station, uuids = self.station, [node.uuid for node in page]
-        self.nodes = station.nodes.of_page(uuids)
-        self.pins = station.pins.among(self.nodes.values(), station.pins.of_page(uuids).values())
+        self.nodes = station.nodes.get_many(uuids)
+        self.pins = station.pins.pinned_among(self.nodes.values(), station.pins.get_many(uuids).values())
         self.bearers = station.nodes.bearers_of([node.name for node in page if node.name])
         self.held: dict[bytes, dict[str, tuple[str, int]]] = {}
-        for key in station.keys.of_page(uuids):
+        for key in station.keys.get_many(uuids):
             self.held.setdefault(key.uuid, {})[key.key_id] = (key.state, key.epoch)
 
     def _obstacle(self, node: BundledNode) -> str:
@@ -477,9 +479,9 @@ def prove_node(station: Station, node: Conversation) -> NodeProof:
 def proven_of(station: Station, uuids: Iterable[bytes]) -> set[bytes]:
     """Those of many nodes with which a session was opened under the key that is held, and no rotation is due."""
     proven: set[bytes] = set()
-    for page in pages(uuids):
-        active = {key.uuid for key in station.keys.of_page(page) if key.state == "active"}
-        proven |= active - station.keys.due_of_page(page)
+    for page in chunks(uuids):
+        active = {key.uuid for key in station.keys.get_many(page) if key.state == "active"}
+        proven |= active - station.keys.due_among(page)
     return proven
 
 

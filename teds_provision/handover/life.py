@@ -52,7 +52,7 @@ def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
     with station.transaction():
         if statement is not None:
             deny(station, statement, key=statement.fingerprint)
-            station.plant.tell("revoked", uuid, statement=statement.statement)
+            station.plant.record_event("revoked", uuid, statement=statement.statement)
         station.pins.remove(uuid)
         keys = station.keys.remove(uuid)
         station.nodes.drop_draft(uuid)

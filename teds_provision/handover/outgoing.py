@@ -34,7 +34,7 @@ from teds_provision.store import (
     NodeRecord,
     Tombstone,
     TrustRecord,
-    pages,
+    chunks,
     utc_now,
 )
 
@@ -177,22 +177,22 @@ class Selection:
 def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[bytes, str, int, str]]:
     """UUID, key id, epoch and state of the keys of the nodes that are wanted, or of all."""
     if wanted is None:
-        return station.keys.each_name()
-    records = (key for page in pages(wanted) for key in station.keys.of_page(page))
+        return station.keys.all_key_names()
+    records = (key for page in chunks(wanted) for key in station.keys.get_many(page))
     return ((key.uuid, key.key_id, key.epoch, key.state) for key in records)
 
 
 def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[bytes, str]:
     """Why each node of the wanted ones, or of all, cannot go, whatever its key is; "" for nothing."""
     known: Iterable[Sequence[NodeRecord | ExportEligibility]] = (
-        pages(station.nodes.each_shown())
+        chunks(station.nodes.all_shown_keys())
         if wanted is None
-        else (list(station.nodes.of_page(page).values()) for page in pages(wanted))
+        else (list(station.nodes.get_many(page).values()) for page in chunks(wanted))
     )
     stays: dict[bytes, str] = {}
     for page in known:
-        entries = station.pins.of_page([node.uuid for node in page])
-        pins = station.pins.among(page, entries.values())
+        entries = station.pins.get_many([node.uuid for node in page])
+        pins = station.pins.pinned_among(page, entries.values())
         stays |= {node.uuid: _why_node_stays(node, pins.get(node.uuid, "")) for node in page}
     return stays
 
@@ -257,7 +257,7 @@ def plan_export(station: Station, order: ExportOrder, now: datetime | None = Non
     return plans[0]
 
 
-@gc_pause.put_off()
+@gc_pause.pause_gc()
 def plan_exports(
     station: Station, order: ExportOrder, *, most: int = NODES_IN_A_BUNDLE, now: datetime | None = None
 ) -> list[ExportPlan]:
@@ -323,7 +323,7 @@ class _SharedFields:
         )
 
 
-@gc_pause.put_off()
+@gc_pause.pause_gc()
 def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> ExportResult:
     """Seal the bundle into a new file of mode 0600; a move's keys rest from before anybody could open that file.
 
@@ -356,7 +356,7 @@ class SealedBundle:
     signed_sha256: str
 
 
-@gc_pause.put_off()
+@gc_pause.pause_gc()
 def seal_export(station: Station, plan: ExportPlan, now: datetime) -> SealedBundle:
     """Seal a bundle in memory, for a parcel. Raises StoreError, VaultError, PolicyError (a node changed)."""
     made = _sealing(station, plan, now)
@@ -437,8 +437,8 @@ def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
 def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[LeavingNode, bytes]]:
     """Each node with the CA that it keeps."""
     own = station.ca
-    for page in pages(nodes):
-        kept = station.keys.cas_of_page([node.uuid for node in page])
+    for page in chunks(nodes):
+        kept = station.keys.cas_among([node.uuid for node in page])
         yield from ((node, kept.get(node.uuid, own)) for node in page)
 
 
@@ -506,10 +506,10 @@ def _sealing(station: Station, plan: ExportPlan, now: datetime) -> EnvelopeWrite
 
 def _bundled(station: Station, nodes: Iterable[LeavingNode]) -> Iterator[BundledNode]:
     """Read the nodes and unwrap their keys, a page at a time."""
-    for page in pages(nodes):
+    for page in chunks(nodes):
         uuids_of_page = [node.uuid for node in page]
-        records = station.nodes.handed_of_page(uuids_of_page)
-        keys = {(key.uuid, key.key_id): key for key in station.keys.of_page(uuids_of_page)}
+        records = station.nodes.exported_many(uuids_of_page)
+        keys = {(key.uuid, key.key_id): key for key in station.keys.get_many(uuids_of_page)}
         for leaving in page:
             record, key = records.get(leaving.uuid), keys.get((leaving.uuid, leaving.key_id))
             if record is None or record.point is None or key is None:
@@ -549,7 +549,7 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
         for node in plan.nodes:
             for peer in peers:
                 told = {"epoch": node.epoch, "key_id": node.key_id, "peer": peer, "mode": plan.mode, "bundle": plan.id}
-                station.plant.tell("gave", node.uuid, **told)
+                station.plant.record_event("gave", node.uuid, **told)
     if digests:
         detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex)}
         station.audit("export", None, "again" if files else "done", file=digests[0], **detail)

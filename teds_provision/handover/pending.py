@@ -19,7 +19,7 @@ from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
 from teds_provision.station.station import Station
-from teds_provision.store import Handover, Holder, pages
+from teds_provision.store import Handover, Holder, chunks
 
 OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
 
@@ -75,7 +75,7 @@ def content_digest(
         json.dumps([sender, sorted(to), mode, ca.hex()], separators=(",", ":")).encode()[:-1] + b",["
     )
     comma = ""
-    for page in pages(nodes):
+    for page in chunks(nodes):
         # as JSON, by hand: hex digits and a number need no quoting, and there may be ten thousand
         listed = [f'["{uuid.hex()}","{identifier}",{epoch}]' for uuid, identifier, epoch in page]
         digest.update(f"{comma}{','.join(listed)}".encode())
@@ -138,7 +138,7 @@ def undo(station: Station, row: Handover) -> UndoResult:
     with station.transaction():
         for uuid in uuids:
             _lift(station, uuid, row)
-            station.plant.tell("undone", uuid, bundle=row.id, peer=row.peers[0], why="taken back")
+            station.plant.record_event("undone", uuid, bundle=row.id, peer=row.peers[0], why="taken back")
         station.handovers.put(replace(row, state=UNDONE))
         station.audit("handover", None, "undone", handover=row.id, nodes=[uuid.hex() for uuid in uuids])
     return UndoResult(row, uuids, fresh=True)
@@ -200,7 +200,7 @@ def _settle(station: Station, row: Handover, receipt: Receipt) -> None:
             _lift(station, refused.uuid, row)
         else:
             station.keys.remove_holder(refused.uuid, receipt.sender)
-        station.plant.tell("undone", refused.uuid, bundle=row.id, peer=receipt.sender, why="refused")
+        station.plant.record_event("undone", refused.uuid, bundle=row.id, peer=receipt.sender, why="refused")
 
 
 def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -> None:
@@ -211,7 +211,7 @@ def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -
         tombstone = station.policy.tombstone(uuid)
         if tombstone is None or tombstone.handover_id != row.id:
             continue
-        for key in station.keys.of(uuid):
+        for key in station.keys.keys_of(uuid):
             # rows of version 1 do not name the keys: then those that were in use when the bundle was made
             in_bundle = left.get(uuid.hex(), "") or (key.key_id if key.created <= row.created else "")
             if key.key_id == in_bundle:

@@ -132,7 +132,7 @@ def _requested(station: Station, name: str | None, keystore: str | None, ask: As
             where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
             station.adopt(vault)
             with station.transaction():
-                station.identity.found(name, where, why, requested=vault.identity().point)
+                station.identity.establish(name, where, why, requested=vault.identity().point)
                 station.audit("init", None, "requested", fingerprint=fingerprint(vault.identity().point))
         else:
             vault = station.vault

@@ -18,7 +18,7 @@ from teds_provision.measure.verified_session import VerifiedSession
 from teds_provision.station.station import Station
 from teds_provision.steps import readings
 from teds_provision.steps.teds_read import read_in_between
-from teds_provision.steps.verify import known_of
+from teds_provision.steps.verify import freshness_floor_of
 from teds_provision.store.records import iso
 from teds_provision.teds.image import Image
 
@@ -80,7 +80,7 @@ class BackgroundReread:
 
     def _conclude(self, image: Image) -> None:
         trusted, uuid = self._trusted, self._trusted.sheet.uuid
-        known = known_of(self._station, uuid, trusted.node.proven)
+        known = freshness_floor_of(self._station, uuid, trusted.node.proven)
         verified = readings.keep(self._station, trusted.node, image, by=self._by, known=known, c=self._c).verified
         same = hashlib.sha256(image.security or b"").hexdigest() == trusted.fingerprint
         if same and verified.verdict in (

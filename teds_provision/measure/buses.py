@@ -106,7 +106,7 @@ class Buses:
         """Every bus."""
         return tuple(self._buses.values())
 
-    def of(self, sighting: Sighting) -> MeasuredBus:
+    def bus_of(self, sighting: Sighting) -> MeasuredBus:
         """The bus on which a node was seen."""
         return self._buses[sighting.port.place]
 

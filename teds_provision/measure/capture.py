@@ -13,7 +13,7 @@ from teds_provision.files import SHARED, read_text, write_whole
 from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
 from teds_provision.links import LinkSettings
-from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, settle
+from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
 from teds_provision.measure.sources import beside
 from teds_provision.measure.verified_session import open_trusted
 from teds_provision.station.station import Station
@@ -73,7 +73,7 @@ def capture_at(
             channel = trusted.channel(number)
             si = reference_for(channel, reference, unit, shown_unit_asked=shown_unit_asked)
             with steps.step("read") as step:
-                point = _point(settle(trusted, number), si)
+                point = _point(take_samples_of(trusted, number), si)
                 step.detail = f"raw {point.raw:.8g}, {point.count} samples"
         except SessionLostError as lost:
             raise lost.cause from lost

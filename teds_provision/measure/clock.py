@@ -137,7 +137,7 @@ class ClockMap:
             self._high += doubt
             self._when, age = tick, 0
         self._high = min(self._high, upper - self._rate * age)
-        if self._hull.take(tick, upper) and self._hull.count % REFIT_AFTER == 1:
+        if self._hull.add_arrival(tick, upper) and self._hull.count % REFIT_AFTER == 1:
             self._refit(tick)
 
     def host(self, ticks: NDArray[np.uint64]) -> NDArray[np.float64]:
@@ -276,7 +276,7 @@ class LowerHull:
         self._end = 0  # tick at which it ends
         self._hull: list[tuple[int, int]] = []
 
-    def take(self, tick: int, upper: int) -> bool:
+    def add_arrival(self, tick: int, upper: int) -> bool:
         """Take an arrival; whether it begins a new bucket."""
         if tick < self._end:
             # Of another stream it may be a little older than what came before it: then it tells nothing new.

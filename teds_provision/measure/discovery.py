@@ -23,7 +23,7 @@ from teds_provision.links.can.identify_broadcast import (
     SILENCE_SECONDS,
     FunctionalAnswers,
     ask_all,
-    settle,
+    ask_unclear_again,
     twice_text,
 )
 from teds_provision.links.can.isotp import Frame
@@ -217,7 +217,7 @@ class CanDiscovery(Discovery):
         self._round_ends()
 
     def _settle(self, found: FunctionalAnswers, began: float) -> None:
-        settled = settle(found, self.port.identify, until=began + 2 * LONGEST_SECONDS)
+        settled = ask_unclear_again(found, self.port.identify, until=began + 2 * LONGEST_SECONDS)
         for address in sorted(settled.conflicts):
             self._sightings.conflict(self.port.place, address)
         for address, identity in sorted(settled.identities.items()):
@@ -226,7 +226,7 @@ class CanDiscovery(Discovery):
         for uuid, addresses in settled.twice.items():
             self._sightings.note(twice_text(uuid, addresses))
 
-    def ask(self, address: int, seconds: float) -> None:
+    def identify_at(self, address: int, seconds: float) -> None:
         """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkError.
 
         An Announce from there ends it: the look-out asks because of that itself.
@@ -243,7 +243,7 @@ class CanDiscovery(Discovery):
             self._saw(address, identity)
 
     def _saw(self, address: int, identity: Identity) -> None:
-        self._sightings.saw(Sighting(identity, address, self.port, time.monotonic()))
+        self._sightings.add_sighting(Sighting(identity, address, self.port, time.monotonic()))
 
 
 # Nodes in the air: their data messages, and the look-out that connects to each and asks who it is (operation.md 6).
@@ -310,7 +310,7 @@ class BleDiscovery(Discovery):
         try:
             for contact in self.port.everyone(seconds=2 * LEAST, notice=_nothing):
                 number = contact.connection or 0
-                self._sightings.saw(Sighting(contact.identity, number, self.port, time.monotonic()))
+                self._sightings.add_sighting(Sighting(contact.identity, number, self.port, time.monotonic()))
         except NoNodeError:
             pass
         except LinkError as failure:

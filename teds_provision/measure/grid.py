@@ -54,7 +54,7 @@ class Grid:
         self._next: int | None = None  # number of the next row: its time is number × period
         self._test = False
 
-    def take(self, block: Block) -> None:
+    def add_block(self, block: Block) -> None:
         """Samples of a stream; channels that are not of this group are left out."""
         stream = self._stream(block)
         if stream is None or not len(block.time):

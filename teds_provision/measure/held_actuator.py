@@ -90,7 +90,7 @@ class HeldActuator:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self._trusted.node.send(idle(self.channel.number), "to let go of the actuator")
+            self._trusted.node.request(idle(self.channel.number), "to let go of the actuator")
             state, _ = operation(self._trusted.node).channels[self.channel.number]
             self.safe = bool(state & ChannelState.SAFE)
         except (TedsProvisionError, SessionLostError, KeyError):
@@ -106,7 +106,7 @@ class HeldActuator:
         octets = self.octets_of(value)
         began = time.monotonic()
         try:
-            self._trusted.node.send(
+            self._trusted.node.request(
                 write_data_set(self.channel.number, octets), "to set the actuator", within=self._dead_man / 1000
             )
         except SessionLostError as lost:

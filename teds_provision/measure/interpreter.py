@@ -62,7 +62,7 @@ class StreamInterpreter:
         self.problems = {number: reason for number, reason in why.items() if reason}
 
         usable = [one.channel.number not in self.problems for one in self._channels]
-        self._many = ManyChannels.of(self._channels, usable)
+        self._many = ManyChannels.side_by_side(self._channels, usable)
         self._invalid: dict[tuple[int, str], int] = {}
 
     @property

@@ -100,7 +100,7 @@ class NodeMatch:
         if self.fits is None:
             return ""
         image = station.nodes.datasheet(uuid)
-        judged = judge(self.fits, Sheet.of(image), datetime.now(UTC)) if image is not None else ()
+        judged = judge(self.fits, Sheet.from_image(image), datetime.now(UTC)) if image is not None else ()
         if met(self.fits, judged):
             return ""
         return next((one.why.rstrip(".") for one in judged), "its datasheet is unknown")
@@ -122,7 +122,7 @@ class UnsignedNodes:
         if judged.origin == "plain" or judged.verified.verdict != "unsigned":
             return f"its datasheet is {judged.verified.verdict}"
         image = station.nodes.datasheet(uuid)
-        return "" if image is not None and Sheet.of(image).channels else "it has no datasheet of its own"
+        return "" if image is not None and Sheet.from_image(image).channels else "it has no datasheet of its own"
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
     image = station.nodes.datasheet(uuid)
     if image is None:
         return NodeLoad()
-    sensors = [one for one in Sheet.of(image).channels if one.sample and not one.actuator]
+    sensors = [one for one in Sheet.from_image(image).channels if one.sample and not one.actuator]
     try:
         plans = plan_node(
             sensors_of(sensors, (), request.kind), time, rate=request.rate, kind=request.kind, at_most=True

@@ -148,7 +148,7 @@ class NodeSupervisor:
         """A set point for one of its actuators; dropped while it is not there."""
         driven = self._driven
         if driven is not None:
-            driven.take(command)
+            driven.queue_command(command)
 
     def join(self, seconds: float) -> None:
         """Wait for its end."""
@@ -171,25 +171,25 @@ class NodeSupervisor:
                 if self._request.newcomers:
                     final = isinstance(error, (NotAuthenticError, PolicyError, BadDataError))
                     if isinstance(error, NoRoomError):
-                        self._say("waiting", why="no room on the bus")
+                        self._set_state("waiting", why="no room on the bus")
                     else:
-                        self._say("refused" if final else "lost", error)
+                        self._set_state("refused" if final else "lost", error)
                     return
                 decided = self._standing is not None and error is self._standing.ended
                 if patience.gives_up(error, proven=self._proven, decided=decided, elsewhere=self._is_elsewhere):
-                    self._say("refused", error)
+                    self._set_state("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
                 lost: State = "refused" if isinstance(error, BadDatasheetError) else "lost"
-                self._say(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
-                self._wait(min(pause, patience.left), began)
+                self._set_state(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
+                self._wait(min(pause, patience.seconds_left), began)
                 pause = min(2 * pause, LAST_PAUSE)
-            self._say("ended", why=self._why)
+            self._set_state("ended", why=self._why)
         finally:
-            self._common_start.gone(self.uuid)
+            self._common_start.drop_node(self.uuid)
             if self._request.require is not None:
-                self._request.require.gone(self.uuid)
+                self._request.require.drop_node(self.uuid)
             if not self._comes_back:
                 for bus in self._buses.all():
                     bus.share.leave(self.uuid)
@@ -223,20 +223,24 @@ class NodeSupervisor:
     def _let_others_finish(self) -> None:
         """Wait while a command of this station works on the node: a claim in the middle would spoil what it does."""
         passed, since, told = 0.0, time.monotonic(), False
-        while passed < LONGEST_WORK and self._station.turn(self.uuid).is_taken and not self._stop.wait(WORKED_ON):
+        while passed < LONGEST_WORK and self._station.node_lock(self.uuid).is_taken and not self._stop.wait(WORKED_ON):
             passed = time.monotonic() - since
             if passed > TELL and not told:
                 told = True
-                self._say("waiting", why="a command of this station is using it")
+                self._set_state("waiting", why="a command of this station is using it")
 
     def _once(self) -> None:
         self._let_others_finish()
         standing = self._standing = NodeStanding(self._station, self.uuid)
         standing.require_measurable()
-        seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._request.timeout, self._patience.left), 1))
+        seconds = (
+            LOOKING
+            if self.ever_ran
+            else max(LOOKING, round(min(self._request.timeout, self._patience.seconds_left), 1))
+        )
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self.sighting = sighting
-        self.bus = self._buses.of(sighting)
+        self.bus = self._buses.bus_of(sighting)
         for other in self._buses.all():
             if other is not self.bus:
                 other.share.leave(self.uuid)
@@ -300,7 +304,7 @@ class NodeSupervisor:
         notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
         self._patience.has_run()
-        self._say("running", why="; ".join(note.removesuffix(".") for note in notes))
+        self._set_state("running", why="; ".join(note.removesuffix(".") for note in notes))
         self.ready.set()
 
     def _actuators(self, trusted: VerifiedSession) -> list[Channel]:
@@ -354,7 +358,7 @@ class NodeSupervisor:
             turn=self.turn,
             mapping=self.streams.mapping,
             echo=self._events.block,
-            tell=lambda why: self._say(self.state, why=why),
+            tell=lambda why: self._set_state(self.state, why=why),
         )
 
     def _subscribe(
@@ -371,10 +375,10 @@ class NodeSupervisor:
                 share.taken[self.uuid] = plans.load
             try:
                 for plan in plans.streams:
-                    self.streams.subscribe(bus, trusted, plan, address, ahead=self._common_start.until(start))
+                    self.streams.subscribe(bus, trusted, plan, address, ahead=self._common_start.seconds_until(start))
             except NodeRefusedError as refusal:
                 if refusal.reason == Reason.TOO_LATE and start != SOON:
-                    self._common_start.late(self.uuid)
+                    self._common_start.start_by_itself(self.uuid)
                     start = SOON
                 elif refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
                     raise
@@ -415,7 +419,7 @@ class NodeSupervisor:
             standing.require()
             if standing.mark != mark:
                 mark = standing.mark
-                self._say("running", why=mark)
+                self._set_state("running", why=mark)
             now = time.monotonic()
             if self._doubted(now) or now - told >= self._lease / 3:
                 with self.turn:
@@ -432,7 +436,7 @@ class NodeSupervisor:
                     self._events.read(self.uuid)
             if self.streams.clock.lie and not lied:
                 lied = True
-                self._say("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")
+                self._set_state("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")
             silent = self.streams.silent(now)
             if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
                 raise failure
@@ -488,7 +492,7 @@ class NodeSupervisor:
                 bus.share.taken.pop(self.uuid, None)
         if answers:
             with suppress(TedsProvisionError, SessionLostError):
-                trusted.node.send(idle(0), "to let go")
+                trusted.node.request(idle(0), "to let go")
         else:
             trusted.node.forget()
         self.trusted = None
@@ -513,7 +517,9 @@ class NodeSupervisor:
             invalid_why=added(*(one.invalid_why for one in sums)),
         )
 
-    def _say(self, state: State, error: TedsProvisionError | None = None, more: str = "", *, why: str = "") -> None:
+    def _set_state(
+        self, state: State, error: TedsProvisionError | None = None, more: str = "", *, why: str = ""
+    ) -> None:
         self.state = state
         self._told = why or (error.message.rstrip(".") + more if error is not None else "")
         self._events.report(self.report())

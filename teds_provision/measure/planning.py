@@ -104,7 +104,7 @@ class BusShare:
         with self.lock:
             return len(self.expected | self.taken.keys())
 
-    def gone(self, uuid: bytes) -> None:
+    def drop_node(self, uuid: bytes) -> None:
         """A node that ended for good, or is on another bus, wants nothing any more."""
         with self.lock:
             self.expected.discard(uuid)
@@ -112,10 +112,10 @@ class BusShare:
             self.lock.notify_all()
 
     def leave(self, uuid: bytes) -> None:
-        """As :meth:`gone`, and what it takes is free."""
+        """As :meth:`drop_node`, and what it takes is free."""
         with self.lock:
             self.taken.pop(uuid, None)
-        self.gone(uuid)
+        self.drop_node(uuid)
 
     def _kept_for_others(self, uuid: bytes, room: float) -> float:
         """What is kept for others of ``room``: whoever wants less than an equal part gets it, the rest share evenly."""
@@ -284,11 +284,15 @@ def _plan(
             f"One sample of channels {', '.join(str(n) for n, _ in widths)} does not fit into a message."
         )
     n = max(1, min(most, BLOCK // period)) if kind != StreamKind.EVENT else 1
-    plan = StreamPlan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
+    plan = StreamPlan.for_channels(
+        number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern
+    )
     # Fuller messages where the bus is short of room: the overhead of a message is 13 octets.
     while n < most and _load(plan, bus) > MOST_LOAD / 2 and kind != StreamKind.EVENT:
         n = min(most, 2 * n)
-        plan = StreamPlan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
+        plan = StreamPlan.for_channels(
+            number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern
+        )
     return plan
 
 

@@ -71,7 +71,7 @@ class Presence:
     gone: int = 0  # how often a node that had been seen, or was never looked for, became missing
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
-    def saw(self, sighting: Sighting) -> None:
+    def add_sighting(self, sighting: Sighting) -> None:
         """Take what a look-out saw; who keeps this node at another place is told."""
         place = (sighting.port.place, sighting.address)
         with self._turn:

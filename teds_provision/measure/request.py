@@ -39,7 +39,7 @@ class Requirements:
         with self._turn:
             self._coming.update(uuids)
 
-    def gone(self, uuid: bytes) -> None:
+    def drop_node(self, uuid: bytes) -> None:
         """One that will not show any, after all."""
         with self._turn:
             self._coming.discard(uuid)

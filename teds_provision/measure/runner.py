@@ -156,7 +156,7 @@ class Measurement:
 
     def _until(self, now: float, duration: float | None) -> float:
         """When ``duration`` seconds of data are over: they count from the first values."""
-        left = self._common_start.left
+        left = self._common_start.seconds_left
         if duration is None or left is None or not any(keeper.ever_ran for keeper in self.keepers):
             return math.inf
         self.began()
@@ -206,7 +206,7 @@ class Measurement:
             block = self._for_grid.popleft()
             grid = self._grids.get(block.uuid if self._open else "")
             if grid is not None:
-                grid.take(block)
+                grid.add_block(block)
         now = self._host.now()
         return [rows for grid in self._grids.values() if (rows := grid.rows(now)) is not None]
 
@@ -262,7 +262,7 @@ class Measurement:
             keeper.stop(why)
             keeper.join(ENDING)
 
-    def let_go(self, uuid: bytes, why: str, seconds: float) -> bool:
+    def suspend_node(self, uuid: bytes, why: str, seconds: float) -> bool:
         """End one node in order for as long as somebody else works on it; False where that took longer."""
         self.lent.add(uuid)
         keeper = self._keeper(uuid)
@@ -271,7 +271,7 @@ class Measurement:
         keeper.stop(why, comes_back=True)
         return keeper.done.wait(seconds)
 
-    def take_back(self, uuid: bytes) -> None:
+    def resume_node(self, uuid: bytes) -> None:
         """Measure a node again that was let go."""
         keeper = self._keeper(uuid)
         if keeper is None or uuid not in self.lent:
@@ -375,7 +375,7 @@ class Measurement:
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
         sinks = [{"sink": one.name, "written": one.stats.written, "dropped": one.stats.dropped} for one in self.sinks]
-        return MeasurementEnd(nodes, files, worst, self._common_start.apart, sinks)
+        return MeasurementEnd(nodes, files, worst, self._common_start.spread, sinks)
 
 
 def _summary(keeper: NodeSupervisor) -> dict[str, Any]:

@@ -53,7 +53,9 @@ class SampleSeries:
         return bool(self.interpreter.calibrated(self.raw, self.others)[2].any())
 
 
-def settle(trusted: VerifiedSession, number: int, *, count: int = SAMPLES, seconds: float = SECONDS) -> SampleSeries:
+def take_samples_of(
+    trusted: VerifiedSession, number: int, *, count: int = SAMPLES, seconds: float = SECONDS
+) -> SampleSeries:
     """Take ``count`` samples of a sensor over at least ``seconds``, and let it go.
 
     Raises BadDataError (no such channel, an actuator, an event sensor), NodeRefusedError, LinkError; PolicyError where
@@ -72,7 +74,7 @@ def settle(trusted: VerifiedSession, number: int, *, count: int = SAMPLES, secon
         began = time.monotonic()
         for taken in range(count):
             time.sleep(max(0.0, began + taken * seconds / (count - 1) - time.monotonic()))
-            reply = SampleReply.decode(trusted.node.send(sample(tuple(readers)), "to sample"), width)
+            reply = SampleReply.decode(trusted.node.request(sample(tuple(readers)), "to sample"), width)
             if not reply.valid:
                 raise PolicyError(
                     f"The node marks the reading of channel {number} as invalid: it is warming up, or has a fault.",
@@ -80,7 +82,7 @@ def settle(trusted: VerifiedSession, number: int, *, count: int = SAMPLES, secon
                 )
             octets += reply.data
     finally:
-        trusted.node.send(idle(0), "to let go")
+        trusted.node.request(idle(0), "to let go")
     rows = np.frombuffer(bytes(octets), dtype=np.uint8).reshape(count, width)
     raws, at = {}, 0
     for each, reader in readers.items():

@@ -72,14 +72,14 @@ def take_samples(trusted: VerifiedSession, numbers: Sequence[int]) -> list[Sampl
     good: dict[int, bool] = {}
     for part in _parts(interpreters):
         width = sum(interpreters[number].octets for number in part)
-        reply = SampleReply.decode(trusted.node.send(sample(part), "to sample"), width)
+        reply = SampleReply.decode(trusted.node.request(sample(part), "to sample"), width)
         at, stamp = 0, _moment(clock, wall, reply.tick)
         for number in part:
             one = interpreters[number]
             raws[number] = one.reader.raw(reply.data[at : at + one.octets])
             times[number], good[number] = stamp, reply.valid
             at += one.octets
-    trusted.node.send(idle(0), "to let go")
+    trusted.node.request(idle(0), "to let go")
     return [_sample(interpreters[one.number], raws, good, times[one.number]) for one in channels]
 
 

@@ -62,7 +62,7 @@ class ReceivedStream:
         self._last_instant = 0 if plan.subscribe.kind == StreamKind.FREE else plan.span - plan.subscribe.period
         self._test_pattern = plan.subscribe.test_pattern
 
-    def take(self, frame: Frame) -> None:
+    def handle_frame(self, frame: Frame) -> None:
         """A frame of this stream."""
         self._take_early()
         self._assemble(frame)
@@ -73,7 +73,7 @@ class ReceivedStream:
 
     def _assemble(self, frame: Frame) -> None:
         segment = frame.identifier >> 8 & 7
-        octets = self.assembly.take(segment, frame.data)
+        octets = self.assembly.add_segment(segment, frame.data)
         if octets is not None:
             self.whole(octets, int((frame.at or time.monotonic()) * 1e9))
 
@@ -112,7 +112,7 @@ class ReceivedStream:
         if not came:
             return
         with self.mapping:
-            messages = self.receiver.take_all(came, self.clock.ahead(came[-1][1]))
+            messages = self.receiver.open_messages(came, self.clock.ahead(came[-1][1]))
             if messages:
                 self._note_arrival(came, messages)
             blocks = self.interpreter.blocks(messages)
@@ -256,7 +256,7 @@ class CanStreamReceiver(StreamReceiver):
         key = (frame.identifier & 0xFF, frame.identifier >> 11 & 3)
         heard = self._streams.get(key)
         if heard is not None:
-            heard.take(frame)
+            heard.handle_frame(frame)
         elif (early := self._early.get(key)) is not None and (frame.at or math.inf) >= early.since:
             early.frames.append(frame)
         return heard

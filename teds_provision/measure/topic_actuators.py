@@ -55,7 +55,10 @@ class _Actuator:
 
 
 class TopicActuators:
-    """The actuators of one node in one session. ``take`` returns at once; the newest set point of each counts."""
+    """The actuators of one node in one session.
+
+    ``queue_command`` returns at once; the newest set point of each counts.
+    """
 
     def __init__(
         self,
@@ -83,7 +86,7 @@ class TopicActuators:
         self._thread = threading.Thread(target=self._run, name=f"actuators {trusted.uuid[:8]}", daemon=True)
         self._thread.start()
 
-    def take(self, command: SetPointCommand) -> None:
+    def queue_command(self, command: SetPointCommand) -> None:
         """A set point in the SI unit of the datasheet."""
         with self._news:
             if command.channel in self._actuators and not self._stop:
@@ -130,7 +133,7 @@ class TopicActuators:
         actuator.came.append(command.received)
         with self._turn:
             self._send(command, actuator, octets)
-        self._say(command.channel, actuator, octets)
+        self._echo_sample(command.channel, actuator, octets)
 
     def _seconds_left(self, command: SetPointCommand) -> float:
         """Seconds until a set point is too old; raises LinkError where it is."""
@@ -142,7 +145,7 @@ class TopicActuators:
     def _send(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
         self._seconds_left(command)
         if self._unsure:
-            self._trusted.node.send(CLOCK, "to tell its time", within=self._dead_man / 1000)
+            self._trusted.node.request(CLOCK, "to tell its time", within=self._dead_man / 1000)
             self._unsure = False
         now = time.monotonic()
         if now >= actuator.claimed_until:
@@ -173,7 +176,7 @@ class TopicActuators:
 
     def _write(self, command: SetPointCommand, octets: bytes) -> None:
         words = write_data_set(command.channel, octets)
-        self._trusted.node.send(words, "to set the actuator", within=self._seconds_left(command))
+        self._trusted.node.request(words, "to set the actuator", within=self._seconds_left(command))
 
     def _claim(self, number: int, actuator: _Actuator) -> None:
         actuator.driver = None
@@ -202,7 +205,7 @@ class TopicActuators:
         number = command.channel
         if actuator.driver is None:
             layout = Layout((number,), (len(octets),))
-            reply = DriveReply.decode(self._trusted.node.send(drive([number]), "to be driven"))
+            reply = DriveReply.decode(self._trusted.node.request(drive([number]), "to be driven"))
             key = self._trusted.node.message_key
             actuator.driver = Driver(layout, reply, key, dead_man=self._dead_man, after=self._last_drive)
             self._last_drive = reply.run
@@ -212,7 +215,7 @@ class TopicActuators:
         message = actuator.driver.seal((octets,), now, hold=left)
         self._send_message(message)
 
-    def _say(self, number: int, actuator: _Actuator, octets: bytes) -> None:
+    def _echo_sample(self, number: int, actuator: _Actuator, octets: bytes) -> None:
         """Echo what was applied, as a sample of the actuator's channel."""
         one = actuator.interpreter
         raw = one.reader.raw(octets)

@@ -23,8 +23,8 @@ from teds_provision.steps.agree import require_session
 from teds_provision.steps.board_type import operate
 from teds_provision.steps.readings import keep
 from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify import known_of, require_authentic
-from teds_provision.steps.verify_node import NodeVerification, look_in_session
+from teds_provision.steps.verify import freshness_floor_of, require_authentic
+from teds_provision.steps.verify_node import NodeVerification, verify_in_session
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.profile import ChannelProfile
 from teds_provision.teds.sheet import Channel, ChannelKind, Sheet
@@ -146,7 +146,7 @@ def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: boo
     """
     require_measurable(station, node.uuid)
     require_session(station, node)
-    return trusted_from(station, node, look_in_session(station, node, by=by), unsigned=unsigned)
+    return trusted_from(station, node, verify_in_session(station, node, by=by), unsigned=unsigned)
 
 
 def open_unverified(station: Station, node: Conversation, *, by: str) -> VerifiedSession:
@@ -157,7 +157,7 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Verifie
     """
     require_measurable(station, node.uuid)
     require_session(station, node)
-    looked = look_in_session(station, node, by=by)
+    looked = verify_in_session(station, node, by=by)
     if looked.verified.verdict == "authentic":
         raise PolicyError("Its datasheet is signed now.")
     if looked.verified.verdict != "unsigned":
@@ -165,11 +165,13 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Verifie
     image = looked.image
     if looked.kept:  # its Security TEDS names no digest of the others: what was read before the start says nothing
         c, image = node.c, read_image(node)
-        verified = keep(station, node, image, by=by, known=known_of(station, node.uuid, node.proven), c=c).verified
+        verified = keep(
+            station, node, image, by=by, known=freshness_floor_of(station, node.uuid, node.proven), c=c
+        ).verified
         if verified.verdict != "unsigned":
             require_authentic(verified)
     digest = hashlib.sha256(image.security or b"").hexdigest()
-    return VerifiedSession(node, Sheet.of(image), digest, "", unverified=True)
+    return VerifiedSession(node, Sheet.from_image(image), digest, "", unverified=True)
 
 
 def trusted_from(
@@ -183,7 +185,7 @@ def trusted_from(
     record = station.nodes.get(node.uuid)
     name = record.name if record is not None and record.name else ""
     digest = hashlib.sha256(image.security or b"").hexdigest()
-    sheet = Sheet.of(image).shown_in(shown_units(station, node.uuid))
+    sheet = Sheet.from_image(image).shown_in(shown_units(station, node.uuid))
     frames = {number: one for (uuid, number), one in station.measurements.frames.items() if uuid == node.uuid}
     return VerifiedSession(node, sheet, digest, name, bare, looked.kept, channel_profiles(station, node.uuid), frames)
 
@@ -205,7 +207,7 @@ def ask_clock(node: Conversation) -> tuple[ClockReply, Exchange]:
     if isinstance(link, TimestampedLink):
         link.left = link.came = 0.0
     asked = time.monotonic_ns()
-    reply = ClockReply.decode(node.send(CLOCK, "to tell its time"))
+    reply = ClockReply.decode(node.request(CLOCK, "to tell its time"))
     answered = time.monotonic_ns()
     if isinstance(link, TimestampedLink) and link.left < link.came:
         asked, answered = math.floor(link.left * 1e9), math.ceil(link.came * 1e9)
@@ -219,4 +221,4 @@ def claim(trusted: VerifiedSession, channel: int, *, lease: int, dead_man: int |
 
 def operation(node: Conversation) -> OperationReply:
     """What the node claims and does (128.19)."""
-    return OperationReply.decode(node.send(commands.OPERATION, "to tell its mode"))
+    return OperationReply.decode(node.request(commands.OPERATION, "to tell its mode"))

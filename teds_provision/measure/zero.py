@@ -16,7 +16,7 @@ from teds_provision.errors import BadDataError, PolicyError
 from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.measure.held_actuator import unit_for
-from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, settle
+from teds_provision.measure.sample_series import SampleSeries, reference_for, require_still, take_samples_of
 from teds_provision.measure.sources import beside
 from teds_provision.measure.verified_session import VerifiedSession, operation, trusted_from
 from teds_provision.protocol.datasheet import SignedNodeKey
@@ -26,7 +26,7 @@ from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import guard
 from teds_provision.steps.commands import NodeVisit, at_node
 from teds_provision.steps.sign import sign
-from teds_provision.steps.verify_node import NodeVerification, look_in_session, verify_node
+from teds_provision.steps.verify_node import NodeVerification, verify_in_session, verify_node
 from teds_provision.steps.write import Low, wait_for_charge, write
 from teds_provision.talk.conversation import SessionLostError
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
@@ -126,13 +126,13 @@ class _ZeroRun:
     def run(self) -> ZeroResult:
         station, node = self.visit.station, self.visit.node
         require_session(station, node)
-        looked = look_in_session(station, node, by=_NAME)
+        looked = verify_in_session(station, node, by=_NAME)
         image, trusted = looked.image, trusted_from(station, node, looked)
         with self.steps.step("read") as step:
             channel, own = _adjustable(trusted, self.order.channel)
             wanted = self._wanted(channel, own)
             turn = turn_of(own, full_turn=channel.full_turn)
-            settled = settle(trusted, channel.number)
+            settled = take_samples_of(trusted, channel.number)
             reading = require_still(settled)
             step.detail = f"{channel.show(_si(channel, own, reading.mean))}, {reading.count} samples"
         offset = offset_for(own, reading.mean, wanted, turn)
@@ -220,7 +220,9 @@ class _ZeroRun:
             trusted = trusted_from(station, node, NodeVerification(written.on_node, judged))
             channel, own = _adjustable(trusted, found.channel.number)
             turn = turn_of(own, full_turn=channel.full_turn)
-            after = reading_of(settle(trusted, channel.number, count=_AFTERWARDS, seconds=0.0).calibrated(), turn)
+            after = reading_of(
+                take_samples_of(trusted, channel.number, count=_AFTERWARDS, seconds=0.0).calibrated(), turn
+            )
         said = {"channel": channel.number, "offset": found.offset, "unit": channel.si_unit}
         station.audit("zero", node.uuid, "done", **said, sequence=signed.sequence)
         return replace(

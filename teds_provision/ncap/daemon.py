@@ -61,7 +61,7 @@ class Daemon:
         self._takes_set_points = sinks.take_set_points
         self.names = Names(station, self.roster, self.live, self.measuring.is_measured, self.measuring.facts_of)
         self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
-        self.provisioning = Provisioning(station, self.roster, self.live, self.desk, self.measuring.apart)
+        self.provisioning = Provisioning(station, self.roster, self.live, self.desk, self.measuring.unmeasured)
         self.holding = ActuatorLeases(
             station,
             self.live,
@@ -197,15 +197,15 @@ class Daemon:
         return next((watch.port for watch in self.watches if watch.place == place), None)
 
     def _saw(self, sighting: Sighting) -> None:
-        self.measuring.saw(sighting.uuid.hex())
+        self.measuring.on_sighting(sighting.uuid.hex())
         for watch in self.watches:
             if watch.port is sighting.port:
-                watch.saw(sighting)
+                watch.on_sighting(sighting)
 
     def _free_again(self, uuid: str) -> None:
         """A node was looked at, or provisioned: now it may be one that is measured."""
         if self.roster.seen(uuid).present:
-            self.measuring.saw(uuid)
+            self.measuring.on_sighting(uuid)
 
     def serve_node(self, node: Conversation) -> bool:
         """Whether somebody asked for this node, or it is to be taken up; then that was done."""
@@ -391,9 +391,9 @@ class Daemon:
 
         Raises NotFoundError, FrozenError (it is measured), NodeBusyError (it is worked on).
         """
-        with self.turns.of(uuid, "it is removed"):
+        with self.turns.hold(uuid, "it is removed"):
             with self.station.lock("virtual"):  # nobody begins to measure it meanwhile
-                if self.measuring.of(uuid) is not None:
+                if self.measuring.measurement_of(uuid) is not None:
                     raise FrozenError(f"Node {uuid} is being measured.", hint="End the measurement first.")
                 one = self.virtuals.forget(uuid)
             self.virtuals.end(one)

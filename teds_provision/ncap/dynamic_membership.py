@@ -128,7 +128,7 @@ class DynamicMembership:
 
     # -- from the threads of the look-outs ---------------------------------------------------------------------------
 
-    def saw(self, uuid: str) -> None:
+    def on_sighting(self, uuid: str) -> None:
         """A node answered on a bus: its turn is taken where it is meant and free."""
         with self._guard:
             known = uuid in self._members or uuid in self._arrived
@@ -162,7 +162,7 @@ class DynamicMembership:
 
     def _arrive(self, uuid: str) -> None:
         try:
-            self._turns.take(uuid, f"measurement {self._job.kept.id}", wait=0.0, frozen=True)
+            self._turns.acquire(uuid, f"measurement {self._job.kept.id}", wait=0.0, frozen=True)
         except TedsProvisionError:  # it is looked at, or provisioned: it joins when that is done
             with self._guard:
                 self._busy[uuid] = time.monotonic() + LOOK
@@ -219,7 +219,7 @@ class DynamicMembership:
         with self._guard:
             arrived, self._arrived = list(self._arrived), {}
         for uuid in arrived:
-            self._turns.give(uuid)
+            self._turns.release(uuid)
         self._askers.shutdown(wait=False, cancel_futures=True)
 
     def _gather(self) -> None:
@@ -239,7 +239,7 @@ class DynamicMembership:
         version = self._station.version()
         if now - self._welcomed >= WELCOMING:
             self._welcomed = now
-            held = {uuid for uuid, *_ in self._station.keys.each_name()}
+            held = {uuid for uuid, *_ in self._station.keys.all_key_names()}
             self._buses.sightings.welcome(held)
         changed = version != self._version or self._anew.is_set()
         if not changed or now - self._followed < FOLLOWING:
@@ -260,14 +260,14 @@ class DynamicMembership:
             del self._waits[uuid]
         for uuid in dict.fromkeys((*mended, *(sighting.uuid.hex() for sighting in self._buses.sightings.all()))):
             if uuid not in self._waits and self._roster.seen(uuid).present:
-                self.saw(uuid)
+                self.on_sighting(uuid)
 
     def _reserve(self, uuid: str) -> None:
         """Say what it wants of its bus before the first of those that come together is given its part."""
         sighting = self._buses.sightings.seen_at(bytes.fromhex(uuid))
         if sighting is None:
             return
-        share = self._buses.of(sighting).share
+        share = self._buses.bus_of(sighting).share
         load = self._members[uuid].load = load_of(self._station, sighting.uuid, self._job.request, share.time)
         if not self._lacks_room(uuid, share.room):
             share.expect([sighting.uuid], load.bus)
@@ -291,7 +291,7 @@ class DynamicMembership:
             if sighting is None and uuid in self._places:  # a session failed there: whoever answers there joins
                 self._askers.submit(self._ask, self._places[uuid])
             return
-        room = self._buses.of(sighting).share.room
+        room = self._buses.bus_of(sighting).share.room
         why = self._lacks_room(uuid, room)
         if why:
             self._wait(uuid, why, room)
@@ -325,13 +325,13 @@ class DynamicMembership:
             self._places[uuid] = last
         self._release(uuid)
         if isinstance(error, NoRoomError) and sighting is not None:
-            self._waits[uuid] = _WaitingNode(now + AGAIN, self._buses.of(sighting).share.room)
+            self._waits[uuid] = _WaitingNode(now + AGAIN, self._buses.bus_of(sighting).share.room)
         elif isinstance(error, (NotAuthenticError, PolicyError, BadDataError)):
             self._waits[uuid] = _WaitingNode(now + AGAIN)
             if last is not None and last.identity.state == NodeState.FACTORY:  # whoever adopts hears it, now it is free
                 self._askers.submit(self._ask, last)
         elif error is not None and sighting is not None and sighting is not last:  # it was seen elsewhere meanwhile
-            self.saw(uuid)
+            self.on_sighting(uuid)
         elif error is not None and last is not None:
             self._lost[uuid] = _LostNode(last, now, now + FIRST_ASK)
         if self._why_not(uuid):
@@ -345,7 +345,7 @@ class DynamicMembership:
         member.stack.close()
         for bus in self._buses.all():
             bus.share.leave(bytes.fromhex(uuid))
-        self._turns.give(uuid)
+        self._turns.release(uuid)
         self._left.add(uuid)
         self._told_left(uuid)
 
@@ -360,12 +360,12 @@ class DynamicMembership:
                 del self._busy[uuid]
         for uuid in busy:
             if self._roster.seen(uuid).present:
-                self.saw(uuid)
+                self.on_sighting(uuid)
         for uuid, waits in list(self._waits.items()):
             if now >= waits.at or (waits.room is not None and self._room_of(uuid) > waits.room + 1e-6):
                 del self._waits[uuid]
                 if self._roster.seen(uuid).present:
-                    self.saw(uuid)
+                    self.on_sighting(uuid)
                 else:
                     self._is_past(uuid)
         for uuid, lost in list(self._lost.items()):
@@ -377,11 +377,11 @@ class DynamicMembership:
 
     def _room_of(self, uuid: str) -> float:
         sighting = self._buses.sightings.seen_at(bytes.fromhex(uuid))
-        return self._buses.of(sighting).share.room if sighting is not None else 0.0
+        return self._buses.bus_of(sighting).share.room if sighting is not None else 0.0
 
     def _ask(self, sighting: Sighting) -> None:
         """Ask a lost node where it was; where it answers, it is seen, and so joins."""
         with suppress(LinkError, KeyError):
-            lookout = self._buses.of(sighting).lookout
+            lookout = self._buses.bus_of(sighting).lookout
             if isinstance(sighting.port, CanPort) and isinstance(lookout, CanDiscovery):
-                lookout.ask(sighting.address, ANSWERING)
+                lookout.identify_at(sighting.address, ANSWERING)

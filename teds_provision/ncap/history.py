@@ -198,7 +198,7 @@ class History:
         """How many channels have a past."""
         return len(self._channels)
 
-    def of(
+    def channel_history(
         self, uuid: str, channel: int, since: float | None = None, until: float | None = None, points: int = 600
     ) -> dict[str, Any]:
         """At most ``points`` bins of a channel between two moments (unix seconds; None: an hour ago, now).

@@ -148,7 +148,7 @@ class Live:
         text = json.dumps({"type": "event", **line})
         loop = self._loop
         if loop is not None and not loop.is_closed():
-            loop.call_soon_threadsafe(self._tell, text, json.dumps({"type": "event", **for_readers(line)}))
+            loop.call_soon_threadsafe(self._broadcast, text, json.dumps({"type": "event", **for_readers(line)}))
 
     def last(self, uuid: str, channel: int) -> LastValue | None:
         """The newest value of a channel."""
@@ -187,9 +187,9 @@ class Live:
             if now - told >= _TOLD:
                 told = now
                 beat = json.dumps({"type": "beat", "time": time.time()})
-                self._tell(beat, beat)
+                self._broadcast(beat, beat)
 
-    def _tell(self, text: str, for_reader: str) -> None:
+    def _broadcast(self, text: str, for_reader: str) -> None:
         for listener in self._listeners:
             listener.event(for_reader if listener.reader else text)
 

@@ -138,7 +138,7 @@ class MeasurementSupervisor:
             self._begin(KeptMeasurement(name, match=name, rate=rate, dead_man=self._dead_man))
 
     @contextmanager
-    def apart(self, uuid: str, why: str) -> Iterator[None]:
+    def unmeasured(self, uuid: str, why: str) -> Iterator[None]:
         """A node that is measured unverified is nobody's for the length of the block, in which it may be signed."""
         loan = NodeLoan(uuid, why)
         with self._guard:
@@ -150,18 +150,18 @@ class MeasurementSupervisor:
             for newcomers in mine:
                 newcomers.part(uuid, why)
             until = time.monotonic() + LETTING_GO
-            while mine and self.of(uuid) is not None and time.monotonic() < until:
+            while mine and self.measurement_of(uuid) is not None and time.monotonic() < until:
                 time.sleep(0.05)
             yield
         finally:
-            self.give_back(loan)
+            self.return_node(loan)
 
-    def saw(self, uuid: str) -> None:
+    def on_sighting(self, uuid: str) -> None:
         """A node answered on a bus; called before anybody else looks at it."""
         with self._guard:
             every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
         for newcomers in every:
-            newcomers.saw(uuid)
+            newcomers.on_sighting(uuid)
 
     def look_who_is_meant(self) -> None:
         """Who may be measured, or what an expression names, changed in this process: a group, a key, a datasheet."""
@@ -250,7 +250,7 @@ class MeasurementSupervisor:
             return self._json(self._begin(kept))
 
     def _require_unmeasured(self, uuid: bytes) -> None:
-        other = self.of(uuid.hex())
+        other = self.measurement_of(uuid.hex())
         if other is not None:
             raise NodeBusyError(
                 f"Node {uuid.hex()} is already being measured ({other}).", hint="End the measurement first."
@@ -266,7 +266,7 @@ class MeasurementSupervisor:
         if image is None:
             return
         kind = None if kept.kind is None else StreamKind[kept.kind.upper()]
-        channels = Sheet.of(image).channels
+        channels = Sheet.from_image(image).channels
         if self._sinks.moves(kept) and channels and all(one.actuator for one in channels):
             return  # it has nothing to measure; set points come for it
         for channel in sensors_of(channels, kept.channels, kind):
@@ -310,7 +310,7 @@ class MeasurementSupervisor:
                 found.append(RunningMeasurement(kept, uuids, state="running", why=why))
         return found
 
-    def of(self, uuid: str) -> str | None:
+    def measurement_of(self, uuid: str) -> str | None:
         """The measurement that has a node."""
         with self._guard:
             return next((key for key, one in self._running.items() if uuid in one.uuids), None)
@@ -348,8 +348,8 @@ class MeasurementSupervisor:
 
     # -- nodes that a command of this home writes to -----------------------------------------------------------------
 
-    def let_go(self, loan: NodeLoan) -> bool:
-        """Let a node go until :meth:`give_back`, so that somebody can write to it; False where nobody measures it.
+    def lend_node(self, loan: NodeLoan) -> bool:
+        """Let a node go until :meth:`return_node`, so that somebody can write to it; False where nobody measures it.
 
         It may be let go to several at once, who take turns at the node. Raises NodeBusyError where its session did not
         end in order within :data:`LETTING_GO` seconds; then it is measured on.
@@ -366,14 +366,14 @@ class MeasurementSupervisor:
                     f"Node {loan.uuid} is in a frozen measurement ({job.kept.id}).", hint="End the measurement first."
                 )
             self._loans.setdefault(loan.uuid, []).append(loan)
-            if job.let_go(bytes.fromhex(loan.uuid), loan.why, LETTING_GO):
+            if job.suspend_node(bytes.fromhex(loan.uuid), loan.why, LETTING_GO):
                 return True
-        self.give_back(loan)
+        self.return_node(loan)
         raise NodeBusyError(
             f"Node {loan.uuid} is being measured and was not released within {LETTING_GO:g} s.", hint="Try again."
         )
 
-    def give_back(self, loan: NodeLoan) -> None:
+    def return_node(self, loan: NodeLoan) -> None:
         """Measure it again, unless somebody else still has it."""
         self._ask_where_it_is(bytes.fromhex(loan.uuid))
         with self._lending:
@@ -387,20 +387,20 @@ class MeasurementSupervisor:
             del self._loans[loan.uuid]
             job = self._job_of(loan.uuid)
             if job is not None:
-                job.take_back(bytes.fromhex(loan.uuid))
+                job.resume_node(bytes.fromhex(loan.uuid))
                 return
         if self._roster.seen(loan.uuid).present:
-            self.saw(loan.uuid)
+            self.on_sighting(loan.uuid)
 
     def _ask_where_it_is(self, uuid: bytes) -> None:
         """A node that was given another address does not announce it: it is asked there, as the store knows it."""
         seen, record = self._buses.sightings.seen_at(uuid), self._station.nodes.get(uuid)
         if seen is None or record is None or record.can_address in (None, seen.address):
             return
-        lookout = self._buses.of(seen).lookout
+        lookout = self._buses.bus_of(seen).lookout
         if isinstance(lookout, CanDiscovery):
             with suppress(LinkError):
-                lookout.ask(record.can_address, ANSWERING)
+                lookout.identify_at(record.can_address, ANSWERING)
 
     def sheet(self, uuid: str) -> Image | None:
         """The datasheet of a node that is measured: the one that its session verified, and that nobody may change."""
@@ -486,7 +486,7 @@ class MeasurementSupervisor:
             kept = self._station.measurements.get(one.kept.id)
             uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
         except NotFoundError as error:
-            self._say(one, "ended", error.message)
+            self._publish_state(one, "ended", error.message)
             with self._guard:
                 self._running.pop(one.kept.id, None)
             self._live.event("measurement", state="deleted", id=one.kept.id)
@@ -520,20 +520,20 @@ class MeasurementSupervisor:
                 taken.append(uuid)
                 self._roster.note(uuid, measurement=one.kept.id)
             job = one.job = self._new_job(one)
-            self._say(one, "starting")
+            self._publish_state(one, "starting")
             job.start(self._buses, self._watcher(one))
             while job.alive and not one.stop.wait(0.5):
-                self._say(one, *_state_of(one, job))
+                self._publish_state(one, *_state_of(one, job))
                 if self._has_other_members(one, job):
                     job.stop()
                     return True
             job.stop()
-            self._say(one, "ended")
+            self._publish_state(one, "ended")
         except TedsProvisionError as error:
-            self._say(one, "failed", error.message)
+            self._publish_state(one, "failed", error.message)
         finally:
             for uuid in taken:
-                self._turns.give(uuid)
+                self._turns.release(uuid)
                 self._roster.note(uuid, "idle", measurement=None, report=None)
         return False
 
@@ -564,20 +564,20 @@ class MeasurementSupervisor:
             return
         match = NodeMatch.parse(one.kept.match)
         while not one.stop.is_set():
-            found = dict.fromkeys(uuid for uuid, *_ in self._station.keys.each_name())
+            found = dict.fromkeys(uuid for uuid, *_ in self._station.keys.all_key_names())
             meant = [
                 uuid
                 for uuid in found
                 if not why_not_measured(self._station, uuid)
                 and not match.why_not(self._station, uuid)
                 and self._station.nodes.datasheet(uuid) is not None
-                and self.of(uuid.hex()) is None
+                and self.measurement_of(uuid.hex()) is None
             ]
             if meant:
                 one.uuids = tuple(uuid.hex() for uuid in meant)
                 one.kept = replace(one.kept, match=None, uuids=tuple(meant), actuators=False)
                 return
-            self._say(one, "waiting", match.unknown_type(self._station) or "no known node matches")
+            self._publish_state(one, "waiting", match.unknown_type(self._station) or "no known node matches")
             one.stop.wait(1.0)
 
     def _run_open(self, one: RunningMeasurement) -> None:
@@ -624,7 +624,9 @@ class MeasurementSupervisor:
                 self._buses,
                 job,
                 self._who(one.kept),
-                elsewhere=lambda uuid: self.of(uuid) is not None or uuid in self._loans or self._is_for(uuid, one),
+                elsewhere=lambda uuid: (
+                    self.measurement_of(uuid) is not None or uuid in self._loans or self._is_for(uuid, one)
+                ),
                 joined=joined,
                 left=left,
                 waiting=waiting,
@@ -634,27 +636,27 @@ class MeasurementSupervisor:
             )
             one.newcomers = newcomers
         except TedsProvisionError as error:
-            self._say(one, "failed", error.message)
+            self._publish_state(one, "failed", error.message)
             return
-        self._say(one, "starting")
+        self._publish_state(one, "starting")
         job.start(self._buses, self._watcher(one))
         unknown = NodeMatch.parse(one.kept.match).unknown_type(self._station)
         try:
             while job.alive and not one.stop.is_set():
                 newcomers.work()
-                self._say(one, *_state_of_open(one, job, unknown))
+                self._publish_state(one, *_state_of_open(one, job, unknown))
         finally:
             job.stop()
             newcomers.end()
-            self._say(one, "ended")
+            self._publish_state(one, "ended")
 
     def _wait_for_turn(self, one: RunningMeasurement, uuid: str) -> None:
         while not one.stop.is_set():
             try:
-                self._turns.take(uuid, f"measurement {one.kept.id}", frozen=True)
+                self._turns.acquire(uuid, f"measurement {one.kept.id}", frozen=True)
                 return
             except TedsProvisionError as error:
-                self._say(one, "waiting", error.message)
+                self._publish_state(one, "waiting", error.message)
                 one.stop.wait(1.0)
 
     def _end(self, one: RunningMeasurement) -> None:
@@ -664,7 +666,7 @@ class MeasurementSupervisor:
         with self._guard:
             self._running.pop(one.kept.id, None)
 
-    def _say(self, one: RunningMeasurement, state: str, why: str = "") -> None:
+    def _publish_state(self, one: RunningMeasurement, state: str, why: str = "") -> None:
         if (one.state, one.why) != (state, why):
             one.state, one.why = state, why
             self._live.event("measurement", state=state, id=one.kept.id, group=one.kept.group, why=why)
@@ -713,11 +715,11 @@ class MeasurementSupervisor:
             self._roster.refresh([said.uuid])
         self._roster.note(said.uuid, said.state if changed else None, **facts)
         if changed and one.job is not None and not one.stop.is_set() and one.newcomers is None:
-            self._say(one, *_state_of(one, one.job))
+            self._publish_state(one, *_state_of(one, one.job))
 
     def _is_of(self, uuid: str, one: RunningMeasurement) -> bool:
         """Whether a node is this measurement's, or nobody's: what one that it has left says of it is past."""
-        return self.of(uuid) in (None, one.kept.id)
+        return self.measurement_of(uuid) in (None, one.kept.id)
 
     def _tell_who_comes(self, one: RunningMeasurement, said: NodeReport, before: str | None) -> None:
         """An event for each node that begins to be measured, is not any more, or waits, and why."""

@@ -86,7 +86,7 @@ class PlantWatch:
             "synced": synced,
             "age": None if synced is None else max(0.0, time.time() - synced),
             "unsent": found.unsent,
-            "to_rotate": plant.removed_members.due(self._station),
+            "to_rotate": plant.removed_members.rotations_due(self._station),
             "stations": [
                 {
                     "name": one.name,
@@ -130,7 +130,9 @@ class PlantWatch:
             raise NotFoundError(f"{len(rows) or 'No'} jobs begin with {text[:64]}.", hint="GET /jobs lists them.")
         [row] = rows
         found = plant.jobs.kept_job(self._station, row)
-        parts = plant.yield_stats.yields(self._station, found, plant.yield_stats.attempts_of(self._station, found.id))
+        parts = plant.yield_stats.yield_stats(
+            self._station, found, plant.yield_stats.attempts_of(self._station, found.id)
+        )
         return {**self._job(found, row.state), "stations": [part.to_json() for part in parts]}
 
     def _job(self, found: Job, state: str) -> dict[str, Any]:
@@ -159,9 +161,9 @@ class PlantWatch:
         station = self._station
         try:
             if self._post is None:
-                self._post = plant.connecting.post_of(station)
+                self._post = plant.connecting.open_transport(station)
             if self._post is None:
-                self._tell("unreachable", "nothing is known that carries: registry connect")
+                self._publish_state("unreachable", "nothing is known that carries: registry connect")
                 return False
             self._say_daily()
             done = plant.sync.sync(station, self._post)
@@ -171,11 +173,11 @@ class PlantWatch:
         except StoreLockedError:
             return True
         except NotMemberError as error:
-            self._tell("removed", error.message)
+            self._publish_state("removed", error.message)
         except LinkError as error:
-            self._tell("unreachable", error.message)
+            self._publish_state("unreachable", error.message)
         except TedsProvisionError as error:
-            self._tell("alarm", error.message)
+            self._publish_state("alarm", error.message)
         else:
             self._after(done.pushed + done.fetched + done.parcels_in + done.parcels_out + len(done.rosters))
         return False
@@ -187,13 +189,13 @@ class PlantWatch:
         found = plant.status.status(self._station, record, roster)
         alarms = [one for one in found.alarms if not one.seen]
         if alarms:
-            self._tell("alarm", f"{alarms[-1].code}: {alarms[-1].why}")
+            self._publish_state("alarm", f"{alarms[-1].code}: {alarms[-1].why}")
         elif found.expired:
-            self._tell("expired", f"the roster's time was over on {roster.expires:%Y-%m-%d}")
+            self._publish_state("expired", f"the roster's time was over on {roster.expires:%Y-%m-%d}")
         elif found.expires_soon:
-            self._tell("expires", f"the roster's time is over on {roster.expires:%Y-%m-%d}")
+            self._publish_state("expires", f"the roster's time is over on {roster.expires:%Y-%m-%d}")
         else:
-            self._tell("synced", "")
+            self._publish_state("synced", "")
         if moved:
             self._changed()
 
@@ -229,7 +231,7 @@ class PlantWatch:
             except TedsProvisionError:
                 self._stop.wait(EVERY if self._told[0] == "unreachable" else _SOON)
 
-    def _tell(self, state: str, why: str) -> None:
+    def _publish_state(self, state: str, why: str) -> None:
         """One line for each change of state."""
         if (state, why) != self._told:
             self._told = state, why

@@ -26,7 +26,7 @@ class NodeTemplate:
     blocks: Mapping[BlockId, bytes]
     uuid: bytes | None = None
 
-    def of(self, uuid: bytes) -> NodeTemplate:
+    def with_uuid(self, uuid: bytes) -> NodeTemplate:
         """The same node under another UUID: field 4 of a Meta-TEDS of the 2007 form says that one."""
         return NodeTemplate(under(self.blocks, uuid), uuid)
 
@@ -83,6 +83,6 @@ def create(
         described = from_profile(profile, folders, wanted, name)
     blocks = None
     if described is not None:
-        blocks = described.of(wanted).blocks
-        Board(Sheet.of(Image(wanted, blocks)))  # what it could not imitate is told now, not when it runs
+        blocks = described.with_uuid(wanted).blocks
+        Board(Sheet.from_image(Image(wanted, blocks)))  # what it could not imitate is told now, not when it runs
     return FlashFile.create(folder, uuid=wanted, name=name, max_message=max_message, blocks=blocks)

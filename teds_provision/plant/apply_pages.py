@@ -23,7 +23,7 @@ from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.claim import Claim
 from teds_provision.protocol.plant.document import join, split
 from teds_provision.protocol.plant.event import Event
-from teds_provision.protocol.plant.fold import BY_CONTACT, BanStatement, LocalState, MergedClaims, view
+from teds_provision.protocol.plant.fold import BY_CONTACT, BanStatement, LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.page import Page
 from teds_provision.protocol.plant.roster import MOST_AHEAD, Roster, Taking, open_roster, taking
 from teds_provision.station.station import Station
@@ -55,7 +55,7 @@ def alarm(station: Station, code: str, about: str, n: int, why: str) -> None:
     with station.transaction():
         if station.plant.tables.put_alarm(Alarm(code, about, n, why)):
             station.audit("registry", None, f"alarm: {code}", about=about[:16], n=n, why=why)
-            station.plant.tell("alarm", code=code, about=about or None, n=n)
+            station.plant.record_event("alarm", code=code, about=about or None, n=n)
 
 
 # -- rosters -----------------------------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ def put_roster(station: Station, roster: Roster) -> None:
     """Have a roster count from now on, and bring in order which pages of each station count by it."""
     before = station.plant.roster
     with station.transaction():
-        mac = station.seals.note("roster", roster.hash)
+        mac = station.row_macs.note("roster", roster.hash)
         station.plant.tables.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, utc_now(), mac))
         for member in roster.members:  # so that it can be handed keys without the CA key being here
             station.identity.keep_certificate(station.ca, member.point, member.certificate)
@@ -200,7 +200,7 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
             digests.append((bytes.fromhex(digest), n, one.act == "vouched", seal_of_digest(station, chain, n, one)))
         elif one.act == "lifted":
             hash = one.members["of"]
-            tables.put_lifting(hash, chain.chain, station.seals.note("plant lifted", f"{hash} {chain.station}"))
+            tables.put_lifting(hash, chain.chain, station.row_macs.note("plant lifted", f"{hash} {chain.station}"))
         if one.uuid is not None:
             by_node.setdefault(one.uuid, []).append(one)
     tables.add_ids(chain.chain, known)
@@ -211,7 +211,7 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
     for uuid, said in by_node.items():
         claim = Claim.from_json(there[uuid]) if uuid in there else Claim()
         for one in said:
-            claim.take(one)
+            claim.apply_event(one)
         claims[uuid] = claim.to_json()
     tables.put_claims(chain.chain, claims)
     if wrong:
@@ -226,7 +226,7 @@ def _number(id: str) -> int:
 
 def seal_of_digest(station: Station, chain: Chain, n: int, one: Event) -> bytes:
     """The seal of the row of a digest that was signed, or vouched for, on page ``n``."""
-    return station.seals.note("digest", f"{one.members['teds_sha256']} {chain.station} {n} {one.act}")
+    return station.row_macs.note("digest", f"{one.members['teds_sha256']} {chain.station} {n} {one.act}")
 
 
 def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, counts: bool) -> None:
@@ -261,9 +261,9 @@ class _LocalRows(NamedTuple):
     keys: dict[bytes, KeyRecord]
 
     @classmethod
-    def of(cls, station: Station, uuids: Sequence[bytes]) -> _LocalRows:
-        keys = {record.uuid: record for record in station.keys.of_page(uuids)}
-        return cls(station.pins.of_page(uuids), station.nodes.of_page(uuids), keys)
+    def read(cls, station: Station, uuids: Sequence[bytes]) -> _LocalRows:
+        keys = {record.uuid: record for record in station.keys.get_many(uuids)}
+        return cls(station.pins.get_many(uuids), station.nodes.get_many(uuids), keys)
 
     def own(self, station: Station, uuid: bytes, hashes: Sequence[tuple[str, str]]) -> LocalState:
         """``hashes``: H and text of the statements about it."""
@@ -290,9 +290,9 @@ class _LocalRows(NamedTuple):
         )
 
 
-def views(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[bytes, MergedClaims]:
+def merged_views(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[bytes, MergedClaims]:
     """What the plant says of nodes, at most a page of them, by today's rows; nothing is written."""
-    return {uuid: seen for uuid, (seen, _) in _judged(station, roster, uuids, _LocalRows.of(station, uuids)).items()}
+    return {uuid: seen for uuid, (seen, _) in _judged(station, roster, uuids, _LocalRows.read(station, uuids)).items()}
 
 
 def _judged(
@@ -314,13 +314,13 @@ def _judged(
         statements = said.get(uuid, [])
         own = here.own(station, uuid, [(one.hash, one.said.statement) for one in statements])
         node = {one: Claim.from_json(claim) for one, claim in claims.get(uuid, {}).items()}
-        judged[uuid] = view(roster, node, own, statements, lifted), statements
+        judged[uuid] = merge_claims(roster, node, own, statements, lifted), statements
     return judged
 
 
 def _lifters(station: Station, hash: str) -> set[str]:
     rows = station.plant.tables.liftings_of(hash)
-    return {one for one, mac in rows if station.seals.noted("plant lifted", f"{hash} {one}", mac)}
+    return {one for one, mac in rows if station.row_macs.noted("plant lifted", f"{hash} {one}", mac)}
 
 
 def apply_claims(station: Station) -> int:
@@ -332,7 +332,7 @@ def apply_claims(station: Station) -> int:
     while uuids := station.plant.tables.to_judge(AT_ONCE):
         roster = require_roster(station)
         with station.transaction():
-            here = _LocalRows.of(station, uuids)
+            here = _LocalRows.read(station, uuids)
             judged = _judged(station, roster, uuids, here)
             station.plant.tables.put_conflicts({uuid: seen.conflicts for uuid, (seen, _) in judged.items()})
             _pin(station, judged, here)

@@ -26,7 +26,7 @@ Told = tuple[str, bytes | None, dict[str, Any]]
 
 def backlog(station: Station) -> Iterator[Told]:
     """What this station would have told had it been a member: act, node, members; nothing is written."""
-    for entry in station.pins.each():
+    for entry in station.pins.all_entries():
         if is_whole(entry.fingerprint) and entry.assurance != "registry":
             yield "pinned", entry.uuid, {"fingerprint": entry.fingerprint, "assurance": entry.assurance}
     keys = {record.uuid: record for record in station.keys.all() if record.state == "active"}
@@ -35,7 +35,7 @@ def backlog(station: Station) -> Iterator[Told]:
         if record.source == "agreement" and is_whole(pinned):
             yield "agreed", uuid, {"fingerprint": pinned, "epoch": record.epoch, "key_id": record.key_id}
     yield from _handed(station, keys)
-    for shown in station.nodes.each_shown():
+    for shown in station.nodes.all_shown_keys():
         for epoch, sequence, digest in signed_here(station, shown.uuid):
             yield "signed", shown.uuid, {"epoch": epoch, "sequence": sequence, "teds_sha256": digest}
     for ban in station.policy.revocations():

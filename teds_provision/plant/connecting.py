@@ -13,7 +13,7 @@ from teds_provision.plant.transport import Transport
 from teds_provision.station.station import Station
 
 
-def post_of(station: Station) -> Transport | None:
+def open_transport(station: Station) -> Transport | None:
     """What carries for this station, by what it joined; None where nothing is known that does. Opens no connection."""
     record = station.plant.joined
     if record is None or record.url is None:

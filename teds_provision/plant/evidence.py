@@ -55,7 +55,7 @@ def sign_evidence(
 def prove_claim(node: Conversation, claim: EvidenceClaim, nonce: bytes) -> bytes:
     """The board's signature over the facts (128.8); raises NotAuthenticError where it is not that of field 101."""
     asked = claim.challenge(nonce)
-    proof = node.ask(security_command(Function.PROVE, asked), "to sign the evidence")
+    proof = node.request_idempotent(security_command(Function.PROVE, asked), "to sign the evidence")
     if not verify(security.decode(claim.teds).node_key, prove_message(claim.uuid, asked), proof):
         raise NotAuthenticError("The node's signature of the evidence does not match the key it presented.")
     return proof

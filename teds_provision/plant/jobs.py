@@ -151,7 +151,7 @@ def close_job(station: Station, job: Job) -> None:
         if row is not None and row.state != CLOSED:
             station.plant.line.set_job_state(job.id, CLOSED)
             station.audit("job", None, CLOSED, job=job.id)
-            station.plant.tell("closed", None, job=job.id)
+            station.plant.record_event("closed", None, job=job.id)
 
 
 def profile_file(station: Station, job: Job) -> Path:

@@ -229,7 +229,7 @@ class LineRun:
 
     # -- units -----------------------------------------------------------------------------------------------------
 
-    def take(
+    def allot_unit(
         self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
     ) -> LineUnit:
         """Take the board's unit, durably, or count a further attempt; raises PolicyError where none is left."""
@@ -290,7 +290,7 @@ class LineRun:
             self.note(uuid, unit, passed=passed)
             self.station.audit("evidence", uuid, verdict, sha256=digest, attempt=facts.attempt)
             told = {"sha256": digest, "job": facts.job, "unit": facts.unit}
-            self.station.plant.tell(
+            self.station.plant.record_event(
                 "evidence", uuid, **told, verdict=verdict if passed else f"{verdict}: {facts.failure}"
             )
         with self._turn:
@@ -330,9 +330,9 @@ class Scans:
     def listen(self) -> None:
         """Take label after label until there are no more; for a thread of its own."""
         for line in self._lines:
-            self.take(line)
+            self.add_label(line)
 
-    def take(self, text: str) -> None:
+    def add_label(self, text: str) -> None:
         """Take one label; what is none is told."""
         found: tuple[bytes, str | None] | None = read_label(text)
         digits = text.strip().lower()

@@ -16,7 +16,7 @@ from teds_provision.protocol.plant.chain import counting
 from teds_provision.protocol.plant.document import MemberRequest, hash_of, open_request
 from teds_provision.protocol.plant.roster import Roster, open_roster
 from teds_provision.station.station import Station
-from teds_provision.steps.verify import Verification, remember, verify_image
+from teds_provision.steps.verify import Verification, snapshot_trust, verify_image
 from teds_provision.store import utc_now
 from teds_provision.store.tables.plant import Chain
 from teds_provision.teds.codec import security
@@ -94,8 +94,8 @@ def vouchable(station: Station, uuids: Sequence[bytes] | None) -> list[tuple[byt
     Gives UUID, digest and the first digits of the signer's fingerprint. ``uuids`` None: of every node.
     """
     roster = require_roster(station)
-    judging = replace(remember(station), policy=replace(remember(station).policy, rules=None))
-    listed = [shown.uuid for shown in station.nodes.each_shown()] if uuids is None else list(uuids)
+    judging = replace(snapshot_trust(station), policy=replace(snapshot_trust(station).policy, rules=None))
+    listed = [shown.uuid for shown in station.nodes.all_shown_keys()] if uuids is None else list(uuids)
     found = []
     for uuid in listed:
         image = station.nodes.datasheet(uuid)
@@ -126,7 +126,7 @@ def vouch(station: Station, found: Sequence[tuple[bytes, str, str]]) -> int:
             words = station.plant.tables.digest_words(bytes.fromhex(digest))
             if any(vouched and who == station.fingerprint for who, _, vouched, _ in words):
                 continue
-            station.plant.tell("vouched", uuid, teds_sha256=digest)
+            station.plant.record_event("vouched", uuid, teds_sha256=digest)
             fresh += 1
     return fresh
 

@@ -104,7 +104,7 @@ def answer_all(
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[AnsweredRequest]:
     """Answer every request that came, one after the other; each answer is on its way before its parcel goes."""
-    for come in inbox.take():
+    for come in inbox.collect():
         if stop():
             return
         sealed = answer(station, come.document, jobs)

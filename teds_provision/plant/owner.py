@@ -73,7 +73,7 @@ def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[To
         )
     station.unlock()
     with station.transaction():
-        mac = station.seals.note("plant", roster.registry)
+        mac = station.row_macs.note("plant", roster.registry)
         before = station.plant.tables.plant()
         if before is not None and before.registry != roster.registry:
             station.plant.tables.forget_plant()
@@ -82,7 +82,7 @@ def join(station: Station, roster: Roster, *, url: str | None, told: Sequence[To
         station.plant.tables.put_plant(replace(record, left=None, url=url or record.url, mac=mac))
         put_roster(station, roster)
         for act, uuid, members in told:
-            station.plant.tell(act, uuid, **members)
+            station.plant.record_event(act, uuid, **members)
         station.audit("registry", None, "joined", registry=roster.registry, version=roster.version, events=len(told))
     return len(told)
 
@@ -146,7 +146,7 @@ def with_roles(station: Station, name: str, roles: frozenset[Role], last: Place 
     return following(station, members=tuple(changed if one is member else one for one in own.members))
 
 
-def without(station: Station, name: str, why: Why, last: int | None) -> Roster:
+def draft_removal(station: Station, name: str, why: Why, last: int | None) -> Roster:
     """Draft a roster in which somebody is removed; ``last`` is the number of the last page that counts of it.
 
     For a retired one that is the newest page here unless said; for a lost or stolen one it must be said.

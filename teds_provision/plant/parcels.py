@@ -29,7 +29,7 @@ from teds_provision.protocol.plant.document import JOB, SIGN_REQUEST, SIGNED, op
 from teds_provision.protocol.plant.fold import MergedClaims
 from teds_provision.protocol.plant.roster import Roster
 from teds_provision.station.station import Station
-from teds_provision.store import TrustRecord, pages
+from teds_provision.store import TrustRecord, chunks
 from teds_provision.store.tables.parcels import ParcelKind, ParcelRow
 from teds_provision.store.tables.plant import Alarm
 
@@ -68,7 +68,7 @@ def take_in(station: Station, post: Transport, views: Views, now: datetime) -> P
     reader = _Reader(station, roster, views, now)
     taken = sum(reader.again(row) for row in station.plant.parcels.parcels("in", "later"))
     for parcel in post.parcels(station.fingerprint):
-        done = reader.take(parcel)
+        done = reader.process_parcel(parcel)
         if done is not None:
             post.drop(parcel.id, station.fingerprint)
             taken += done
@@ -119,7 +119,7 @@ class _Reader:
             import_parcel(self.station, row, plan)
             return True
 
-    def take(self, parcel: Parcel) -> bool | None:
+    def process_parcel(self, parcel: Parcel) -> bool | None:
         """Deal with what lies there: True where it is done, False where it is kept here, None where it stays there."""
         tables = self.station.plant.parcels
         if tables.parcel(parcel.id, "in") is not None:
@@ -165,9 +165,9 @@ class _Reader:
         if bundle.ca != self.station.ca:
             return "its nodes belong to another CA"
         later = ""
-        for page in pages(plan.taken):
+        for page in chunks(plan.taken):
             held = self._unproven_of(bundle.sender, [one.node.uuid for one in page])
-            pins = self.station.pins.of_page([one.node.uuid for one in page])
+            pins = self.station.pins.get_many([one.node.uuid for one in page])
             seen = self.views([one.node.uuid for one in page])
             for one in page:
                 node, pin = one.node, pins.get(one.node.uuid)
@@ -191,7 +191,7 @@ class _Reader:
     def _unproven_of(self, sender: str, page: Sequence[bytes]) -> dict[bytes, list[str]]:
         """Keys that came from this sender and were never proven, by node."""
         held: dict[bytes, list[str]] = {}
-        for key in self.station.keys.of_page(page):
+        for key in self.station.keys.get_many(page):
             if key.state == "pending" and key.source == "import":
                 held.setdefault(key.uuid, []).append(key.key_id)
         return {
@@ -244,7 +244,7 @@ class _Reader:
         with self.station.transaction():
             for one in error.nodes:
                 told = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": one.why}
-                self.station.plant.tell("refused", one.node.uuid, **told)
+                self.station.plant.record_event("refused", one.node.uuid, **told)
             self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
 
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
@@ -426,7 +426,7 @@ def _due(
 
 def _with_views(views: Views, rows: Sequence[tuple[bytes, int, str]]) -> Iterator[tuple[bytes, int, str, MergedClaims]]:
     """Nodes with what the plant says of them, a page at a time."""
-    for page in pages(rows):
+    for page in chunks(rows):
         seen = views([uuid for uuid, _, _ in page])
         yield from ((uuid, epoch, key_id, seen[uuid]) for uuid, epoch, key_id in page)
 
@@ -436,7 +436,7 @@ def _forget(station: Station, roster: Roster, views: Views) -> None:
     me, tables = station.fingerprint, station.plant.parcels
     if not any(share.forget for share in roster.share):
         return
-    for page in pages(tables.receipted()):
+    for page in chunks(tables.receipted()):
         seen = views([uuid for uuid, _, _ in page])
         for uuid, epoch, taken in page:
             shares = [share for share in roster.share if sharing.shares_any([share], seen[uuid], me)]
@@ -446,10 +446,10 @@ def _forget(station: Station, roster: Roster, views: Views) -> None:
 
 def _delete(station: Station, uuid: bytes, epoch: int) -> None:
     with station.durable(_COMMAND):
-        for key in station.keys.of(uuid):
+        for key in station.keys.keys_of(uuid):
             if key.epoch <= epoch:
                 station.keys.remove_key(uuid, key.key_id)
-        station.plant.tell("forgot", uuid, epoch=epoch)
+        station.plant.record_event("forgot", uuid, epoch=epoch)
         station.audit("handover", uuid, "forgot", epoch=epoch)
 
 

@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Final
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.plant.apply_pages import counted_places, views
+from teds_provision.plant.apply_pages import counted_places, merged_views
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim, Key
@@ -74,7 +74,7 @@ def last(station: Station) -> RemovalReview | None:
     return None if text is None else RemovalReview(**json.loads(text))
 
 
-def due(station: Station) -> int:
+def rotations_due(station: Station) -> int:
     """How many nodes this station has to rotate because somebody left."""
     return sum(why.startswith(WHY) for why in station.keys.rotations_due().values())
 
@@ -82,7 +82,7 @@ def due(station: Station) -> int:
 def _pages(station: Station) -> Iterable[list[bytes]]:
     page: list[bytes] = []
     seen: set[bytes] = set()
-    for uuid, _, _, _ in station.keys.each_name():
+    for uuid, _, _, _ in station.keys.all_key_names():
         if uuid not in seen:
             seen.add(uuid)
             page.append(uuid)
@@ -96,7 +96,7 @@ def _pages(station: Station) -> Iterable[list[bytes]]:
 def _keys_held(station: Station, page: Sequence[bytes]) -> dict[bytes, KeyRecord]:
     """The key of each node: the active one, or the newest of those that no session has proven yet (copies)."""
     found: dict[bytes, KeyRecord] = {}
-    for key in station.keys.of_page(page):
+    for key in station.keys.get_many(page):
         if key.uuid not in found or found[key.uuid].state != "active":
             found[key.uuid] = key
     return found
@@ -112,7 +112,7 @@ def _mark(
 ) -> None:
     """Mark those of a page of nodes whose key somebody had who left."""
     claims = station.plant.tables.claims_of(list(keys))
-    marked = station.keys.due_of_page(list(keys))
+    marked = station.keys.due_among(list(keys))
     wanted: dict[bytes, str] = {}
     for uuid, key in keys.items():
         already = station.keys.rotation_due(uuid) or "" if uuid in marked else None
@@ -210,6 +210,6 @@ def _alone(station: Station, roster: Roster) -> int:
     while page := station.plant.tables.claimed_nodes(after, _PAGE):
         after = page[-1]
         held = _keys_held(station, page).keys()
-        seen = views(station, roster, page)
+        seen = merged_views(station, roster, page)
         count += sum(not seen[uuid].held and bool(seen[uuid].left) and uuid not in held for uuid in page)
     return count

@@ -81,9 +81,9 @@ class OfficeSilentError(UnprovenError):
 # -- the post: documents of a line, each sealed for its receiver -------------------------------------------------------
 
 
-def post_of(station: Station, folder: Path | None) -> Transport:
+def transport_for(station: Station, folder: Path | None) -> Transport:
     """What carries between the stations: the folder, or the registry that this station is connected to."""
-    post = FolderTransport(folder) if folder is not None else connecting.post_of(station)
+    post = FolderTransport(folder) if folder is not None else connecting.open_transport(station)
     if post is None:
         raise PolicyError(
             "This station has no way to reach the other stations.", hint="Give a transfer folder: --files DIR"
@@ -115,8 +115,8 @@ class Delivery:
 class Inbox:
     """The documents of one kind that come for this station: those that a sync kept here, and those that lie there.
 
-    Each is given once until it is dropped, and nothing is read twice; anything else is left where it is. ``take`` and
-    ``wait`` are for one thread at a time.
+    Each is given once until it is dropped, and nothing is read twice; anything else is left where it is. ``collect``
+    and ``wait`` are for one thread at a time.
     """
 
     def __init__(self, station: Station, post: Transport, kind: DocumentKind) -> None:
@@ -125,7 +125,7 @@ class Inbox:
         self._listener: postgres.Registry | None = None
         self._hears = isinstance(post, postgres.PostgresTransport)
 
-    def take(self) -> list[Delivery]:
+    def collect(self) -> list[Delivery]:
         """What came since; raises LinkError."""
         station, own = self._station, self._station.identity.fingerprint
         tables = station.plant.parcels
@@ -207,7 +207,7 @@ def send_job(station: Station, post: Transport, job: Job) -> None:
 class Office(Protocol):
     """How requests reach an office, and answers come back."""
 
-    def ask(self, request: SignRequest) -> bytes | None:
+    def request_signature(self, request: SignRequest) -> bytes | None:
         """The answer to a request, None where none came in time; asked again it is the same request."""
 
 
@@ -224,7 +224,7 @@ class RemoteOffice:
         self._came: dict[tuple[str, str], Delivery] = {}
         self._looking = False
 
-    def ask(self, request: SignRequest) -> bytes | None:
+    def request_signature(self, request: SignRequest) -> bytes | None:
         """Send the request and wait for its answer; what others than that office signed answers nothing."""
         send(self.station, self.post, request.to, request.octets, name_of(request.hash))
         wanted = request.to, request.hash
@@ -240,7 +240,7 @@ class RemoteOffice:
                 return come.document
             found: list[Delivery] = []
             try:
-                found = self._inbox.take()
+                found = self._inbox.collect()
                 if not found:
                     self._inbox.wait(max(0.0, min(_MOST_LOOK_SECONDS, until - time.monotonic())), pause)
                     pause = min(2 * pause, _MOST_LOOK_SECONDS)
@@ -274,7 +274,7 @@ class FileOffice:
 
     path: Path
 
-    def ask(self, request: SignRequest) -> bytes | None:
+    def request_signature(self, request: SignRequest) -> bytes | None:
         """Write it down."""
         write_whole(self.path, request.octets + b"\n", mode=SHARED)
         return None
@@ -320,7 +320,7 @@ def by_office(
         request = open_request(earlier.request, lambda kid: station.point)
     else:
         request = _new_request(station, node, keys, wanted)
-    answer = office.ask(request)
+    answer = office.request_signature(request)
     if answer is None:
         raise OfficeSilentError(
             f"The office {roster.name_of(wanted.office)} has not answered yet.",
@@ -374,7 +374,7 @@ def sign_by_office(station: Station, links: LinkSettings, order: OfficeOrder, re
         if order.output is not None:
             office = FileOffice(order.output)
         else:
-            office = RemoteOffice(station, post_of(station, order.files), links.timeout)
+            office = RemoteOffice(station, transport_for(station, order.files), links.timeout)
             stack.callback(office.close)
         with at_node(station, links, uuid, reporter, unlock="always") as visit:
             visit.session()
@@ -415,7 +415,7 @@ def _new_request(station: Station, node: Conversation, keys: SignedNodeKey, want
     nonce, key = os.urandom(NONCE_OCTETS), station.credentials().key
     blocks = wanted.image.unsigned_blocks()
     asked = challenge(nonce, key.point, keys.uuid, wanted.epoch, wanted.sequence, blocks)
-    proof = node.ask(security_command(Function.PROVE, asked), "to sign the request to the office")
+    proof = node.request_idempotent(security_command(Function.PROVE, asked), "to sign the request to the office")
     if not verify(keys.key, prove_message(keys.uuid, asked), proof):
         raise NotAuthenticError("The node's signature of the request does not match the key it presented.")
     unsigned = SignRequest(

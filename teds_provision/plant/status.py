@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from typing import Any, Final
 
 from teds_provision.errors import NotFoundError, UsageError
-from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_digest, now, require_roster, views
+from teds_provision.plant.apply_pages import AT_ONCE, counted_places, heads_digest, merged_views, now, require_roster
 from teds_provision.protocol.handover.strict_json import load_exact
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.roster import WARN_BEFORE, Member, Roster
@@ -166,7 +166,7 @@ def names(station: Station, roster: Roster, uuids: Sequence[bytes]) -> dict[byte
     """Return the names that the plant's stations gave to these nodes; nodes without one are left out."""
     found: dict[bytes, str] = {}
     for start in range(0, len(uuids), AT_ONCE):
-        page = views(station, roster, uuids[start : start + AT_ONCE])
+        page = merged_views(station, roster, uuids[start : start + AT_ONCE])
         found.update((uuid, seen.name) for uuid, seen in page.items() if seen.name)
     return found
 
@@ -180,7 +180,7 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
     digits = wanted.removeprefix("0x")
     while uuids := station.plant.tables.claimed_nodes(after, AT_ONCE):
         after = uuids[-1]
-        for uuid, seen in views(station, roster, uuids).items():
+        for uuid, seen in merged_views(station, roster, uuids).items():
             name = seen.name or ""
             if wanted and not uuid.hex().startswith(digits) and wanted not in name.lower():
                 continue

@@ -18,12 +18,12 @@ from teds_provision.plant import fetching, parcels, removed_members, returned
 from teds_provision.plant.apply_pages import (
     alarm,
     apply_claims,
+    merged_views,
     now,
     octets_of,
     require_roster,
     take_pages,
     take_rosters,
-    views,
 )
 from teds_provision.plant.transport import Transport
 from teds_provision.protocol.handover.strict_json import load_exact
@@ -93,7 +93,7 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
         done.fetched += fetching.fetch(station, post, roster)
         _return_pages(station, post, roster, done)
         done.judged = apply_claims(station)
-        hearsay(station, roster, done)
+        unseen_heads(station, roster, done)
         _parcels(station, post, roster, done)
         if connected:
             with station.transaction():
@@ -139,7 +139,7 @@ def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult
     """Take in and send keys, once the pages are here that say whose they are."""
 
     def seen(uuids: Sequence[bytes]) -> Mapping[bytes, MergedClaims]:
-        return views(station, roster, uuids)
+        return merged_views(station, roster, uuids)
 
     at = max(now(), roster.created)
     removed_members.review(station, roster, at)
@@ -373,7 +373,7 @@ def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]],
         row = station.plant.tables.page(chain.chain, n, hash)
         for one in load_exact(row.content, "A page")["events"] if row is not None else ():
             if one["id"] not in adopted:
-                station.plant.say(one)
+                station.plant.queue_event(one)
 
 
 def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page | None:
@@ -438,7 +438,7 @@ def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *
         station.plant.tables.put_plant(replace(joined, acknowledged=newest))
 
 
-def hearsay(station: Station, roster: Roster, done: SyncResult) -> None:
+def unseen_heads(station: Station, roster: Roster, done: SyncResult) -> None:
     """Tell what members say that they saw of others and nobody showed this station; it ends nothing."""
     chains = station.plant.tables.chains()
     for who, about, n, hash in station.plant.tables.heads():

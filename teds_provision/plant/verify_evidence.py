@@ -40,7 +40,7 @@ class EvidenceAnchors:
     roster: Roster | None = None
 
     @classmethod
-    def of(cls, ca: bytes, pins: Path | None = None, roster: Path | None = None) -> EvidenceAnchors:
+    def from_files(cls, ca: bytes, pins: Path | None = None, roster: Path | None = None) -> EvidenceAnchors:
         """Read ``pins``, a whitelist file, and a roster that this CA signed.
 
         Raises NotFoundError, NotAuthenticError, BadDataError.

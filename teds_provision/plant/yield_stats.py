@@ -42,7 +42,7 @@ class Attempt:
     steps: dict[str, float] | None = None
 
     @classmethod
-    def of(cls, evidence: Evidence) -> Attempt:
+    def from_evidence(cls, evidence: Evidence) -> Attempt:
         """What evidence says of its attempt; a step that failed counts in ``code`` alone."""
         facts = evidence.facts
         steps = {name: milliseconds / 1000 for name, result, milliseconds in facts.steps if result in GOOD_RESULTS}
@@ -101,7 +101,7 @@ def attempts_of(station: Station, job: str, files: Iterable[bytes] = ()) -> list
     for octets in chain((row.document for row in station.plant.line.evidence(job=job)), files):
         evidence = read(octets)
         if evidence.facts.job == job:
-            attempt = Attempt.of(evidence)
+            attempt = Attempt.from_evidence(evidence)
             found[attempt.station, attempt.uuid, attempt.attempt] = attempt
             known.add(hashlib.sha256(octets).hexdigest())
     for digest, attempt in _of_pages(station, job):
@@ -139,7 +139,7 @@ def _of_pages(station: Station, job: str) -> Iterator[tuple[str, Attempt]]:
                 yield told.members["sha256"], attempt
 
 
-def yields(station: Station, job: Job, attempts: Iterable[Attempt]) -> list[StationYield]:
+def yield_stats(station: Station, job: Job, attempts: Iterable[Attempt]) -> list[StationYield]:
     """What each station of a job did, those without any attempt included."""
     roster = station.plant.roster
     names = {key: roster.name_of(key) if roster is not None else key[:16] for key in job.stations}

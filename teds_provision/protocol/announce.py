@@ -102,7 +102,7 @@ class AddressClaim:
         """A frame of any kind came from this address."""
         self._heard.add(source)
 
-    def take(self, announce: Announce, own: int, now: float, *, pinned: bool = False) -> int:
+    def handle_announce(self, announce: Announce, own: int, now: float, *, pinned: bool = False) -> int:
         """An Announce came in; return the address that the node has from now on, ``own`` if it stays.
 
         ``pinned``: an actuator of the node is claimed, so it stays and goes on announcing. An Announce proves nothing,

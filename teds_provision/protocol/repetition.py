@@ -38,7 +38,7 @@ class Repetition:
         self._request, self._reply, self._at = (transaction, frame), reply, now
         return reply
 
-    def left(self, now: float) -> None:
+    def reply_sent(self, now: float) -> None:
         """The reply has left: it is kept from here on. A commit, or a long reply, may take seconds."""
         self._at = now
 

@@ -91,7 +91,7 @@ def _decrypt(key: bytes, payload: bytes) -> bytes | None:
 
 
 class StationSession:
-    """The station's half: :meth:`ask` for c, :meth:`open` once, then sealed commands with rising counters.
+    """The station's half: :meth:`request_counter` for c, :meth:`open` once, then sealed commands with rising counters.
 
     One object is one Open; after a refusal with reason 12 a new one asks for c again (another station was faster).
     ``statics`` are the static points at hand, P(station) and P(node): En is due to be none of them.
@@ -107,7 +107,7 @@ class StationSession:
         self.c = b""
         """c of Open, as the node gave it: the mac is over it, so a good reply says that it was the node's own."""
 
-    def ask(self) -> Command:
+    def request_counter(self) -> Command:
         """Return the empty Open, whose reply is c."""
         return security_command(Function.OPEN)
 

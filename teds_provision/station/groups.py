@@ -79,7 +79,7 @@ class Groups:
         if present is None:
             with self._store.together():
                 self._store.put_group(Group(name, tuple(dict.fromkeys(uuids))))
-                self._tell(name, uuids, member=True)
+                self._report_member(name, uuids, member=True)
         return self.get(name)
 
     def add(self, name: str, uuids: Iterable[bytes]) -> Group:
@@ -88,7 +88,7 @@ class Groups:
         with self.frozen(name), self._store.together():
             there, added = self.get(name).uuids, list(dict.fromkeys(uuids))
             self._store.add_to_group(name, added)
-            self._tell(name, [uuid for uuid in added if uuid not in there], member=True)
+            self._report_member(name, [uuid for uuid in added if uuid not in there], member=True)
         return self.get(name)
 
     def remove(self, name: str, uuids: Iterable[bytes]) -> Group:
@@ -97,7 +97,7 @@ class Groups:
         with self.frozen(name), self._store.together():
             there, gone = self.get(name).uuids, list(dict.fromkeys(uuids))
             self._store.remove_from_group(name, gone)
-            self._tell(name, [uuid for uuid in gone if uuid in there], member=False)
+            self._report_member(name, [uuid for uuid in gone if uuid in there], member=False)
         return self.get(name)
 
     def delete(self, name: str) -> bool:
@@ -105,7 +105,7 @@ class Groups:
         if self.find(name) is None:
             return False
         with self.frozen(name), self._store.together():
-            self._tell(name, self.get(name).uuids, member=False)
+            self._report_member(name, self.get(name).uuids, member=False)
             return self._store.remove_group(name)
 
     def of(self, uuid: bytes) -> list[str]:
@@ -121,16 +121,16 @@ class Groups:
         with self._store.together():
             for name in names:
                 self._store.remove_from_group(name, [old])
-                self._tell(name, [old], member=False)
+                self._report_member(name, [old], member=False)
                 if new is not None and new not in self.get(name).uuids:
                     self._store.add_to_group(name, [new])
-                    self._tell(name, [new], member=True)
+                    self._report_member(name, [new], member=True)
         return names
 
-    def _tell(self, name: str, uuids: Iterable[bytes], *, member: bool) -> None:
+    def _report_member(self, name: str, uuids: Iterable[bytes], *, member: bool) -> None:
         """Tell the plant who came into a group, or left it."""
         for uuid in uuids:
-            self._plant.tell("grouped", uuid, group=name, member=member)
+            self._plant.record_event("grouped", uuid, group=name, member=member)
 
     @contextmanager
     def frozen(self, name: str) -> Iterator[None]:

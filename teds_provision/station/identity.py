@@ -41,7 +41,7 @@ class StationIdentity:
         facts = self._store.facts()
         return facts.requested if facts is not None else None
 
-    def found(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
+    def establish(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
         """Keep where the secrets of a new station lie, and the key for which it asks a certificate, if it does."""
         self._store.put_facts(self._seals.facts(StationRecord(name or DEFAULT_NAME, keystore, keystore_why, requested)))
 

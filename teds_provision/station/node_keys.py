@@ -18,7 +18,7 @@ from teds_provision.errors import (
 from teds_provision.station.identity import StationIdentity
 from teds_provision.station.plant import Plant
 from teds_provision.station.row_macs import RowMacs
-from teds_provision.store import Holder, KeyFlags, KeyRecord, Store, pages, utc_now
+from teds_provision.store import Holder, KeyFlags, KeyRecord, Store, chunks, utc_now
 from teds_provision.store.records import KeySource
 from teds_provision.vault.base import node_key_context
 
@@ -68,7 +68,7 @@ class NodeKeys:
         self._seals = seals
         self._reopened = reopened
 
-    def of(self, uuid: bytes) -> list[KeyRecord]:
+    def keys_of(self, uuid: bytes) -> list[KeyRecord]:
         """The keys of a node, wrapped, in the order to try them: newest pending first, the active one last."""
         return self._store.keys(uuid)
 
@@ -76,9 +76,9 @@ class NodeKeys:
         """Every key of every node, wrapped, in the order they came, a page at a time."""
         return self._store.all_keys()
 
-    def each_name(self) -> Iterator[tuple[bytes, str, int, str]]:
+    def all_key_names(self) -> Iterator[tuple[bytes, str, int, str]]:
         """UUID, key id, epoch and state of every key, in the order they came, a page at a time."""
-        return self._store.each_key_name()
+        return self._store.all_key_names()
 
     def held(self, uuid: bytes) -> bool:
         """Whether any key is held for a node."""
@@ -106,7 +106,7 @@ class NodeKeys:
         """Epoch of the current (active) key of a node, 0 for none."""
         return next((record.epoch for record in self._store.keys(uuid) if record.state == "active"), 0)
 
-    def of_page(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
+    def get_many(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
         """The keys of a page of nodes, wrapped, in the order they came."""
         return self._store.keys_of(uuids)
 
@@ -205,10 +205,10 @@ class NodeKeys:
                 for other in self.outdated(record):
                     self._store.remove_key(uuid, other.key_id)
             self._store.activate_key(uuid, key_id)
-            marks = self._store.marks(uuid)
+            marks = self._store.key_flags(uuid)
             if marks.next_ca is None:
                 return
-            self._mark(uuid, next_key_id=None, next_ca=None)
+            self._set_flags(uuid, next_key_id=None, next_ca=None)
             if marks.next_key_id == key_id:
                 self.set_ca_of(uuid, marks.next_ca)
 
@@ -221,7 +221,7 @@ class NodeKeys:
     def _tell_forgotten(self, uuid: bytes, gone: Sequence[KeyRecord]) -> None:
         """Tell the plant that no key up to these epochs is left here."""
         if gone and self._plant.joined is not None:
-            self._plant.tell("forgot", uuid, epoch=max(record.epoch for record in gone))
+            self._plant.record_event("forgot", uuid, epoch=max(record.epoch for record in gone))
 
     def wrap_anew(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
         """Replace the wrapped form of every key by what ``rewrap`` gives, all or none; returns how many."""
@@ -255,7 +255,7 @@ class NodeKeys:
 
     def ca_of(self, uuid: bytes) -> bytes:
         """P(CA) that a node keeps: the owner's, or that of the bundle in which the node's key came."""
-        marks = self._store.marks(uuid)
+        marks = self._store.key_flags(uuid)
         if marks.ca is None:
             return self._identity.ca
         self._seals.check_ca(uuid, marks.ca, marks.ca_mac)
@@ -263,11 +263,11 @@ class NodeKeys:
 
     def cas_of_nodes(self) -> dict[bytes, bytes]:
         """P(CA) of every node that keeps another CA than the owner's."""
-        return self._checked_cas(self._store.all_marks())
+        return self._checked_cas(self._store.all_key_flags())
 
-    def cas_of_page(self, uuids: Sequence[bytes]) -> dict[bytes, bytes]:
+    def cas_among(self, uuids: Sequence[bytes]) -> dict[bytes, bytes]:
         """P(CA) of those of a page of nodes that keep another CA than the owner's."""
-        return self._checked_cas(self._store.marks_of(uuids))
+        return self._checked_cas(self._store.key_flags_of(uuids))
 
     def _checked_cas(self, marked: Mapping[bytes, KeyFlags]) -> dict[bytes, bytes]:
         cas: dict[bytes, bytes] = {}
@@ -279,13 +279,15 @@ class NodeKeys:
 
     def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
         """Note which CA a node keeps."""
-        self._mark(uuid, ca=ca)
+        self._set_flags(uuid, ca=ca)
 
-    def mark(self, changes: Mapping[bytes, Mapping[str, Any]]) -> None:
+    def set_flags(self, changes: Mapping[bytes, Mapping[str, Any]]) -> None:
         """Change marks of many nodes at once, by the names of :class:`KeyFlags`; the owner's CA is none."""
-        self._mark_all(changes, {uuid: m for page in pages(changes) for uuid, m in self._store.marks_of(page).items()})
+        self._set_all_flags(
+            changes, {uuid: m for page in chunks(changes) for uuid, m in self._store.key_flags_of(page).items()}
+        )
 
-    def _mark_all(self, changes: Mapping[bytes, Mapping[str, Any]], present: Mapping[bytes, KeyFlags]) -> None:
+    def _set_all_flags(self, changes: Mapping[bytes, Mapping[str, Any]], present: Mapping[bytes, KeyFlags]) -> None:
         own = self._identity.ca
         wanted: dict[bytes, KeyFlags] = {}
         for uuid, change in changes.items():
@@ -303,25 +305,25 @@ class NodeKeys:
             if after != before:
                 wanted[uuid] = after
         if wanted:
-            self._store.put_marks(wanted)
+            self._store.put_key_flags(wanted)
 
-    def _mark(self, uuid: bytes, **change: Any) -> None:
-        self._mark_all({uuid: change}, {uuid: self._store.marks(uuid)})
+    def _set_flags(self, uuid: bytes, **change: Any) -> None:
+        self._set_all_flags({uuid: change}, {uuid: self._store.key_flags(uuid)})
 
     # -- rotations and other holders -------------------------------------------------------------------------------
 
     def rotation_due(self, uuid: bytes) -> str | None:
         """Why the next session with a node has to rotate its key first; None where it has not."""
-        return self._store.marks(uuid).rotation
+        return self._store.key_flags(uuid).rotation
 
     def rotations_due(self) -> dict[bytes, str]:
         """Why a rotation is due, for every node that has one."""
-        marks = self._store.all_marks()
+        marks = self._store.all_key_flags()
         return {uuid: mark.rotation for uuid, mark in marks.items() if mark.rotation is not None}
 
-    def due_of_page(self, uuids: Sequence[bytes]) -> set[bytes]:
+    def due_among(self, uuids: Sequence[bytes]) -> set[bytes]:
         """Those of a page of nodes whose key must be rotated."""
-        marks = self._store.marks_of(uuids)
+        marks = self._store.key_flags_of(uuids)
         return {uuid for uuid, mark in marks.items() if mark.rotation is not None}
 
     def restored(self, uuid: bytes) -> bool:
@@ -338,22 +340,22 @@ class NodeKeys:
 
         Only a key that is agreed on from now on ends that: one that is pending already may be known to others.
         """
-        self._mark(uuid, rotation=why)
+        self._set_flags(uuid, rotation=why)
         self._store.count_as_imported(uuid)
 
     def rotated(self, uuid: bytes) -> None:
         """Note that a node has a key that no other station holds."""
-        self._mark(uuid, rotation=None)
+        self._set_flags(uuid, rotation=None)
         for holder in self._store.holders(uuid):
             self._store.remove_holder(uuid, holder.fingerprint)
 
     def former(self, uuid: bytes) -> str | None:
         """Fingerprint of the board that the link keys were agreed with, once its pin was let go."""
-        return self._store.marks(uuid).former
+        return self._store.key_flags(uuid).former
 
     def set_former(self, uuid: bytes, fingerprint: str | None) -> None:
         """Note which board the link keys were agreed with; None once a session has shown it."""
-        self._mark(uuid, former=fingerprint)
+        self._set_flags(uuid, former=fingerprint)
 
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Who else holds keys: of this node, or of all."""

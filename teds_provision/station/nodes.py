@@ -21,7 +21,7 @@ from teds_provision.store import (
     NodeRecord,
     Search,
     Store,
-    pages,
+    chunks,
 )
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
@@ -45,17 +45,17 @@ class Nodes:
         """All nodes, by UUID."""
         return self._store.nodes()
 
-    def each_shown(self) -> Iterator[ExportEligibility]:
+    def all_shown_keys(self) -> Iterator[ExportEligibility]:
         """Identity key of all nodes, and whether each was retired, by UUID, a page at a time."""
-        return self._store.each_shown()
+        return self._store.all_shown_keys()
 
-    def of_page(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
+    def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
         """What is known of a page of nodes, by UUID."""
         return self._store.nodes_of(uuids)
 
-    def handed_of_page(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
+    def exported_many(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
         """What a bundle says of a page of nodes, by UUID."""
-        return self._store.handed_of(uuids)
+        return self._store.exported_nodes_of(uuids)
 
     def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
         """Who has each of a page of names."""
@@ -80,7 +80,7 @@ class Nodes:
             if present is None or changed != present or mac != present.point_mac:
                 self._store.replace_node(changed, present)
             if changed.name != before.name:
-                self._plant.tell_name(uuid, changed.name)
+                self._plant.record_name(uuid, changed.name)
         return changed
 
     def _seal(self, uuid: bytes, point: object, present: NodeRecord | None) -> bytes | None:
@@ -102,7 +102,7 @@ class Nodes:
 
     def last_places(self, uuids: Sequence[bytes]) -> dict[bytes, str]:
         """Where each of these nodes was met last, as ``LINK:WHERE``; without those that never were."""
-        return {uuid: place for page in pages(uuids) for uuid, place in self._store.last_places(page).items()}
+        return {uuid: place for page in chunks(uuids) for uuid, place in self._store.last_places(page).items()}
 
     def resolve(self, text: str) -> bytes:
         """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFoundError, UsageError."""
@@ -234,5 +234,5 @@ def _first_due(image: Image) -> str | None:
     """The day (ISO 8601) on which the first calibration of a datasheet ends, None where none does."""
     if not any(code == AccessCode.CALIBRATION for _, code in image):
         return None
-    ends = [channel.due for channel in sheet.Sheet.of(image).channels if channel.due is not None]
+    ends = [channel.due for channel in sheet.Sheet.from_image(image).channels if channel.due is not None]
     return min(ends).strftime("%Y-%m-%d") if ends else None

@@ -53,9 +53,9 @@ class Pins:
 
     def all(self, nodes: Iterable[NodeRecord] | None = None) -> dict[bytes, str]:
         """Fingerprint of every pinned UUID; ``nodes`` are all of the store where they have been read already."""
-        return self.among(self._store.nodes() if nodes is None else nodes, self.whitelist())
+        return self.pinned_among(self._store.nodes() if nodes is None else nodes, self.whitelist())
 
-    def among(
+    def pinned_among(
         self, nodes: Iterable[NodeRecord | ExportEligibility], entries: Iterable[WhitelistEntry]
     ) -> dict[bytes, str]:
         """Fingerprint of each of these nodes and entries that is pinned, by UUID."""
@@ -96,9 +96,9 @@ class Pins:
             self._seals.check_entry(entry)
         return entries
 
-    def each(self) -> Iterator[WhitelistEntry]:
+    def all_entries(self) -> Iterator[WhitelistEntry]:
         """All entries, by UUID, a page at a time, for lists."""
-        return map(self._checked, self._store.each_whitelisted())
+        return map(self._checked, self._store.all_whitelisted())
 
     def _checked(self, entry: WhitelistEntry) -> WhitelistEntry:
         self._seals.check_entry(entry)
@@ -108,7 +108,7 @@ class Pins:
         """The whitelist entry of a node, None where it is not on it."""
         return self._seals.check_entry(self._store.whitelisted(uuid))
 
-    def of_page(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
+    def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
         """The entries of a page of nodes, by UUID."""
         return {uuid: self._checked(entry) for uuid, entry in self._store.whitelist_of(uuids).items()}
 
@@ -117,18 +117,18 @@ class Pins:
         self._seals.require()
         with self._store.together():
             for entry in entries if self._plant.joined is not None else ():
-                self._tell(entry)
+                self._report_pin(entry)
             self._store.put_whitelist_entries(self._seals.entry(entry) for entry in entries)
 
-    def _tell(self, entry: WhitelistEntry) -> None:
+    def _report_pin(self, entry: WhitelistEntry) -> None:
         """Tell the plant of a pin of this station's own, where it is a new one."""
         before = self._store.whitelisted(entry.uuid)
         if entry.name != (before.name if before is not None else None):
-            self._plant.tell_name(entry.uuid, entry.name)
+            self._plant.record_name(entry.uuid, entry.name)
         if entry.fingerprint is None or not is_whole(entry.fingerprint) or entry.assurance == "registry":
             return
         if before is None or (before.fingerprint, before.assurance) != (entry.fingerprint, entry.assurance):
-            self._plant.tell("pinned", entry.uuid, fingerprint=entry.fingerprint, assurance=entry.assurance)
+            self._plant.record_event("pinned", entry.uuid, fingerprint=entry.fingerprint, assurance=entry.assurance)
 
     def remove(self, uuid: bytes) -> bool:
         """Take a node off the whitelist (the vault opens); False if it was not on it. A contact's key stays pinned."""
@@ -136,12 +136,12 @@ class Pins:
         with self._store.together():
             entry = self._store.whitelisted(uuid) if self._plant.joined is not None else None
             if entry is not None and is_whole(entry.fingerprint) and entry.assurance != "registry":
-                self._plant.tell("unpinned", uuid)
+                self._plant.record_event("unpinned", uuid)
             return self._store.remove_whitelist(uuid)
 
     # -- a board that was replaced under its UUID ------------------------------------------------------------------
 
-    def let_go(self, uuid: bytes) -> None:
+    def unpin(self, uuid: bytes) -> None:
         """Forget the pinned key; the link keys that are held still belong to the board that had it."""
         self._seals.require()
         entry, node = self._store.whitelisted(uuid), self._store.node(uuid)  # whatever it is: it is forgotten

@@ -163,21 +163,21 @@ class Plant:
             if self._seals.noted("digest", f"{digest.hex()} {station} {n} {'vouched' if vouched else 'signed'}", mac)
         ]
 
-    def tell(self, act: str, uuid: bytes | None = None, **members: object) -> None:
+    def record_event(self, act: str, uuid: bytes | None = None, **members: object) -> None:
         """Tell the plant what was done, in the transaction of the act itself: both are on the disk, or neither.
 
         Members as ``protocol.plant.event.FORMS`` has them. Nothing is written where none was joined.
         """
         if self.joined is None:
             return
-        self.say(event.made(act, secrets.token_hex(8), utc_now(), uuid, members))
+        self.queue_event(event.made(act, secrets.token_hex(8), utc_now(), uuid, members))
 
-    def tell_name(self, uuid: bytes, name: object) -> None:
+    def record_name(self, uuid: bytes, name: object) -> None:
         """Tell a node's name, where it is one that a plant can say: 1 to 100 printable characters."""
         if self.joined is not None and document.is_name(name):
-            self.tell("named", uuid, name=name)
+            self.record_event("named", uuid, name=name)
 
-    def say(self, told: Mapping[str, Any]) -> None:
+    def queue_event(self, told: Mapping[str, Any]) -> None:
         """Have an event that was made wait for the next page."""
         uuid = told.get("uuid")
         text = json.dumps(told, ensure_ascii=False, separators=(",", ":"))

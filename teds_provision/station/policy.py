@@ -147,7 +147,7 @@ class Policy:
             hash = event.hash_of_statement(entry.statement)
             for name in (_digest(entry.statement), hash):
                 self._store.put_lifted(name, self._seals.note("lifted", name))
-            self._plant.tell("lifted", of=hash)
+            self._plant.record_event("lifted", of=hash)
             return self._store.remove_revocation(uuid)
 
     def forgive(self, uuid: bytes) -> bool:

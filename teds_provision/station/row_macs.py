@@ -137,7 +137,7 @@ class RowMacs:
         for node in self._store.nodes():
             if node.point is not None and node.point_mac is not None:
                 yield f"the key of node {node.uuid.hex()}", node.point_mac, "node", (node.uuid, node.point)
-        for uuid, marks in self._store.all_marks().items():
+        for uuid, marks in self._store.all_key_flags().items():
             if marks.ca is not None:
                 yield f"the CA of node {uuid.hex()}", marks.ca_mac, "ca", (uuid, marks.ca)
         yield from self._decisions()

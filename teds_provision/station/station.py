@@ -90,12 +90,12 @@ class Handovers:
         """Add or replace many rows, all or none; the caller has held them against what is there."""
         with self._store.transaction():
             seals = self._seals
-            self._store.put_batch(
+            self._store.put_bulk(
                 batch,
                 seal_node=lambda node: seals.point(node.uuid, node.point) if node.point else None,
                 seal_entry=seals.of_entry,
             )
-            self._keys.mark(batch.marks)
+            self._keys.set_flags(batch.marks)
 
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
@@ -130,16 +130,16 @@ class Station:
         self.use_agent = True
         """Whether what ``unlock`` holds open opens the vault; False where the passphrase itself is asked for."""
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
-        self.seals = RowMacs(store, self._opened, tell)
-        self.identity = StationIdentity(store, self._opened, self.seals)
-        self.plant = Plant(store, self.current_vault, self.identity, self.seals)
-        self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened, self.plant)
-        self.pins = Pins(store, self.keys, self.seals, self.plant)
-        self.policy = Policy(store, self.identity, self.keys, self.pins, self.seals, self.plant)
-        self.nodes = Nodes(store, self.seals, self.plant)
+        self.row_macs = RowMacs(store, self._opened, tell)
+        self.identity = StationIdentity(store, self._opened, self.row_macs)
+        self.plant = Plant(store, self.current_vault, self.identity, self.row_macs)
+        self.keys = NodeKeys(store, self._opened, self.identity, self.row_macs, self._reopened, self.plant)
+        self.pins = Pins(store, self.keys, self.row_macs, self.plant)
+        self.policy = Policy(store, self.identity, self.keys, self.pins, self.row_macs, self.plant)
+        self.nodes = Nodes(store, self.row_macs, self.plant)
         self.groups = Groups(store, store.home, self.plant)
         self.measurements = Measurements(store, self.groups, store.home)
-        self.handovers = Handovers(store, self.keys, self.seals)
+        self.handovers = Handovers(store, self.keys, self.row_macs)
 
     @classmethod
     def open(cls, home: Path, *, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> Station:
@@ -201,7 +201,7 @@ class Station:
 
     def _opened(self) -> Vault:
         if self._vault is None:
-            self._store.in_order()
+            self._store.drain()
             with self._opening:  # of several threads one asks for the passphrase
                 if self._vault is None:
                     keystore = self.identity.keystore
@@ -220,13 +220,13 @@ class Station:
 
     def _look_at_seals(self, vault: Vault) -> None:
         try:
-            self.seals.unlocked(vault)
+            self.row_macs.unlocked(vault)
         except (
             UnknownMasterKeyError
         ):  # between the opening of the vault and this look another command changed the master key
             if not vault.refresh():
                 raise
-            self.seals.unlocked(vault)
+            self.row_macs.unlocked(vault)
 
     def ask_by(self, ask: Ask) -> None:
         """Ask for the passphrase by another function from now on."""
@@ -273,7 +273,7 @@ class Station:
             common = here.keys() & masters.keys.keys()
             if any(here[number] != masters.keys[number] for number in common):
                 return False
-            if not common and not self.seals.opened_by(masters):
+            if not common and not self.row_macs.opened_by(masters):
                 return False
             vault.accept(masters)
             return True
@@ -310,7 +310,7 @@ class Station:
 
         May stand inside another one of the same thread.
         """
-        self._store.in_order()
+        self._store.drain()
         with self._turn:
             if self._held:
                 yield
@@ -339,7 +339,7 @@ class Station:
     @contextmanager
     def run(self) -> Iterator[None]:
         """Several steps by one thread, of which the last is durable: so are all of them when the block has ended."""
-        self._runs.now = run = _DurableRun(self._store.behind())
+        self._runs.now = run = _DurableRun(self._store.background_writer())
         try:
             try:
                 yield
@@ -347,9 +347,9 @@ class Station:
                 self._runs.now = None
                 run.behind.close()
         finally:
-            self._store.settle(run.last)  # not what other threads have written since: they see to it themselves
+            self._store.flush(run.last)  # not what other threads have written since: they see to it themselves
 
-    def behind(self, step: Callable[[], object]) -> None:
+    def run_in_background(self, step: Callable[[], object]) -> None:
         """Take a durable step while the node is talked to: in a :meth:`run` by its own thread, elsewhere at once.
 
         Whatever is asked of the store afterwards waits for it, and raises what it raised; the run ends with it. So the
@@ -368,15 +368,15 @@ class Station:
             finally:
                 self._runs.now = None
 
-        run.behind.take(taken)
+        run.behind.submit(taken)
 
-    def settle(self) -> None:
+    def flush(self) -> None:
         """Wait until all that this thread's run has written is on the disk; outside a run it is."""
         run: _DurableRun | None = getattr(self._runs, "now", None)
         if run is not None:
-            self._store.settle(run.last)
+            self._store.flush(run.last)
 
-    def turn(self, uuid: bytes) -> NodeLock:
+    def node_lock(self, uuid: bytes) -> NodeLock:
         """Have one node to oneself: two commands of this station do not work on the same node at once."""
         return NodeLock(self.home, uuid, notice=self.notice)
 
@@ -454,7 +454,7 @@ def initialise(
             station.adopt(vault)
             with station.transaction():
                 where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
-                station.identity.found(name, where, why)
+                station.identity.establish(name, where, why)
                 station.identity.complete(key.point, ca.point, ca.sign(keys.station_key_message(key.point)))
                 station.audit("init", None, "done", fingerprint=keys.fingerprint(key.point), keystore=vault.kind)
             return why
@@ -503,7 +503,7 @@ def rewrap(station: Station) -> RewrapResult:
         return vault.wrap(key, context=context)
 
     count = station.keys.wrap_anew(anew)
-    station.seals.rewrap(vault)
+    station.row_macs.rewrap(vault)
     station.plant.rewrap(vault)
     vault.retire_masters()
     master_socket.hand_over(station.home, vault.master_keys())

@@ -70,7 +70,7 @@ class NotAdoptedError(PolicyError):
         self.brought = brought
 
 
-def nobody_adopts(brought: FactoryDatasheet) -> None:
+def refuse_adoption(brought: FactoryDatasheet) -> None:
     """The answer where nobody can be asked: no. Raises NotAdoptedError."""
     raise NotAdoptedError(
         f"Node {brought.image.uuid.hex()} brought its own datasheet, and nobody has approved signing it.",
@@ -79,7 +79,7 @@ def nobody_adopts(brought: FactoryDatasheet) -> None:
     )
 
 
-def brought_by(station: Station, image: Image, *, name: str | None = None) -> FactoryDatasheet:
+def read_factory_datasheet(station: Station, image: Image, *, name: str | None = None) -> FactoryDatasheet:
     """What the TEDS on a board say, judged; ``name`` goes before the one that it gives itself.
 
     Raises BadDataError (no datasheet, damaged or hostile TEDS, another node's), PolicyError (another node's name).
@@ -93,7 +93,7 @@ def brought_by(station: Station, image: Image, *, name: str | None = None) -> Fa
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), octets):
             raise _refused(uuid, f"TEDS {code} of channel {channel} is damaged, or is one that no node can store")
     found = Image(image.uuid, blocks)
-    sheet = Sheet.of(found)
+    sheet = Sheet.from_image(found)
     if not sheet.channels:
         raise BadDataError(
             f"Node {uuid} has no datasheet of its own: no TransducerChannel TEDS.",

@@ -112,7 +112,7 @@ def _activate(station: Station, record: KeyRecord) -> None:
             station.keys.rotated(uuid)
         pinned = station.pins.pinned(uuid)
         if is_whole(pinned):
-            station.plant.tell("agreed", uuid, fingerprint=pinned, epoch=record.epoch, key_id=record.key_id)
+            station.plant.record_event("agreed", uuid, fingerprint=pinned, epoch=record.epoch, key_id=record.key_id)
     station.audit("key", uuid, "active", key_id=record.key_id, epoch=record.epoch)
 
 
@@ -174,7 +174,7 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
     The epoch is that of a plain Identify. Who agreed is seen only from a datasheet that this station's trust vouches
     for, and the new owner may not have signed one yet.
     """
-    held = max((record.epoch for record in station.keys.of(node.uuid)), default=0)
+    held = max((record.epoch for record in station.keys.keys_of(node.uuid)), default=0)
     said = node.identity.epoch
     if said <= held:
         return ""
@@ -392,7 +392,7 @@ def _agree_anew(
         station.keys.set_ca_of(uuid, ca)
         _enlist(station, entry)
         station.audit("agree", uuid, "pending", key_id=key_id, epoch=agreed.epoch, via=node.contact.link.via)
-    node.send(agreed.confirm, "the key confirmation")
+    node.request(agreed.confirm, "the key confirmation")
     node.forget()
     node.open(agreed.key, statics=(station.point, agreed.node))
     identity = read_identity(node)
@@ -406,7 +406,9 @@ def _agree_anew(
     def record() -> None:
         with station.durable("agree", more_follows=True):
             station.keys.promote(uuid, key_id)
-            station.plant.tell("agreed", uuid, fingerprint=fingerprint(agreed.node), epoch=agreed.epoch, key_id=key_id)
+            station.plant.record_event(
+                "agreed", uuid, fingerprint=fingerprint(agreed.node), epoch=agreed.epoch, key_id=key_id
+            )
             station.nodes.met_at(uuid, place)
             station.nodes.remember(
                 uuid,
@@ -421,7 +423,9 @@ def _agree_anew(
             station.pins.settled(uuid)
             station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
 
-    station.behind(record)  # the pending key opens a session as well: nothing that is read next depends on it
+    station.run_in_background(
+        record
+    )  # the pending key opens a session as well: nothing that is read next depends on it
     return AgreeResult(agreed.epoch, key_id, fresh=True)
 
 
@@ -429,7 +433,9 @@ def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: by
     """One Request with a one-time key of its own, and its reply checked; nothing is kept on either side yet."""
     fit_to_agree(teds, node.uuid, entry.fingerprint)
     agreement = StationAgreement(station.identity.credentials(ca), node.uuid)
-    reply = node.sure(agreement.request(), "the key agreement")  # it lies in RAM only, and goes at the next one
+    reply = node.request_retry_once(
+        agreement.request(), "the key agreement"
+    )  # it lies in RAM only, and goes at the next one
     with station.reading():
         epoch = station.pins.epoch_to_exceed(node.uuid, entry.fingerprint)
     return agreement.accept(reply, teds, pinned=entry.fingerprint, epoch=epoch)
@@ -461,7 +467,7 @@ def reset_node(station: Station, node: Conversation, who: IdentifiedNode) -> Res
         station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), retired=None)
         station.nodes.forget_reading(who.uuid)
         told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
-        station.plant.tell("reset", who.uuid, epoch=receipt.epoch, point=who.point.hex(), **told)
+        station.plant.record_event("reset", who.uuid, epoch=receipt.epoch, point=who.point.hex(), **told)
         station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)
     return receipt
 
@@ -475,10 +481,10 @@ def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
     challenge = os.urandom(CHALLENGE_OCTETS)
     command = security_command(Function.RESET, challenge)
     try:
-        proof = node.send(command, "the reset")
+        proof = node.request(command, "the reset")
     except SessionLostError:  # its reply was lost and the session with it: in factory state it gives the proof again
         node.forget()
-        proof = node.plain(command, "the proof of its reset")
+        proof = node.request_plain(command, "the proof of its reset")
     node.forget()
     if not verify(point, reset_message(node.uuid, epoch, challenge), proof):
         raise NotAuthenticError("The node's reset receipt is not valid; its keys are kept here.")

@@ -25,7 +25,7 @@ from teds_provision.errors import (
 from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.adoption import Adopt, brought_by, nobody_adopts
+from teds_provision.steps.adoption import Adopt, read_factory_datasheet, refuse_adoption
 from teds_provision.steps.agree import TakeOver
 from teds_provision.steps.batch_sheet import (
     BatchTotals,
@@ -48,17 +48,24 @@ from teds_provision.steps.build import (
     for_several,
     merged,
     named_for,
-    nobody,
+    no_confirmation,
     prepare,
     propose,
 )
 from teds_provision.steps.identify import IdentifiedNode, examine
-from teds_provision.steps.provision import Accept, ProductionLine, ProvisionResult, inspect, provision
+from teds_provision.steps.provision import Accept, ProductionLine, ProvisionResult, provision, verify_only
 from teds_provision.steps.readings import verdict_of
-from teds_provision.steps.teds_read import survey
+from teds_provision.steps.teds_read import take_snapshot
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLostError
-from teds_provision.talk.meeting import IdleStop, meet, onward, refuse_twins, watch_nodes, without_twins
+from teds_provision.talk.meeting import (
+    IdleStop,
+    continue_over_ble,
+    drop_duplicate_uuids,
+    meet,
+    refuse_duplicate_uuids,
+    watch_nodes,
+)
 from teds_provision.talk.progress import NodeReporter, Reporter
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
@@ -109,7 +116,7 @@ class Questions:
     low: Low = wait_for_charge
     take_over: TakeOver | None = None
     retype: Retype | None = None
-    adopt: Adopt = nobody_adopts
+    adopt: Adopt = refuse_adoption
 
 
 @dataclass(frozen=True)
@@ -187,10 +194,10 @@ class BatchRun:
         steps = ["identify"]
         steps += [] if who.whitelisted else ["whitelist"]
         steps += ["agree"] if who.state == NodeState.FACTORY or not self._station.keys.held(who.uuid) else []
-        found = survey(node, initial=who.security_teds)
+        found = take_snapshot(node, initial=who.security_teds)
         named = named_for(self._station, who.uuid, self._for(who))
         if named.order.adopt and found.identity.state != NodeState.PROVISIONED:
-            brought = brought_by(self._station, found.image, name=named.order.name)
+            brought = read_factory_datasheet(self._station, found.image, name=named.order.name)
             return ProvisionPlan(who.uuid, who.state, (*steps, *_AFTER), (), (*brought.errors, *brought.warnings))
         proposal = propose(self._station, named, found, record=False)
         changes = tuple(change.text for change in proposal.changes)
@@ -320,7 +327,7 @@ class BatchRun:
             yield from self._side_by_side(port, contacts, questions)
             if not self.stop.is_asked:
                 self._all_done = True
-                refuse_twins(everyone)  # the others are done, and what is not done is not passed over
+                refuse_duplicate_uuids(everyone)  # the others are done, and what is not done is not passed over
         finally:
             port.close()
 
@@ -332,7 +339,7 @@ class BatchRun:
                 hint="Use --watch to provision boards one tap after the other.",
             )
         everyone = port.everyone(seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen)
-        found = without_twins(everyone, self._reporter.notice)
+        found = drop_duplicate_uuids(everyone, self._reporter.notice)
         contacts = [contact for contact in found if self._is_meant(contact)]
         if not contacts:
             self._require_known(found)
@@ -439,15 +446,15 @@ class BatchRun:
                 questions.accept(who)
 
         if self.line is not None and self.line.only_verify:
-            return inspect(self._station, node, self.line, self._reporter)
+            return verify_only(self._station, node, self.line, self._reporter)
         return provision(
             self._station,
             node,
             self._for,
             accept=accept,
             reporter=reporter or self._reporter,
-            confirm=questions.confirm or nobody,
-            onward=onward(self._links, self._reporter.notice),
+            confirm=questions.confirm or no_confirmation,
+            onward=continue_over_ble(self._links, self._reporter.notice),
             low=questions.low,
             take_over=questions.take_over,
             retype=questions.retype,
@@ -483,7 +490,7 @@ class BatchRun:
             except TedsProvisionError:
                 self.progress.turn_away(row, who.uuid)
                 raise
-            self.progress.take(row, who.uuid)
+            self.progress.assign_row(row, who.uuid)
         return row.prepared
 
     def _note(self, board: BoardResult) -> None:

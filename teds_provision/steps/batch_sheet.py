@@ -496,7 +496,7 @@ class Progress:
         """The board that has the row, or was turned away from it in this run; None where there was none."""
         return self.rows[row.number].uuid or self._turned_away.get(row.number)
 
-    def take(self, row: SheetRow, uuid: bytes) -> None:
+    def assign_row(self, row: SheetRow, uuid: bytes) -> None:
         """Note that this board is the row's, before anything is done with it.
 
         Raises NodeBusyError where another run of this sheet has given the row to another board meanwhile.

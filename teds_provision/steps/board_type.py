@@ -58,7 +58,7 @@ Retype = Callable[[bytes, tuple[str, ...]], None]
 """Asked before a board becomes one of another type: its UUID and the differences; raises where the answer is no."""
 
 
-def refuse(uuid: bytes, differences: tuple[str, ...]) -> None:
+def require_board_type(uuid: bytes, differences: tuple[str, ...]) -> None:
     """The answer where nobody can be asked: no. Raises WrongBoardError."""
     more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
     raise WrongBoardError(
@@ -77,7 +77,7 @@ class _ChannelStatement(NamedTuple):
     calibrated: bool
 
     @classmethod
-    def of(cls, channel: Channel, blocks: Mapping[BlockId, bytes]) -> _ChannelStatement:
+    def from_teds(cls, channel: Channel, blocks: Mapping[BlockId, bytes]) -> _ChannelStatement:
         form = None if channel.sample is None else (channel.sample.model, channel.sample.octets)
         units = channel.units if channel.units_stated else None
         return cls(channel.kind, form, units, (channel.number, AccessCode.CALIBRATION) in blocks)
@@ -102,11 +102,13 @@ def differences(
     """
     if not _describes(has):
         return ()
-    own = {channel.number: _ChannelStatement.of(channel, has) for channel in Sheet.of_blocks(has).channels}
+    own = {channel.number: _ChannelStatement.from_teds(channel, has) for channel in Sheet.from_blocks(has).channels}
     if not own:
         return ()
     if isinstance(wanted, Image):
-        meant = {one.number: _ChannelStatement.of(one, wanted.blocks) for one in Sheet.of(wanted).channels}
+        meant = {
+            one.number: _ChannelStatement.from_teds(one, wanted.blocks) for one in Sheet.from_image(wanted).channels
+        }
     else:
         meant = {one.number: _ChannelStatement.wanted(one) for one in wanted.channels}
     meant |= {number: meant[number]._replace(calibrated=True) for number in calibrated if number in meant}
@@ -122,7 +124,9 @@ def further(has: Mapping[BlockId, bytes], wanted: Image) -> tuple[str, ...]:
     """A warning for the channels that the board describes and nobody wants, if there are any."""
     if not _describes(has):
         return ()
-    channels = {one.number for one in Sheet.of_blocks(has).channels} - {one.number for one in Sheet.of(wanted).channels}
+    channels = {one.number for one in Sheet.from_blocks(has).channels} - {
+        one.number for one in Sheet.from_image(wanted).channels
+    }
     named = ", ".join(map(str, sorted(channels)))
     return (f"The board has more channels than the profile: {named}.",) if channels else ()
 
@@ -193,7 +197,7 @@ def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead
     """
     named = f"channel {channel}" if channel else "any sensor"
     try:
-        node.send(
+        node.request(
             OperateCommand(channel, digest[:DIGEST_OCTETS], lease, dead_man).command(),
             f"to measure with {named}" if channel else "to measure",
         )
@@ -232,7 +236,7 @@ class HardwareCheck:
         return any(self.channels.values())
 
 
-def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = None) -> HardwareCheck:
+def check_hardware(node: Conversation, image: Image, shown: Mapping[int, str] | None = None) -> HardwareCheck:
     """Ask a node, in its session, whether each channel bears the datasheet ``image``, and its sensors for one reading.
 
     ``shown`` are the units in which people see the values of channels, where the profile names one. Nothing stays
@@ -253,7 +257,9 @@ def bears(node: Conversation, image: Image, shown: Mapping[int, str] | None = No
 
 
 def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) -> HardwareCheck:
-    described = Sheet.of(Image(image.uuid, image.unsigned_blocks()))  # what the Security TEDS says is judged already
+    described = Sheet.from_image(
+        Image(image.uuid, image.unsigned_blocks())
+    )  # what the Security TEDS says is judged already
     sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
     found = {one.number: _bears(node, one, digest) for one in sheet.channels}
     sensors = [one for one in sheet.channels if not one.actuator and found[one.number]]
@@ -285,7 +291,7 @@ def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
 
 
 def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: bytes) -> Iterator[dict[str, Any]]:
-    told = OperationReply.decode(node.send(OPERATION, "to tell its mode")).channels
+    told = OperationReply.decode(node.request(OPERATION, "to tell its mode")).channels
     taken = {number for number, (state, _) in told.items() if state & ChannelState.CLAIMED_BY_OTHER}
     free = [one for one in sensors if one.number not in taken]
     readers = {one.number: ChannelInterpreter(sheet, one.number) for one in free}
@@ -294,7 +300,7 @@ def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: byte
             operate(node, number, digest, lease=_LEASE)
         for part in _parts(readers):
             width = sum(readers[number].octets for number in part)
-            reply = SampleReply.decode(node.send(sample(part), "to sample"), width)
+            reply = SampleReply.decode(node.request(sample(part), "to sample"), width)
             at, raws = 0, {}
             for number in part:
                 one = readers[number]
@@ -303,7 +309,7 @@ def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: byte
             for number in part:
                 yield _to_json(readers[number], raws, valid=reply.valid)
     finally:
-        node.send(idle(0), "to let go")
+        node.request(idle(0), "to let go")
 
 
 def _parts(readers: dict[int, ChannelInterpreter]) -> list[list[int]]:

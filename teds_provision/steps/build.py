@@ -20,8 +20,8 @@ from teds_provision.lazy import late
 from teds_provision.protocol import datasheet
 from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
-from teds_provision.steps.adoption import brought_by
-from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse
+from teds_provision.steps.adoption import read_factory_datasheet
+from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.verify import FreshnessFloor, Verification, verify_image
@@ -317,7 +317,7 @@ def teds_calibrations(image: Image) -> dict[int, Calibration]:
     """The calibrations that an image holds, by channel."""
     if not _is_calibrated(image):
         return {}
-    return dict(Sheet.of(image).calibrations)
+    return dict(Sheet.from_image(image).calibrations)
 
 
 def own_name(station: Station, image: Image, before: str | None) -> str | None:
@@ -487,7 +487,7 @@ Confirm = Callable[[bytes, tuple[Change, ...]], None]
 """Asked before a datasheet changes in what was not named: UUID and changes; raises where the answer is no."""
 
 
-def nobody(uuid: bytes, changes: tuple[Change, ...]) -> None:
+def no_confirmation(uuid: bytes, changes: tuple[Change, ...]) -> None:
     """The answer where nobody can be asked: no. Raises UnrequestedChangeError with the changes."""
     shown = " ".join(change.text for change in changes[:3])
     more = f" And {len(changes) - 3} more." if len(changes) > 3 else ""
@@ -522,7 +522,7 @@ def build(
     if has is not None and prepared.profile is not None and not order.retype:
         told = differences(has.blocks, prepared.profile, prepared.calibrations or ())
         if told and not is_remembered(station, uuid, order.profile, factory=False):
-            (retype or refuse)(uuid, told)
+            (retype or require_board_type)(uuid, told)
     pending, draft = pending_image(station, uuid, has), station.nodes.draft(uuid)
     name = own_name(station, pending, draft.profile) if pending is not None and draft is not None else None
     plan = compose(station, uuid, prepared, pending or has, name=name, edition=edition)
@@ -609,7 +609,7 @@ def _proposal(station: Station, prepared: PreparedOrder, present: NodeSnapshot) 
     if order.adopt and order.name is None:
         return _as_it_is(station, present, keep)
     if order.adopt:  # what it has, under another name, whatever its type
-        brought = brought_by(station, present.image, name=order.name)
+        brought = read_factory_datasheet(station, present.image, name=order.name)
         return Proposal(brought.image, (), True, name=brought.name or None)
     if not _intact(station, present):
         return _mended(station, prepared, present) or _composed(

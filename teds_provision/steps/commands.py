@@ -32,15 +32,22 @@ from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import AgreeResult, ResetReceipt, agree, open_session, require_session, reset_node
-from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse, shown_by
+from teds_provision.steps.board_type import Retype, differences, is_remembered, require_board_type, shown_by
 from teds_provision.steps.build import guard, own_name, require_free_name
 from teds_provision.steps.identify import IdentifiedNode, describe, identify
 from teds_provision.steps.provision import add_to_whitelist
 from teds_provision.steps.readings import keep
 from teds_provision.steps.sign import SignResult, known_image, known_node_keys, sign
-from teds_provision.steps.teds_read import read_identity, read_image, survey
-from teds_provision.steps.verify import Verification, known_of, require_authentic, session, unproven, verify_image
-from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
+from teds_provision.steps.teds_read import read_identity, read_image, take_snapshot
+from teds_provision.steps.verify import (
+    Verification,
+    freshness_floor_of,
+    require_authentic,
+    session_check,
+    unproven,
+    verify_image,
+)
+from teds_provision.steps.verify_node import open_or_say_why, provenance_check, verify_at_node
 from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
 from teds_provision.store import DatasheetRecord, Draft
 from teds_provision.talk.conversation import HEARD, Conversation, SessionLostError
@@ -91,7 +98,7 @@ def at_node(
 
     with (
         meet(station, links, uuid, reporter, before=before) as node,
-        station.turn(uuid),
+        station.node_lock(uuid),
         station.released(uuid, writes) if writes else nullcontext(),
     ):
         yield NodeVisit(station, node, identify(station, node))
@@ -257,7 +264,7 @@ def agree_at(
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
     if dry_run:
-        held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.of(uuid))
+        held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.keys_of(uuid))
         return AgreeReport(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
     if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
         confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
@@ -299,7 +306,7 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
         return False
     open_session(station, node)
     try:
-        node.send(security_command(Function.SET_CAN_ADDRESS, bytes([address])), "the new CAN address")
+        node.request(security_command(Function.SET_CAN_ADDRESS, bytes([address])), "the new CAN address")
     except SessionLostError as lost:
         raise lost.cause from lost
     except (NodeSilentError, GarbledError):
@@ -338,9 +345,9 @@ def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter
         why = open_or_say_why(station, visit.node)
         c = visit.node.c
         image = read_image(visit.node)
-        check = vouched(visit.node, visit.who.point, why)
+        check = provenance_check(visit.node, visit.who.point, why)
         if visit.node.sealed:
-            known = known_of(station, uuid, visit.node.proven or read_identity(visit.node))
+            known = freshness_floor_of(station, uuid, visit.node.proven or read_identity(visit.node))
             with station.durable("read"):
                 keep(station, visit.node, image, by="read", known=known, c=c)
         return ReadReport(image, unproven(uuid, check.why) if check.result == "failed" else None)
@@ -382,7 +389,7 @@ def verify_at(
         try:
             with at_node(station, links.after_agreeing(), found, reporter) as visit:
                 try:
-                    looked = look_at_node(station, visit.node, visit.who)
+                    looked = verify_at_node(station, visit.node, visit.who)
                 finally:
                     in_session = visit.node.sealed
             image, verified = looked.image, looked.verified
@@ -391,7 +398,7 @@ def verify_at(
                 raise
             station.audit("verify", found, "unproven", why=refusal.message)
             why = refusal.message.removeprefix(HEARD).rstrip(".")
-            image, verified = Image(found, {}), Verification(found, (session("", why),))
+            image, verified = Image(found, {}), Verification(found, (session_check("", why),))
     try:
         require_authentic(verified)
         return VerifyReport(verified, guard(station, image, None, accept_calibration), None)
@@ -472,7 +479,7 @@ def write_at(
             profile = facts.get("profile")
             known = isinstance(profile, str) and is_remembered(station, uuid, profile, factory=False)
             if told and not known:
-                (retype or refuse)(uuid, told)
+                (retype or require_board_type)(uuid, told)
         far = jump is not None
         written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=far, low=low)
         return WriteReport(wanted, written)
@@ -526,7 +533,7 @@ def sign_at(
         station.unlock()
     if not read_node:
         return sign_image(station, order, None)
-    with meet(station, links.after_agreeing(), uuid, reporter) as node, station.turn(uuid):
+    with meet(station, links.after_agreeing(), uuid, reporter) as node, station.node_lock(uuid):
         return sign_image(station, order, node)
 
 
@@ -623,7 +630,7 @@ def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image 
 def _read_now(station: Station, node: Conversation, order: SignOrder) -> _PresentTeds:
     if not order.dry_run:  # opening a session may settle or rotate keys
         require_session(station, node)
-    found = survey(node)
+    found = take_snapshot(node)
     return _PresentTeds(found.image, found.identity.epoch, found.identity.sequence, found.read_only, read=True)
 
 
@@ -703,7 +710,7 @@ def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
     )
 
 
-def bring_back(
+def restore_datasheet(
     station: Station, links: LinkSettings, node: str, sequence: int, reporter: Reporter, *, dry_run: bool = False
 ) -> RestoredDatasheet:
     """Write a datasheet that the node had under ``sequence``, signed anew; its content counts, not its number.
@@ -719,7 +726,7 @@ def bring_back(
         return RestoredDatasheet(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
     with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always", writes="write") as visit:
         visit.session()
-        present = survey(visit.node)
+        present = take_snapshot(visit.node)
         keep = {block: present.image.blocks[block] for block in present.read_only}
         image = Image(uuid, {**record.image.unsigned_blocks(), **keep})
         guard(station, image, present.image, f"datasheet of sequence {sequence} brought back")

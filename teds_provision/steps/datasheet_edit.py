@@ -13,10 +13,10 @@ from teds_provision.errors import BadDataError
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.board_type import differences, refuse
+from teds_provision.steps.board_type import differences, require_board_type
 from teds_provision.steps.build import guard, own_name, require_fit, teds_calibrations
 from teds_provision.steps.sign import known_node_keys, sign
-from teds_provision.steps.teds_read import NodeSnapshot, survey
+from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.steps.verify import Verification, require_authentic
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import write
@@ -74,12 +74,12 @@ def plan_sheet(
         )
     if not node.sealed:
         require_session(station, node)
-    present = survey(node)
+    present = take_snapshot(node)
     keep = {block: present.image.blocks[block] for block in present.read_only}
     image = Image(node.uuid, {**keep, **under(blocks, node.uuid)})
     told = () if retype else differences(present.image.blocks, image)
     if told:
-        refuse(node.uuid, told)
+        require_board_type(node.uuid, told)
     same = {
         number: one
         for number, one in teds_calibrations(present.image).items()

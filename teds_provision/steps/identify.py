@@ -47,7 +47,7 @@ class IdentifiedNode:
 def prove(node: Conversation, point: bytes) -> None:
     """Have the node sign a fresh challenge (128.8); raises NotAuthenticError where it cannot."""
     challenge = os.urandom(CHALLENGE_OCTETS)
-    proof = node.ask(security_command(Function.PROVE, challenge), "to prove its key")
+    proof = node.request_idempotent(security_command(Function.PROVE, challenge), "to prove its key")
     if not verify(point, prove_message(node.uuid, challenge), proof):
         raise NotAuthenticError(
             f"The node cannot prove that it holds the key {fingerprint(point)[:16]}, which it presents.",

@@ -142,7 +142,7 @@ def fits_of(
     asked = tuple(requirements)
     for uuid in uuids:
         image = station.nodes.datasheet(uuid)
-        sheet = teds.sheet.Sheet.of(image) if image is not None else None
+        sheet = teds.sheet.Sheet.from_image(image) if image is not None else None
         for requirement in asked:
             if sheet is None or not sheet.channels:
                 unknown = teds.fits.Fit(None, "", "skipped", "its datasheet is unknown here.")

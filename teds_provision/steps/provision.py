@@ -16,16 +16,16 @@ from teds_provision.protocol.datasheet import SignedNodeKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.shown_units import shown_units, units_of
 from teds_provision.station.station import Station
-from teds_provision.steps.adoption import Adopt, brought_by, nobody_adopts, require_a_reason
+from teds_provision.steps.adoption import Adopt, read_factory_datasheet, refuse_adoption, require_a_reason
 from teds_provision.steps.agree import AgreeResult, TakeOver, agree
 from teds_provision.steps.board_type import (
     HardwareCheck,
     Retype,
-    bears,
+    check_hardware,
     differences,
     further,
     is_remembered,
-    refuse,
+    require_board_type,
     shown_by,
 )
 from teds_provision.steps.build import (
@@ -35,16 +35,16 @@ from teds_provision.steps.build import (
     Proposal,
     merged,
     named_for,
+    no_confirmation,
     no_profile,
-    nobody,
     prepare,
     propose,
 )
 from teds_provision.steps.identify import IdentifiedNode, identify
 from teds_provision.steps.sign import SignResult, sign
-from teds_provision.steps.teds_read import NodeSnapshot, survey
+from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.steps.verify import Verification
-from teds_provision.steps.verify_node import look_at_node, verify_node
+from teds_provision.steps.verify_node import verify_at_node, verify_node
 from teds_provision.steps.write import Low, WriteResult, wait_for_charge, write
 from teds_provision.store import WhitelistEntry
 from teds_provision.store.records import Assurance
@@ -74,29 +74,29 @@ class ProvisionResult:
     """One reading of each sensor at the end: channel, name, value and unit (SI), valid."""
 
 
-def inspect(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> ProvisionResult:
+def verify_only(station: Station, node: Conversation, line: ProductionLine, reporter: Reporter) -> ProvisionResult:
     """Test one board that another station made: identify, verify, check; nothing is written, proof is left.
 
     Raises what :func:`provision` raises; a board that is not authentic is told by its verdict.
     """
     steps, unit = Steps(reporter), None
     try:
-        with station.turn(node.uuid), station.released(node.uuid, "provision"):
+        with station.node_lock(node.uuid), station.released(node.uuid, "provision"):
             with steps.step("identify") as step:
                 who = identify(station, node)
                 step.detail = f"{who.uuid.hex()}, key {who.fingerprint[:16]}"
             prepared = line.order(who)
-            unit = line.take(node, who, prepared, None)
+            unit = line.allot_unit(node, who, prepared, None)
             try:
                 with steps.step("verify") as step:
-                    looked = look_at_node(station, node, who)
+                    looked = verify_at_node(station, node, who)
                     step.detail = looked.verified.verdict
                     told = differences(looked.image.blocks, prepared.profile) if prepared.profile is not None else ()
                     if told:
-                        refuse(who.uuid, told)
+                        require_board_type(who.uuid, told)
                 with steps.step("check") as step:
                     passed = looked.verified.verdict == "authentic" and node.sealed
-                    borne = bears(node, looked.image) if passed else HardwareCheck({})
+                    borne = check_hardware(node, looked.image) if passed else HardwareCheck({})
                     step.result = DONE if borne.asked else SKIPPED
                 done = ProvisionResult(
                     who, tuple(steps.done), looked.image, looked.verified, borne.warnings, borne.samples
@@ -167,7 +167,7 @@ class ProductionLine(Protocol):
     def is_listed(self, uuid: bytes) -> bool:
         """Whether the job names this UUID."""
 
-    def take(
+    def allot_unit(
         self, node: Conversation, who: IdentifiedNode, prepared: PreparedOrder, entry: WhitelistEntry | None
     ) -> Unit:
         """Take a unit for this board, durably, or find the one that it has; ``entry`` is a newcomer's.
@@ -183,13 +183,13 @@ def provision(
     *,
     accept: Accept,
     reporter: Reporter,
-    confirm: Confirm = nobody,
+    confirm: Confirm = no_confirmation,
     onward: Onward | None = None,
     low: Low = wait_for_charge,
     take_over: TakeOver | None = None,
     retype: Retype | None = None,
     line: ProductionLine | None = None,
-    adopt: Adopt = nobody_adopts,
+    adopt: Adopt = refuse_adoption,
 ) -> ProvisionResult:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
@@ -202,7 +202,7 @@ def provision(
     """
     run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype, line, adopt)
     try:
-        with station.turn(node.uuid), station.released(node.uuid, "provision"), station.run():
+        with station.node_lock(node.uuid), station.released(node.uuid, "provision"), station.run():
             return run.proven()
     except TedsProvisionError as error:
         with suppress(StoreError):  # a full disk must not hide what happened
@@ -229,7 +229,7 @@ class _Run:
         self.station, self.node, self.order = station, node, order
         self.accept, self.confirm, self.reporter = accept, confirm, reporter
         self.steps, self.onward, self.low, self.take_over = Steps(reporter), onward, low, take_over
-        self.retype, self._retyped, self.adopt = retype or refuse, False, adopt
+        self.retype, self._retyped, self.adopt = retype or require_board_type, False, adopt
         self.line = line
         self.unit: Unit | None = None
 
@@ -256,12 +256,12 @@ class _Run:
             self._require_its_board(who, prepared, told)
         entry = self._whitelist(who)
         if self.line is not None:
-            self.unit = self.line.take(self.node, who, prepared, entry)
+            self.unit = self.line.allot_unit(self.node, who, prepared, entry)
             prepared = self.unit.prepared
         self._agree(who, entry)
         if self.onward is not None:
             self.onward(self.node)
-        present = survey(self.node, initial=who.security_teds)
+        present = take_snapshot(self.node, initial=who.security_teds)
         proposal = self._build(who, prepared, present)
         signed = self._sign(who, proposal, present)
         written = self._write(signed, proposal, present)
@@ -309,7 +309,7 @@ class _Run:
             if who.whitelisted is not None:
                 step.result = NOTHING
                 return None
-            entry = newcomer(self.station, self.node, who)
+            entry = new_whitelist_entry(self.station, self.node, who)
             self.accept(who)
         return entry
 
@@ -338,7 +338,7 @@ class _Run:
 
     def _adopted(self, prepared: PreparedOrder, present: NodeSnapshot) -> Proposal:
         """What the board brought, judged and asked about; nothing of it changes but its name, where one is given."""
-        brought = brought_by(self.station, present.image, name=prepared.order.name)
+        brought = read_factory_datasheet(self.station, present.image, name=prepared.order.name)
         reason = prepared.order.accept_calibration
         if brought.errors and reason is None:
             require_a_reason(self.station, brought, None)
@@ -399,7 +399,7 @@ class _Run:
                 return HardwareCheck({})
             profile = prepared.profile
             units = shown_units(self.station, self.node.uuid) if profile is None else units_of(profile.channels)
-            borne = bears(self.node, written.on_node, units)
+            borne = check_hardware(self.node, written.on_node, units)
             step.result = DONE if borne.asked else SKIPPED
             good = sum(bool(one) for one in borne.channels.values())
             step.detail = (
@@ -414,7 +414,7 @@ class _Run:
         return verified
 
 
-def newcomer(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
+def new_whitelist_entry(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
     """The whitelist entry of a node that was just identified, pinned to its key by tap, or by the bus of a new node.
 
     A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. Over the
@@ -431,8 +431,8 @@ def newcomer(station: Station, node: Conversation, who: IdentifiedNode) -> White
 
 
 def add_to_whitelist(station: Station, node: Conversation, who: IdentifiedNode) -> WhitelistEntry:
-    """Whitelist a node as :func:`newcomer` says; an entry that another process made meanwhile stays."""
-    entry = newcomer(station, node, who)
+    """Whitelist a node as :func:`new_whitelist_entry` says; an entry that another process made meanwhile stays."""
+    entry = new_whitelist_entry(station, node, who)
     with station.durable("whitelist"):
         present = station.pins.entry(who.uuid)
         if present is not None:

@@ -26,9 +26,9 @@ from teds_provision.steps.verify import (
     TrustSource,
     Verification,
     judge,
-    remember_page,
-    session,
-    what_octets_say,
+    session_check,
+    snapshot_trust_of,
+    static_checks,
 )
 from teds_provision.store import NodeReading, utc_now
 from teds_provision.talk.conversation import Conversation
@@ -43,9 +43,9 @@ _IN_SESSION = "opened with the key held here"
 class NodeVerdict:
     """The verdict on a node, and what it rests on.
 
-    ``origin``: every TEDS was read in a ``session`` since the node last started; or ``kept``: the Security TEDS was,
-    and the rest is as it was read before; or ``plain``: nothing was read in a session. ``at`` is when the TEDS were
-    read (ISO 8601), ``by`` the command that did.
+    ``origin``: every TEDS was read in a ``session_check`` since the node last started; or ``kept``: the Security TEDS
+    was, and the rest is as it was read before; or ``plain``: nothing was read in a session. ``at`` is when the TEDS
+    were read (ISO 8601), ``by`` the command that did.
     """
 
     verified: Verification
@@ -105,7 +105,7 @@ def judge_reading(
     more: Sequence[Check] = (),
 ) -> tuple[NodeReading, NodeVerdict]:
     """The row of a reading and the verdict on it; nothing is kept yet. See :func:`keep_read`."""
-    said, signers = what_octets_say(image, known)
+    said, signers = static_checks(image, known)
     octets = [*said, *more]
     row = NodeReading(image.uuid, utc_now(), by, c, True, _packed(image), *signers, _written(octets))
     return row, _judged(station, row, keyed=is_keyed(station, image.uuid))
@@ -122,7 +122,7 @@ def keep_judged(
 def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) -> None:
     """Keep the Security TEDS that a node showed in no session: its key, for who builds; it is no datasheet."""
     image = Image(uuid, {SECURITY: security_teds})
-    signers = what_octets_say(image, None)[1]
+    signers = static_checks(image, None)[1]
     station.nodes.keep_reading(NodeReading(uuid, utc_now(), by, None, False, _packed(image), *signers))
 
 
@@ -138,7 +138,9 @@ def is_known(station: Station, node: Conversation, image: Image) -> bool:
     )
 
 
-def stands(station: Station, node: Conversation, security_teds: bytes, known: FreshnessFloor) -> Image | None:
+def cached_image_if_current(
+    station: Station, node: Conversation, security_teds: bytes, known: FreshnessFloor
+) -> Image | None:
     """The datasheet that was read of this node before, if its Security TEDS is the same and nothing spoke against it.
 
     Every TEDS of field 108 is in it, with the digest that was read last. Where the session's c tells a restart since,
@@ -149,7 +151,7 @@ def stands(station: Station, node: Conversation, security_teds: bytes, known: Fr
         return None
     if image.security != security_teds or _packed(image) != row.digests or row.failed - MERELY_UNSIGNED:
         return None
-    said, _ = what_octets_say(image, known)
+    said, _ = static_checks(image, known)
     if {check.name for check in said if check.result == "failed"} - MERELY_UNSIGNED:
         return None
     if not row.is_of_this_start(node.c):
@@ -177,7 +179,7 @@ def verdicts_of(station: Station, uuids: Sequence[bytes], keyed: Iterable[bytes]
         return {}
     held = set(keyed)
     try:
-        judging = remember_page(station, [row.uuid for row in rows])
+        judging = snapshot_trust_of(station, [row.uuid for row in rows])
     except (
         StoreChangedError
     ):  # of one node another program wrote the pin: it costs that one its verdict, not the others
@@ -203,7 +205,7 @@ def _judged(station: TrustSource, row: NodeReading, *, keyed: bool) -> NodeVerdi
         checks.append(Check("signed", "failed", "it does not say who signed it"))
     if not any(check.name == "session" for check in checks):
         why = "its datasheet was last read outside a session" if keyed else ""
-        checks.append(session(_IN_SESSION if row.in_session else "", why))
+        checks.append(session_check(_IN_SESSION if row.in_session else "", why))
     if not row.whole:
         checks = [check._replace(kept=True) if check.name in ABOUT_THE_REST else check for check in checks]
     origin: Origin = "plain" if not row.in_session else "session" if row.whole else "kept"

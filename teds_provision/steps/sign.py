@@ -149,10 +149,10 @@ def sign(
             station.nodes.keep_draft(Draft(keys.uuid, made, "signed", profile))
         digest = hashlib.sha256(made.blocks[SECURITY]).hexdigest()
         of_unit = {} if unit is None else dict(zip(("job", "unit"), unit, strict=True))
-        station.plant.tell("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest, **of_unit)
+        station.plant.record_event("signed", keys.uuid, epoch=epoch, sequence=number, teds_sha256=digest, **of_unit)
         station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
     if write_follows:
-        station.behind(station.settle)
+        station.run_in_background(station.flush)
     return SignResult(made, number, reused=False)
 
 

@@ -97,7 +97,7 @@ def _ask_despite_noise(node: Conversation, command: Command, what: str) -> bytes
     """Ask; a refusal that came in no session is asked for again: noise on the line makes another question of a read."""
     for left in range(_REFUSED_READS, -1, -1):
         try:
-            return node.ask(command, what)
+            return node.request_idempotent(command, what)
         except NodeRefusedError:
             if node.sealed or not left:
                 raise
@@ -106,7 +106,7 @@ def _ask_despite_noise(node: Conversation, command: Command, what: str) -> bytes
 
 def list_blocks(node: Conversation) -> list[BlockId]:
     """List (128.11): every TEDS on the node."""
-    return decode_list(node.ask(security_command(Function.LIST), "to list its TEDS"))
+    return decode_list(node.request_idempotent(security_command(Function.LIST), "to list its TEDS"))
 
 
 def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
@@ -141,10 +141,10 @@ def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Im
     def sent(command: Command, what: str) -> bytes:
         link = node.contact.link
         if not isinstance(link, PacedLink):
-            return node.send(command, what)
+            return node.request(command, what)
         link.gap = gap
         try:
-            return node.send(command, what)
+            return node.request(command, what)
         finally:
             link.gap = 0
 
@@ -175,7 +175,7 @@ def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Im
 
 def read_identity(node: Conversation) -> Identity:
     """Ask Identify again, inside the session where one is open (then it is authentic)."""
-    identity = Identity.decode(node.ask(IDENTIFY, "to identify itself"))
+    identity = Identity.decode(node.request_idempotent(IDENTIFY, "to identify itself"))
     if identity.uuid != node.uuid:
         raise GarbledError(f"The node gave its UUID as {node.uuid.hex()} before and gives {identity.uuid.hex()} now.")
     if node.sealed:
@@ -192,7 +192,7 @@ class NodeSnapshot:
     identity: Identity
 
 
-def survey(node: Conversation, *, initial: bytes | None = None) -> NodeSnapshot:
+def take_snapshot(node: Conversation, *, initial: bytes | None = None) -> NodeSnapshot:
     """Read all TEDS and, for those that the Security TEDS does not account for, whether they are read-only.
 
     ``initial`` is the Security TEDS that was read before the session: of a node that nobody wrote to since its last
@@ -205,5 +205,7 @@ def survey(node: Conversation, *, initial: bytes | None = None) -> NodeSnapshot:
 
 
 def _is_read_only(node: Conversation, block: BlockId) -> bool:
-    status = TedsStatus.decode(node.ask(query_teds(*block), f"to query TEDS {block[1]} of channel {block[0]}"))
+    status = TedsStatus.decode(
+        node.request_idempotent(query_teds(*block), f"to query TEDS {block[1]} of channel {block[0]}")
+    )
     return bool(status.attributes & Attribute.READ_ONLY)

@@ -114,7 +114,7 @@ class StationSnapshot:
     policy: _TrustSnapshot
 
 
-def remember(station: Station) -> StationSnapshot:
+def snapshot_trust(station: Station) -> StationSnapshot:
     """Take down everything that judging images asks a station for; raises StoreChangedError as the station does."""
     return StationSnapshot(
         station.point,
@@ -129,16 +129,16 @@ def remember(station: Station) -> StationSnapshot:
     )
 
 
-def remember_page(station: Station, uuids: Sequence[bytes]) -> StationSnapshot:
-    """As :func:`remember`, of what is asked for a page of nodes alone: a list of 100,000 is never held whole."""
-    entries = station.pins.of_page(uuids)
+def snapshot_trust_of(station: Station, uuids: Sequence[bytes]) -> StationSnapshot:
+    """As :func:`snapshot_trust`, of what is asked for a page of nodes alone: a list of 100,000 is never held whole."""
+    entries = station.pins.get_many(uuids)
     return StationSnapshot(
         station.point,
-        _PinSnapshot(station.pins.among(station.nodes.of_page(uuids).values(), entries.values()), entries),
+        _PinSnapshot(station.pins.pinned_among(station.nodes.get_many(uuids).values(), entries.values()), entries),
         _TrustSnapshot(
             station.policy.revocations_of(uuids),
             tuple(station.policy.trusted_cas()),
-            _counting(station, station.keys.cas_of_page(uuids)),
+            _counting(station, station.keys.cas_among(uuids)),
             tuple(station.policy.trusted_stations()),
             station.policy.signer_rules(),
         ),
@@ -217,7 +217,7 @@ class FreshnessFloor:
     key_epoch: int = 0
 
 
-def known_of(station: Station, uuid: bytes, identity: Identity | None) -> FreshnessFloor:
+def freshness_floor_of(station: Station, uuid: bytes, identity: Identity | None) -> FreshnessFloor:
     """What this station knows of a node's datasheet. Signed values alone count: anyone could serve the others."""
     image = known_image(station, uuid)
     octets = image.security if image is not None else None
@@ -227,7 +227,7 @@ def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Freshn
         shown = None
     if image is None or octets is None or shown is None or not shown.signed:
         return FreshnessFloor(identity)
-    signers = Signers.of(shown)
+    signers = Signers.from_security_teds(shown)
     counts = _signer(station, signers, _certifier(station, uuid, signers), octets)[0].result == "passed"
     trusted = counts and datasheet.signature_good(shown, octets, uuid)
     return FreshnessFloor(identity, shown.sequence, shown.key_epoch) if trusted else FreshnessFloor(identity)
@@ -273,7 +273,9 @@ def _proofs(image: Image) -> _SecurityFields:
 
 
 def _checks(station: TrustSource, image: Image, proofs: _SecurityFields, known: FreshnessFloor | None) -> list[Check]:
-    return judge(station, image.uuid, _octets(image, proofs, known), Signers.of(proofs.shown), image.security)
+    return judge(
+        station, image.uuid, _octets(image, proofs, known), Signers.from_security_teds(proofs.shown), image.security
+    )
 
 
 class Signers(NamedTuple):
@@ -285,7 +287,7 @@ class Signers(NamedTuple):
     station_key_signature: bytes | None = None
 
     @classmethod
-    def of(cls, shown: SecurityTeds | NotCanonicalError | None) -> Signers:
+    def from_security_teds(cls, shown: SecurityTeds | NotCanonicalError | None) -> Signers:
         """Those of a Security TEDS that was read; none of one that is absent or not of this profile."""
         if not isinstance(shown, SecurityTeds):
             return cls()
@@ -293,7 +295,7 @@ class Signers(NamedTuple):
         return cls(shown.node_key, shown.node_key_signature, *signed)
 
 
-def what_octets_say(image: Image, known: FreshnessFloor | None) -> tuple[list[Check], Signers]:
+def static_checks(image: Image, known: FreshnessFloor | None) -> tuple[list[Check], Signers]:
     """The checks that no later change of trust alters, and what :func:`judge` needs for the others.
 
     What an image says by itself is remembered for a moment: it is asked when a write is recorded, and at the verdict.
@@ -304,7 +306,7 @@ def what_octets_say(image: Image, known: FreshnessFloor | None) -> tuple[list[Ch
         said = proofs.shown, _by_itself(image, proofs)
         _SAID.append((image, said))
     shown, checks = said
-    return [*checks, *_not_older(shown, known)], Signers.of(shown)
+    return [*checks, *_not_older(shown, known)], Signers.from_security_teds(shown)
 
 
 _Shown = SecurityTeds | NotCanonicalError | None
@@ -373,7 +375,7 @@ def _by_itself(image: Image, proofs: _SecurityFields) -> tuple[Check, ...]:
     return tuple(checks)
 
 
-def possession(prove: Callable[[], None]) -> Check:
+def possession_check(prove: Callable[[], None]) -> Check:
     """Run the challenge and tell it as a check; a link that fails is raised, not judged."""
     try:
         prove()
@@ -382,7 +384,7 @@ def possession(prove: Callable[[], None]) -> Check:
     return Check("possession", "passed", "the node signed a fresh challenge")
 
 
-def session(opened: str, why: str) -> Check:
+def session_check(opened: str, why: str) -> Check:
     """Tell whether what was read is known to come from the node: ``opened`` says how, ``why`` why it is not.
 
     Both empty: no key of the node is held here, and signatures alone count.

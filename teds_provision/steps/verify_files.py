@@ -15,7 +15,14 @@ from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
-from teds_provision.steps.verify import Check, TrustSource, Verification, remember, require_authentic, verify_images
+from teds_provision.steps.verify import (
+    Check,
+    TrustSource,
+    Verification,
+    require_authentic,
+    snapshot_trust,
+    verify_images,
+)
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
@@ -94,7 +101,7 @@ def verify_files(
     there are cores), which tell of them too: sentences are quicker sent than verdicts with all their checks.
     """
     workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
-    work = _Work(remember(station), tell, files)
+    work = _Work(snapshot_trust(station), tell, files)
     if len(files) <= _FEW or workers <= 1:
         yield from (work.judge(range(at, at + 1)) for at in range(len(files)))
         return

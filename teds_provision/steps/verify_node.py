@@ -13,7 +13,14 @@ from teds_provision.steps.agree import agreed_elsewhere, proof_of_reset, session
 from teds_provision.steps.identify import IdentifiedNode, prove
 from teds_provision.steps.readings import NodeVerdict
 from teds_provision.steps.teds_read import read_block, read_identity, read_image
-from teds_provision.steps.verify import Check, Verification, known_of, possession, session, verify_image
+from teds_provision.steps.verify import (
+    Check,
+    Verification,
+    freshness_floor_of,
+    possession_check,
+    session_check,
+    verify_image,
+)
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import HEARD, Conversation
 from teds_provision.teds.codec.model import AccessCode
@@ -38,7 +45,7 @@ class NodeVerification:
         return self.judged.origin == "kept"
 
 
-def look_at_node(station: Station, node: Conversation, who: IdentifiedNode) -> NodeVerification:
+def verify_at_node(station: Station, node: Conversation, who: IdentifiedNode) -> NodeVerification:
     """Open a session where a key is held, read every TEDS and judge them; raises LinkError and what a read raises.
 
     One in which the node answers nothing but that it is busy is as good as none: then all is read without it.
@@ -55,7 +62,7 @@ def look_at_node(station: Station, node: Conversation, who: IdentifiedNode) -> N
     return NodeVerification(image, verify_node(station, node, image, who.point, why=why, c=c))
 
 
-def look_in_session(station: Station, node: Conversation, *, by: str) -> NodeVerification:
+def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeVerification:
     """Judge the TEDS of a node in the session that is open. Raises LinkError, NodeRefusedError.
 
     Where its Security TEDS is octet for octet the one that was read before, and nothing spoke against the rest then,
@@ -65,8 +72,8 @@ def look_in_session(station: Station, node: Conversation, *, by: str) -> NodeVer
     """
     identity, c = read_identity(node), node.c
     octets = read_block(node, SECURITY)
-    known = known_of(station, node.uuid, identity)
-    image = readings.stands(station, node, octets, known)
+    known = freshness_floor_of(station, node.uuid, identity)
+    image = readings.cached_image_if_current(station, node, octets, known)
     if image is not None:
         judged = readings.verdict_of(station, node.uuid)
         assert judged is not None, "a reading that stands is there"
@@ -112,8 +119,8 @@ def verify_node(
     command that asks, ``c`` that of the session in which the reading began.
     """
     identity = (node.proven or read_identity(node)) if node.sealed else None
-    possessed, vouch = possession(lambda: prove(node, point)), vouched(node, point, why)
-    known = known_of(station, node.uuid, identity)
+    possessed, vouch = possession_check(lambda: prove(node, point)), provenance_check(node, point, why)
+    known = freshness_floor_of(station, node.uuid, identity)
     if vouch.result == "failed":
         with station.reading():
             verified = Verification(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
@@ -132,7 +139,7 @@ def verify_node(
                 station.nodes.remember(image.uuid, **_facts(image, identity))
             station.audit("verify", image.uuid, judged.verified.verdict)
 
-    station.behind(record)  # a run tells its result when it is on the disk, and asks the hardware meanwhile
+    station.run_in_background(record)  # a run tells its result when it is on the disk, and asks the hardware meanwhile
     return judged
 
 
@@ -153,17 +160,17 @@ def _facts(image: Image, identity: Identity | None) -> dict[str, object]:
     return facts
 
 
-def vouched(node: Conversation, point: bytes, why: str) -> Check:
+def provenance_check(node: Conversation, point: bytes, why: str) -> Check:
     """Whether the node itself is known to have said this: in a session, or by its signature that it was reset.
 
     ``why`` is what :func:`open_or_say_why` said; the check has failed where a key is held and neither came about.
     """
     if node.sealed:
-        return session("opened with the key held here", "")
+        return session_check("opened with the key held here", "")
     if why and node.identity.state == NodeState.FACTORY:
         try:
             proof_of_reset(node, point)
         except (NotAuthenticError, NodeRefusedError, LinkError):
-            return session("", f"{why}, and it did not prove that it was reset")
-        return session("the node signed that it was reset: it no longer has the key held here", "")
-    return session("", why)
+            return session_check("", f"{why}, and it did not prove that it was reset")
+        return session_check("the node signed that it was reset: it no longer has the key held here", "")
+    return session_check("", why)

@@ -24,7 +24,7 @@ from teds_provision.files import read_text
 from teds_provision.limits import check_count, load_json
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.station.station import Station
-from teds_provision.store import WhitelistEntry, pages
+from teds_provision.store import WhitelistEntry, chunks
 from teds_provision.store.records import UUID_OCTETS
 
 MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
@@ -412,10 +412,10 @@ def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPl
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[ListedNode, str]] = []
     new = 0
-    for page in pages(listed):
+    for page in chunks(listed):
         uuids = [entry.uuid for entry in page]
-        present = station.pins.of_page(uuids)
-        pinned = station.pins.among(station.nodes.of_page(uuids).values(), present.values())
+        present = station.pins.get_many(uuids)
+        pinned = station.pins.pinned_among(station.nodes.get_many(uuids).values(), present.values())
         for entry in page:
             known, pin = present.get(entry.uuid), pinned.get(entry.uuid)
             if pin is not None and entry.fingerprint is not None and not same_key(pin, entry.fingerprint):
@@ -481,7 +481,7 @@ def remove(station: Station, uuid: bytes) -> bool:
     """
     with station.transaction():
         pinned = is_pinned(station, uuid)
-        station.pins.let_go(uuid)
+        station.pins.unpin(uuid)
         removed = station.pins.remove(uuid)
         if removed or pinned:
             station.audit("whitelist", uuid, "removed" if removed else "unpinned")

@@ -31,7 +31,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.readings import is_known, keep, keep_read
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.teds_read import NodeSnapshot, read_block, read_identity, read_image
-from teds_provision.steps.verify import known_of
+from teds_provision.steps.verify import freshness_floor_of
 from teds_provision.store import NodeRecord
 from teds_provision.talk.conversation import Conversation, SessionLostError
 from teds_provision.teds.codec import security
@@ -94,7 +94,7 @@ def write(
         has = has or read_image(node)
         if all(has.blocks.get(block) == image.blocks[block] for block in image):
             if not is_known(station, node, has):
-                known = known_of(station, image.uuid, node.proven or read_identity(node))
+                known = freshness_floor_of(station, image.uuid, node.proven or read_identity(node))
                 with station.durable("write", more_follows=True):
                     keep(station, node, has, by="write", known=known)
             return WriteResult(0, time.monotonic() - started, has)
@@ -119,7 +119,7 @@ def _tell_written(station: Station, image: Image, known: NodeRecord, sequence: i
     """Tell the plant which datasheet the node has now, and what it was made of."""
     octets = image.security
     if station.plant.joined is not None and octets is not None:
-        station.plant.tell(
+        station.plant.record_event(
             "written",
             image.uuid,
             epoch=security.decode(octets).key_epoch,
@@ -151,7 +151,9 @@ def _conclude(
 
     def record() -> None:  # asks the node nothing: the next message may be on its way
         with station.durable("write", more_follows=True):
-            keep_read(station, back, c, by="write", known=known_of(station, image.uuid, identity), profile=named)
+            keep_read(
+                station, back, c, by="write", known=freshness_floor_of(station, image.uuid, identity), profile=named
+            )
             if differing:
                 station.audit("write", image.uuid, "read-back differs", block=list(differing[0]))
             else:
@@ -163,7 +165,7 @@ def _conclude(
                     station.nodes.drop_draft(image.uuid)
                 station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
 
-    station.behind(record)  # whoever verifies next has the node prove its key meanwhile
+    station.run_in_background(record)  # whoever verifies next has the node prove its key meanwhile
     if differing:
         channel, access_code = differing[0]
         raise NotAuthenticError(
@@ -188,7 +190,7 @@ def _percent(node: Conversation) -> int | None:
     if node.tapped or node.wired or not node.sealed:
         return None
     try:
-        power = PowerReply.decode(node.ask(POWER, "to tell its charge"))
+        power = PowerReply.decode(node.request_idempotent(POWER, "to tell its charge"))
     except (NodeRefusedError, BadDataError):
         return None  # it has no battery, or does not measure
     return power.level if power.flags & PowerFlag.BATTERY else None
@@ -249,7 +251,7 @@ def _stage_and_commit(
     station: Station, node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None
 ) -> int:
     octets = _stage(station, node, image, skip, progress)
-    node.send(update_teds(*SECURITY), "the commit")
+    node.request(update_teds(*SECURITY), "the commit")
     return octets
 
 
@@ -282,11 +284,11 @@ def _stage(station: Station, node: Conversation, image: Image, skip: set[BlockId
         teds = image.blocks[channel, access_code]
         offset = 0
         if (channel, access_code) == SECURITY:
-            station.settle()
+            station.flush()
         while offset < len(teds):
             part = teds[offset : offset + piece]
             try:
-                node.send(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
+                node.request(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
             except (NodeSilentError, GarbledError):
                 losses += 1
                 if losses > _LOSSES or not node.lives():

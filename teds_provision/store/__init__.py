@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     )
     from teds_provision.store.store import Store
     from teds_provision.store.tables.line import EvidenceRow, JobRow, LineTables, SignRequestRow, UnitRow
-    from teds_provision.store.tables.nodes import BulkRows, pages
+    from teds_provision.store.tables.nodes import BulkRows, chunks
     from teds_provision.store.tables.overview import NodeOverview, Search
 else:
     __getattr__ = lazy(
@@ -43,7 +43,7 @@ else:
             "store": "Store",
             "tables.overview": "NodeOverview Search",
             "tables.line": "EvidenceRow JobRow LineTables SignRequestRow UnitRow",
-            "tables.nodes": "BulkRows pages",
+            "tables.nodes": "BulkRows chunks",
         },
     )
 
@@ -80,7 +80,7 @@ __all__ = [
     "TrustRecord",
     "UnitRow",
     "WhitelistEntry",
+    "chunks",
     "is_failure",
-    "pages",
     "utc_now",
 ]

@@ -24,7 +24,7 @@ class BackgroundWriter:
         self._ended: SimpleQueue[BaseException | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
 
-    def take(self, step: Step) -> None:
+    def submit(self, step: Step) -> None:
         """Have a step taken, after the one before it; the run's own thread goes on meanwhile.
 
         Not inside a transaction: the step needs the store for itself.

@@ -131,7 +131,7 @@ class Connection:
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run one statement and return all its rows; raises StoreError."""
         if self.behind:
-            self.in_order()
+            self.drain()
         with self._lock:
             try:  # not by _run(): every step makes dozens of statements
                 return self._connection.execute(statement, values).fetchall()
@@ -140,7 +140,7 @@ class Connection:
                     raise self._failure(error) from error
             return self._wait_for(lambda: self._connection.execute(statement, values).fetchall())
 
-    def in_order(self) -> None:
+    def drain(self) -> None:
         """Wait until what this thread had done behind its back is done; raises what that raised."""
         behind = self.behind.get(threading.get_ident())
         if behind is not None:
@@ -162,7 +162,7 @@ class Connection:
 
     def _run(self, run: Callable[[], _Given]) -> _Given:
         if self.behind:
-            self.in_order()
+            self.drain()
         with self._lock:
             try:
                 return run()
@@ -214,7 +214,7 @@ class Connection:
         For many questions at one moment, with no waiting in between: whether another process has changed something is
         asked once. Changes inside it are made, and seen, as ever.
         """
-        self.in_order()
+        self.drain()
         with self._lock:
             mine = self._reader is None
             if mine:
@@ -228,7 +228,7 @@ class Connection:
     def transaction(self, *, later: bool = False) -> AbstractContextManager[None]:
         """All or nothing: BEGIN IMMEDIATE, COMMIT, or ROLLBACK when anything is raised; inside another, a savepoint.
 
-        It is on the disk when the block ends; ``later``: when a later one is, or after :meth:`settle`. A loss of power
+        It is on the disk when the block ends; ``later``: when a later one is, or after :meth:`flush`. A loss of power
         until then undoes it whole, and never without those that came after it.
         """
         return Transaction(self, later=later)
@@ -241,12 +241,12 @@ class Connection:
         """
         return Transaction(self, apart=False)
 
-    def settle(self, through: int | None = None) -> None:
+    def flush(self, through: int | None = None) -> None:
         """Wait until all commits, or the first ``through`` of those that did not wait, are on the disk.
 
         Raises StoreError.
         """
-        self.in_order()
+        self.drain()
         with self._lock:
             if (self.later if through is None else through) <= self._settled:
                 return
@@ -263,7 +263,7 @@ class Connection:
     def enter(self, block: Transaction) -> None:
         """Begin a block; for :class:`Transaction` alone."""
         if self.behind:
-            self.in_order()
+            self.drain()
         self._lock.acquire()
         try:
             if self._frozen is not None:

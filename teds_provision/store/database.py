@@ -195,7 +195,7 @@ class Database(Connection):
         For what every step asks again of the node at hand. Raises what :meth:`read` raises.
         """
         if self.behind:
-            self.in_order()
+            self.drain()
         with self._lock:
             state = (self.state(), self._connection.total_changes)
             if state != self._remembered_at or len(self._remembered) >= _REMEMBERED:

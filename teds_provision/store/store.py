@@ -114,7 +114,7 @@ class Store(
     def transaction(self, *, later: bool = False) -> AbstractContextManager[None]:
         """All of the block or nothing of it; may stand inside another one.
 
-        ``later``: it is on the disk with the next one that is not, or after :meth:`settle`.
+        ``later``: it is on the disk with the next one that is not, or after :meth:`flush`.
         """
         return self._database.transaction(later=later)
 
@@ -126,17 +126,17 @@ class Store(
         """Many questions at one moment: what was read before counts as it was when the block began."""
         return self._database.reading()
 
-    def settle(self, through: int | None = None) -> None:
+    def flush(self, through: int | None = None) -> None:
         """Wait until everything that was committed is on the disk, or what was when :attr:`later` was ``through``."""
-        self._database.settle(through)
+        self._database.flush(through)
 
-    def behind(self) -> BackgroundWriter:
+    def background_writer(self) -> BackgroundWriter:
         """For a run of this thread: what takes its steps behind its back, which its next statement here waits for."""
         return BackgroundWriter(self._database.behind)
 
-    def in_order(self) -> None:
+    def drain(self) -> None:
         """Wait for what this thread has done behind its back; before it takes a lock that such a step takes too."""
-        self._database.in_order()
+        self._database.drain()
 
     @property
     def later(self) -> int:

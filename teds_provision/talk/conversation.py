@@ -182,7 +182,7 @@ class Conversation:
     def _open(self, key: bytes) -> tuple[StationSession, Reply]:
         """Ask for c and send one Open; each has a one-time key of its own."""
         session = StationSession(key, self.uuid, statics=self._statics)
-        return session, self._exchange(session.open(self.plain(session.ask(), _OPENING)))
+        return session, self._exchange(session.open(self.request_plain(session.request_counter(), _OPENING)))
 
     def reopen(self) -> None:
         """Open a new session under the same key, after the old one was lost."""
@@ -212,7 +212,7 @@ class Conversation:
         if self._session is None:
             return
         try:
-            self.send(security_command(Function.CLOSE), "to close the session")
+            self.request(security_command(Function.CLOSE), "to close the session")
         except (LinkError, SessionLostError, NodeRefusedError):
             pass
         finally:
@@ -220,21 +220,21 @@ class Conversation:
 
     # -- commands --------------------------------------------------------------------------------------------------
 
-    def plain(self, command: Command, doing: str) -> bytes:
+    def request_plain(self, command: Command, doing: str) -> bytes:
         """Send a plain command and return its payload; raises NodeRefusedError, LinkError."""
         reply = self._exchange(command)
         if not reply.ok:
             raise refused(reply.reason, doing)
         return reply.payload
 
-    def send(self, command: Command, doing: str, *, within: float | None = None) -> bytes:
+    def request(self, command: Command, doing: str, *, within: float | None = None) -> bytes:
         """Send sealed where a session is open, else plain. Raises SessionLostError where the session is gone.
 
         ``within``: seconds after which what it orders is of no use; it is given up then (NodeSilentError).
         """
         session = self._session
         if session is None:
-            return self.plain(command, doing)
+            return self.request_plain(command, doing)
         outer = self._exchange(session.seal(command), command, within)
         if not outer.ok:
             raise SessionLostError(refused(outer.reason, doing))
@@ -250,19 +250,19 @@ class Conversation:
             raise refused(inner.reason, doing, sealed=True)
         return inner.payload
 
-    def sure(self, command: Command, doing: str) -> bytes:
+    def request_retry_once(self, command: Command, doing: str) -> bytes:
         """Send; a refusal on a bus outside a session is asked for once more: a disturbed frame may have made it.
 
-        For commands that may run twice. Raises what :meth:`send` raises.
+        For commands that may run twice. Raises what :meth:`request` raises.
         """
         try:
-            return self.send(command, doing)
+            return self.request(command, doing)
         except NodeRefusedError:
             if self.sealed or not self._is_noisy:
                 raise
-        return self.send(command, doing)
+        return self.request(command, doing)
 
-    def ask(self, command: Command, doing: str) -> bytes:
+    def request_idempotent(self, command: Command, doing: str) -> bytes:
         """Send a command that may be repeated without harm, over a new session where the old one was lost.
 
         One that the node was too busy for is given up: a new session would meet the same node.
@@ -271,7 +271,7 @@ class Conversation:
         until = time.monotonic() + _REPEATING_SECONDS
         while True:
             try:
-                return self.sure(command, doing)
+                return self.request_retry_once(command, doing)
             except SessionLostError as lost:
                 reopenings += 1
                 if reopenings > _REOPENINGS or is_busy(lost.cause):

@@ -59,7 +59,7 @@ def meet(
         port = open_port(links)
         try:
             before()
-            contact = the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
+            contact = pick_single_node(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
             with Conversation(contact, notice=reporter.notice) as node:
                 yield node
         finally:
@@ -200,14 +200,14 @@ def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conv
     port = open_port(links)
     try:
         everyone = port.everyone(seconds=links.timeout, notice=reporter.notice, listen=links.listen)
-        contacts = without_twins(everyone, reporter.notice)
+        contacts = drop_duplicate_uuids(everyone, reporter.notice)
         with ExitStack() as stack:
             yield [stack.enter_context(Conversation(contact, notice=reporter.notice)) for contact in contacts]
     finally:
         port.close()
 
 
-def without_twins(contacts: list[Contact], notice: NoticeSink) -> list[Contact]:
+def drop_duplicate_uuids(contacts: list[Contact], notice: NoticeSink) -> list[Contact]:
     """Those whose UUID answers at one address alone; anybody can copy a UUID, so it costs that node and no other.
 
     ``notice`` is told of the rest; raises AddressConflictError where nothing is left.
@@ -217,13 +217,13 @@ def without_twins(contacts: list[Contact], notice: NoticeSink) -> list[Contact]:
         same.setdefault(contact.identity.uuid, []).append(contact)
     for uuid, group in same.items():
         try:
-            refuse_twins(group)
+            refuse_duplicate_uuids(group)
         except AddressConflictError as conflict:
             notice(Notice("conflict", f"{conflict.message} {conflict.hint}", uuid=uuid))
-    return [one for one in contacts if len(same[one.identity.uuid]) == 1] or refuse_twins(contacts)
+    return [one for one in contacts if len(same[one.identity.uuid]) == 1] or refuse_duplicate_uuids(contacts)
 
 
-def refuse_twins(contacts: list[Contact]) -> list[Contact]:
+def refuse_duplicate_uuids(contacts: list[Contact]) -> list[Contact]:
     """The contacts as they are; raises AddressConflictError where one UUID answers at two addresses."""
     seen: dict[bytes, Contact] = {}
     for contact in contacts:
@@ -238,9 +238,9 @@ def refuse_twins(contacts: list[Contact]) -> list[Contact]:
     return contacts
 
 
-def the_one(station: Station, contacts: list[Contact]) -> Contact:
+def pick_single_node(station: Station, contacts: list[Contact]) -> Contact:
     """The only node, or the only one that is not provisioned and verified yet."""
-    refuse_twins(contacts)
+    refuse_duplicate_uuids(contacts)
     unfinished = [contact for contact in contacts if not _finished(station, contact.identity)]
     for choice in (contacts, unfinished):
         if len(choice) == 1:
@@ -263,7 +263,7 @@ def _finished(station: Station, identity: Identity) -> bool:
 # The node may stay on the reader or be carried away meanwhile: the tap gave its BLE address, its key proves who it is.
 
 
-def onward(links: LinkSettings, notice: NoticeSink) -> Callable[[Conversation], None] | None:
+def continue_over_ble(links: LinkSettings, notice: NoticeSink) -> Callable[[Conversation], None] | None:
     """How to go on once a key is agreed on: where both ``--nfc`` and ``--ble`` are named, over BLE; None where not.
 
     What is returned raises NoReaderError, NoNodeError (it does not advertise, or is out of reach), LinkError.
@@ -319,7 +319,7 @@ class IdleStop(threading.Event):
         self._busy, self._counting = 0, threading.Lock()
         self.renew()
 
-    def ask(self) -> None:
+    def request_stop(self) -> None:
         """Say stop from a signal handler: takes no lock, which the interrupted thread may hold; seen within 0.2 s."""
         self._asked = True
 

@@ -61,7 +61,7 @@ def plot_blocks(
         raise BadDataError(f"There is no calibration of {which} that can be drawn.")
     if len(panels) > MAXIMUM_PANELS:
         raise UsageError(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
-    sheet = Sheet.of_blocks(blocks)
+    sheet = Sheet.from_blocks(blocks)
     title = "  ".join(part for part in (sheet.meta.name, sheet.uuid.hex()) if part)
     write_whole(path, _picture(panels, kind, title), mode=SHARED)
     return tuple(panel.curve.channel.number for panel in panels)
@@ -81,7 +81,7 @@ def _panels(
     calibrations: Mapping[int, Calibration],
 ) -> list[_Panel]:
     panels = []
-    for number, calibration in Sheet.of_blocks(blocks).calibrations.items():
+    for number, calibration in Sheet.from_blocks(blocks).calibrations.items():
         if channel not in (None, number) or not is_sound(calibration):
             continue
         own = channel_of(number, blocks, profile)

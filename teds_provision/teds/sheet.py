@@ -1,6 +1,6 @@
 """The typed datasheet: everything that the TEDS of one node say, as values with types and units.
 
-:meth:`Sheet.of` never raises, whatever the octets. What is missing is None, NaN or "", what is wrong stands in
+:meth:`Sheet.from_image` never raises, whatever the octets. What is missing is None, NaN or "", what is wrong stands in
 ``findings`` beside the values. Who may be believed is another question: a Sheet is made from verified and foreign TEDS
 alike (``protocol.datasheet`` judges the signature).
 """
@@ -95,12 +95,12 @@ class Sheet:
     findings: tuple[SheetFinding, ...] = ()
 
     @classmethod
-    def of(cls, image: Image) -> Sheet:
+    def from_image(cls, image: Image) -> Sheet:
         """Datasheet of an image; never raises."""
         return _Reader(image.uuid, image.blocks).sheet()
 
     @classmethod
-    def of_blocks(cls, blocks: Mapping[BlockId, bytes]) -> Sheet:
+    def from_blocks(cls, blocks: Mapping[BlockId, bytes]) -> Sheet:
         """Datasheet of framed TEDS by (channel, access code); its UUID is what the Meta-TEDS says, or empty."""
         return _Reader(b"", blocks).sheet()
 

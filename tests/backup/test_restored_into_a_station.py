@@ -72,7 +72,7 @@ def test_a_revoked_node_stays_revoked_and_off_the_whitelist(station: Station, tm
     done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
     assert done.action == "nothing"
     assert station.pins.entry(ONE) is None
-    assert station.keys.of(ONE) == []
+    assert station.keys.keys_of(ONE) == []
     assert "revocations made since: 1" in done.kept
 
 
@@ -81,14 +81,14 @@ def test_keys_given_up_since_are_not_brought_back(station: Station, tmp_path: Pa
     station.keys.remove(ONE)
     station.audit("decommission", ONE, "done")
     merge(station._store, opened(tmp_path / "b"), dry_run=False)
-    assert station.keys.of(ONE) == []
+    assert station.keys.keys_of(ONE) == []
 
 
 def test_a_node_that_was_pinned_anew_keeps_its_new_key(station: Station, tmp_path: Path) -> None:
     station.pins.put(WhitelistEntry(ONE, "ab" * 32, assurance="tap"))
     back_up(station, tmp_path / "b")
     station.pins.remove(ONE)
-    station.pins.let_go(ONE)
+    station.pins.unpin(ONE)
     other = SoftwareKey.generate().point
     station.nodes.remember(ONE, point=other)
     station.audit("identify", ONE, "proven")
@@ -211,7 +211,7 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
     with Store.open(stale) as store:
         done = merge(store, opened(tmp_path / "new"), dry_run=False)
         assert done.relation is Relation.NEWER
-        assert (store.marks(ONE).rotation, store.marks(TWO).rotation) == ("due", "due")
+        assert (store.key_flags(ONE).rotation, store.key_flags(TWO).rotation) == ("due", "due")
 
 
 def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:

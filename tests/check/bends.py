@@ -521,7 +521,7 @@ an_empty_write_stages_nothing = _written(_empty_stages_nothing)
 
 def staging_for_ever(patch: Patch) -> None:
     """It belongs to nobody, so that it goes with no session."""
-    patch.setattr(teds_access.Staging, "of", lambda self, session: self._images)
+    patch.setattr(teds_access.Staging, "staged_by", lambda self, session: self._images)
     patch.setattr(teds_access.Staging, "require", lambda self, session, **_: None)
     patch.setattr(teds_access.Staging, "end", lambda self, session=None: None)
 
@@ -534,7 +534,7 @@ def staging_for_ever(patch: Patch) -> None:
 def staging_per_session(patch: Patch) -> None:
     """One for each session, as the draft had it."""
     areas: dict[NodeSession, dict[Any, bytes]] = {}
-    patch.setattr(teds_access.Staging, "of", lambda self, session: areas.get(session, {}))
+    patch.setattr(teds_access.Staging, "staged_by", lambda self, session: areas.get(session, {}))
     patch.setattr(teds_access.Staging, "require", lambda self, session, **_: None)
 
     def put(self: Any, session: NodeSession, block: Any, image: bytes, now: float) -> None:

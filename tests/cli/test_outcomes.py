@@ -53,10 +53,10 @@ def test_a_dry_run_of_sign_against_the_node_settles_no_key(tmp_path: Path) -> No
         agree(station, node, identify(station, node))
     build(station, board.uuid, ANGLE)
     station.keys.demand_rotation(board.uuid, "a copy was handed over")
-    before = station.keys.of(board.uuid)
+    before = station.keys.keys_of(board.uuid)
     with talk(board) as node:
         sign_image(station, SignOrder(board.uuid, dry_run=True), node)
-    assert station.keys.of(board.uuid) == before
+    assert station.keys.keys_of(board.uuid) == before
     assert board.state.epoch == 1
 
 

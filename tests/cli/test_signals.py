@@ -26,7 +26,10 @@ def test_a_command_that_is_about_to_wait_hears_its_signal() -> None:
 
 
 def test_no_signal_handler_takes_a_lock() -> None:
-    """``Event.set`` in a handler waits for ever for the lock that the interrupted thread holds: ``IdleStop.ask``."""
+    """``Event.set`` in a handler waits for ever for the lock that the interrupted thread holds.
+
+    ``IdleStop.request_stop``.
+    """
     found = []
     for module in MODULES:
         tree = ast.parse(module.read_text())

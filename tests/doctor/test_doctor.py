@@ -447,7 +447,7 @@ def test_what_waits_for_somebody_is_told(stationed: System) -> None:
             store.put_node(NodeRecord(bytes([number]) * 10, name="same" if number else "other", due="2020-01-01"))
         store.put_draft(Draft(bytes(10), Image(bytes(10), {(0, 1): b"x"})))
         store.add_key(KeyRecord(bytes(10), 1, "ab" * 8, "active", 1, b"wrapped"))
-        store.put_marks({b"\1" * 10: KeyFlags(rotation="restored")})
+        store.put_key_flags({b"\1" * 10: KeyFlags(rotation="restored")})
     said = [finding.why for finding in look(stationed, "nodes")]
     counts = [why.split()[0] for why in said]
     assert counts == ["3", "2", "1", "1", "1"]

@@ -33,7 +33,7 @@ class CPeripheral(Peripheral):
         self._secret = file.key.secret()
         self.c = MemoryNode(self._draw, time.monotonic, uuid=state.uuid, max_message=2048, max_teds=16384)
         if file.hardware:
-            for number, facts in Board(Sheet.of(Image(state.uuid, file.hardware))).channels.items():
+            for number, facts in Board(Sheet.from_image(Image(state.uuid, file.hardware))).channels.items():
                 self.c.add_channel(number, int(facts.kind), facts.octets, model=facts.model, shortest=facts.shortest)
         assert self.c.start() == 0
         self.c.put(state)

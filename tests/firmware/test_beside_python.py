@@ -302,7 +302,7 @@ class Station:
         if not self.key:
             return
         session = StationSession(self.key, UUID, one_time=SoftwareKey(self.dice.randrange(1, 1 << 200)))
-        ok, counter = self.send(session.ask(), link)
+        ok, counter = self.send(session.request_counter(), link)
         if not ok:
             return
         command = session.open(counter)

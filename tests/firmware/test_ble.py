@@ -41,7 +41,7 @@ class Line:
 
     def write(self, value: bytes) -> list[bytes]:
         """Both take a piece, and notify the same."""
-        received, due = self.assembly.take(value), []
+        received, due = self.assembly.add_frame(value), []
         if received is not None:
             name = f"ble:{self.number + 2:x}"
             reply = self.repetition.answer(
@@ -51,7 +51,7 @@ class Line:
                 now=self.twins.now(),
             )
             due = list(ble.cut(received.transaction, reply, self.mtu))
-            self.repetition.left(self.twins.now())
+            self.repetition.reply_sent(self.twins.now())
         assert self.twins.c.ble_written(self.number, value) == due, value.hex()
         return due
 

@@ -40,7 +40,7 @@ def request(desk: CDesk) -> Reply:
 def long_open(desk: CDesk) -> Reply:
     session = StationSession(desk.key, UUID)
     calls = desk.node.chip_calls
-    command = session.open(desk.plain(session.ask()).payload)
+    command = session.open(desk.plain(session.request_counter()).payload)
     assert desk.node.chip_calls == calls, "the short form costs nothing"
     return desk.plain(command)
 

@@ -108,7 +108,7 @@ def check_sheet(data: bytes) -> None:
         channel, code, length = struct.unpack_from(">BBH", data, at)
         blocks[channel, code] = frame(data[at + 4 : at + 4 + length])
         at += 4 + length
-    sheet = Sheet.of(Image(bytes(10), blocks))
+    sheet = Sheet.from_image(Image(bytes(10), blocks))
     for channel in sheet.channels:
         assert channel.value_problem == "" or channel.value_problem.endswith(".")
         channel.show(channel.low)
@@ -210,7 +210,7 @@ def check_operation(data: bytes) -> None:
     can_frames.read_ble_frame(data)
     assembly = can_frames.StreamAssembly(63, fd=bool(data[:1] and data[0] & 1))
     for at in range(1, len(data), 9):
-        found = assembly.take(data[at] & 7, data[at + 1 : at + 9])
+        found = assembly.add_segment(data[at] & 7, data[at + 1 : at + 9])
         assert found is None or len(found) == 63
 
 
@@ -229,7 +229,7 @@ def check_nfc(data: bytes) -> None:
     for record in [*(record.payload for record in records), data]:
         with suppress(TedsProvisionError):
             piece = pieces.Piece.decode(record)
-            reads(partial(requester.take, piece), partial(responder.answer, piece, 20))
+            reads(partial(requester.handle_piece, piece), partial(responder.answer, piece, 20))
     _pieces_without_checksum(data, requester, responder)
 
 
@@ -243,7 +243,7 @@ def _pieces_without_checksum(data: bytes, requester: Requester, responder: Respo
         piece = Piece(transaction, total, offset, body, bool(flags & 1), bool(flags & 2))
         with suppress(TedsProvisionError):
             read = Piece.decode(piece.encode())
-            reads(partial(requester.take, read), partial(responder.answer, read, 20))
+            reads(partial(requester.handle_piece, read), partial(responder.answer, read, 20))
     requester.next()
 
 
@@ -273,8 +273,8 @@ def check_can(data: bytes) -> None:
         at += 2 + length
         node = 0x21 + (kind >> 1 & 3)
         frame = Frame(isotp.physical_id(0xF1, node), octets, bool(kind & 1))
-        gathering.take(frame)
-        pair.take(frame)
+        gathering.add_frame(frame)
+        pair.handle_frame(frame)
         pair.received()
     isotp.read_single(data)
 
@@ -476,7 +476,7 @@ def check_image(data: bytes) -> None:
     from teds_provision.teds.sheet import Sheet
 
     with suppress(TedsProvisionError):
-        Sheet.of(Image.from_json(data))
+        Sheet.from_image(Image.from_json(data))
     with suppress(TedsProvisionError):
         kind = detect(data)
         blocks = read_blocks(data, kind)
@@ -556,13 +556,13 @@ def check_plant(data: bytes) -> None:
         if kind is document.ROSTER:
             read = roster.open_roster(octets, key.point)
             assert roster.taking(read, None, read.registry)[0] == "taken"
-            assert fold.view(read, {}, fold.LocalState("f" * 64)).key_it
+            assert fold.merge_claims(read, {}, fold.LocalState("f" * 64)).key_it
         elif kind is document.PAGE:
             opened = page.open_page(octets, "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29", lambda kid: key.point)
             gathered = claim.Claim()
             for one in map(event.read, opened.events):
                 if isinstance(one, event.Event):
-                    gathered.take(one)
+                    gathered.apply_event(one)
             assert claim.Claim.from_json(gathered.to_json()) == gathered
         else:
             document.open_request(octets)

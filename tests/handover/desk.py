@@ -96,7 +96,7 @@ class Pair:
 
 
 def held(station: Station, board: Board) -> list[tuple[str, int, str]]:
-    return [(key.state, key.epoch, key.source) for key in station.keys.of(board.uuid)]
+    return [(key.state, key.epoch, key.source) for key in station.keys.keys_of(board.uuid)]
 
 
 def node_key_id(board: Board) -> str:

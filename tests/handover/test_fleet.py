@@ -29,7 +29,7 @@ from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.verify import Verification, verify_image
-from teds_provision.steps.verify_node import look_at_node
+from teds_provision.steps.verify_node import verify_at_node
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.codec import security
@@ -186,12 +186,12 @@ def test_the_station_that_was_locked_out_is_told_of_a_tap_elsewhere_and_then_who
         session(one, board)
     assert "attack" not in told.value.message + (told.value.hint or "")
     assert "proves nothing" not in told.value.message
-    assert [record.epoch for record in one.keys.of(board.uuid)] == [1], "a hint changes no key"
+    assert [record.epoch for record in one.keys.keys_of(board.uuid)] == [1], "a hint changes no key"
 
 
 def why_unproven(station: Station, board: Board) -> str:
     with talk(board) as node:
-        verified = look_at_node(station, node, identify(station, node)).verified
+        verified = verify_at_node(station, node, identify(station, node)).verified
     assert verified.verdict == "unproven"
     return next(check.why for check in verified.checks if check.name == "session")
 

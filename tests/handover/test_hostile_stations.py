@@ -162,7 +162,7 @@ def test_a_node_that_comes_back_is_rotated_and_the_plan_says_so(pair: Pair) -> N
 def cut_rotation(station: Station, board: Board) -> None:
     """A rotation whose Confirm reached the node while the station died before its reply."""
     with talk(board) as node:
-        who, real = identify(station, node), node.send
+        who, real = identify(station, node), node.request
 
         def cut(command: Command, why: str) -> bytes:
             reply = real(command, why)
@@ -170,7 +170,7 @@ def cut_rotation(station: Station, board: Board) -> None:
                 raise KeyboardInterrupt
             return reply
 
-        node.send = cut  # type: ignore[assignment, method-assign]
+        node.request = cut  # type: ignore[assignment, method-assign]
         with pytest.raises(KeyboardInterrupt):
             agree(station, node, who, rotate=True)
 
@@ -190,7 +190,7 @@ def test_a_receipt_deletes_the_key_that_was_in_its_bundle_and_no_other(pair: Pai
     path, _exported = pair.export("move")
     pair.north.keys.add_pending(pair.board.uuid, key=bytes(16), key_id=b"newer...", epoch=9)
     close(pair.north, pair.take(path).receipt)
-    assert [record.key_id for record in pair.north.keys.of(pair.board.uuid)] == [b"newer...".hex()]
+    assert [record.key_id for record in pair.north.keys.keys_of(pair.board.uuid)] == [b"newer...".hex()]
 
 
 def test_a_receipt_that_comes_after_the_nodes_return_deletes_nothing(pair: Pair) -> None:

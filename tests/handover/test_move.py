@@ -106,7 +106,7 @@ def test_a_first_contact_cut_anywhere_is_carried_on(pair: Pair, what: str, lost:
     epoch = session(pair.south, pair.board)
     assert epoch >= 2
     assert pair.south.keys.rotation_due(pair.board.uuid) is None
-    assert [key.key_id for key in pair.south.keys.of(pair.board.uuid)] == [node_key_id(pair.board)]
+    assert [key.key_id for key in pair.south.keys.keys_of(pair.board.uuid)] == [node_key_id(pair.board)]
 
 
 def test_any_first_contact_after_a_move_rotates_even_to_write(pair: Pair) -> None:

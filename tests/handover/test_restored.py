@@ -65,7 +65,7 @@ def test_a_pending_key_out_of_a_backup_counts_for_no_rotation(tmp_path: Path) ->
     assert held_key is not None
     station.keys.add_pending(board.uuid, key=bytes(16), key_id=b"pending!", epoch=2)
     station.keys.demand_rotation(board.uuid, "others may have it")
-    assert {record.source for record in station.keys.of(board.uuid) if record.state == "pending"} == {"import"}
+    assert {record.source for record in station.keys.keys_of(board.uuid) if record.state == "pending"} == {"import"}
     station.close()
 
 
@@ -79,7 +79,7 @@ def test_a_pending_key_that_came_back_and_opens_is_no_rotation(tmp_path: Path) -
         agree(station, node, identify(station, node), rotate=True)
     assert [(state, epoch) for state, epoch, *_ in held(station, board)] == [("pending", 2), ("active", 1)]
     again = back(station, tmp_path)
-    assert {record.source for record in again.keys.of(board.uuid) if record.state == "pending"} == {"agreement"}
+    assert {record.source for record in again.keys.keys_of(board.uuid) if record.state == "pending"} == {"agreement"}
     with talk(board) as node:
         opened = open_session(again, node)
         assert opened is not None

@@ -110,5 +110,5 @@ def test_names_and_keys_are_held_against_all_that_a_large_receiver_knows(
     import_bundle(south, plan)
     assert len(south.nodes.all()) == COUNT + 1
     assert south.nodes.get(last) == other
-    assert {len(south.keys.of(uuid_of(number))) for number in range(COUNT) if uuid_of(number) != last} == {1}
+    assert {len(south.keys.keys_of(uuid_of(number))) for number in range(COUNT) if uuid_of(number) != last} == {1}
     assert set(south.keys.cas_of_nodes().values()) == {north.ca}

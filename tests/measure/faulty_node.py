@@ -57,7 +57,7 @@ class Faulty(VirtualNode):
 
 
 def _board(file: FlashFile) -> Board:
-    return Board(Sheet.of(Image(file.load().uuid, file.hardware)), source="ramp:2")
+    return Board(Sheet.from_image(Image(file.load().uuid, file.hardware)), source="ramp:2")
 
 
 # -- faults of data frames: what leaves, given what should -----------------------------------------------------------
@@ -281,7 +281,7 @@ def main() -> None:
         node.streams_over(_sender(server, node, FAULTS[fault] if FAULTS[fault] in BENDING else None))
         boards.append(node.board)
     stop = IdleStop(None)
-    signal.signal(signal.SIGTERM, lambda *_: stop.ask())
+    signal.signal(signal.SIGTERM, lambda *_: stop.request_stop())
     for part in (pulse, *boards, server):
         part.start()  # type: ignore[union-attr]
     print(json.dumps({"ready": True}, separators=(", ", ": ")), flush=True)

@@ -48,7 +48,7 @@ def test_a_node_that_wants_little_leaves_the_rest_to_the_fast_ones(fast_first: b
 
 def test_a_node_alone_or_beside_one_that_ended_takes_what_the_bus_bears() -> None:
     share = BusShare(BusTime(), {FIRST, SECOND})
-    share.gone(SECOND)
+    share.drop_node(SECOND)
     assert measure(share, [(FIRST, FAST)])[FIRST].load == pytest.approx(MOST_LOAD, rel=0.1)
 
 

@@ -24,8 +24,8 @@ def rows(grid: Grid, now: float) -> GroupRows:
 
 def test_a_row_holds_the_last_value_that_is_not_newer_and_its_age() -> None:
     grid = Grid("g", [ANGLE, SLOW], patience=0.1)
-    grid.take(block([[k] for k in range(10)]))
-    grid.take(block([[100], [200]], uuid=HAND, channels=(2,), period=0.05))
+    grid.add_block(block([[k] for k in range(10)]))
+    grid.add_block(block([[100], [200]], uuid=HAND, channels=(2,), period=0.05))
     got = rows(grid, NOW + 0.3)
     np.testing.assert_allclose(got.time[:10] - NOW, np.arange(10) * 0.01, atol=1e-6)
     np.testing.assert_allclose(got.value[:10, 0], np.arange(10) / 10)
@@ -35,7 +35,7 @@ def test_a_row_holds_the_last_value_that_is_not_newer_and_its_age() -> None:
 
 def test_after_two_periods_a_value_is_no_value() -> None:
     grid = Grid("g", [ANGLE], patience=0.0)
-    grid.take(block([[7]]))
+    grid.add_block(block([[7]]))
     got = rows(grid, NOW + 0.0501)
     assert np.isnan(got.value[:, 0]).tolist() == [False, False, False, True, True, True]
     assert np.isnan(got.age[:, 0]).tolist() == [False, False, False, True, True, True]
@@ -43,15 +43,15 @@ def test_after_two_periods_a_value_is_no_value() -> None:
 
 def test_an_invalid_sample_is_not_covered_up_by_the_one_before() -> None:
     grid = Grid("g", [ANGLE], patience=0.0)
-    grid.take(block([[7], [8]], valid=[[True], [False]]))
+    grid.add_block(block([[7], [8]], valid=[[True], [False]]))
     got = rows(grid, NOW + 0.011)
     assert np.isnan(got.value[:, 0]).tolist() == [False, True]
 
 
 def test_a_row_waits_for_all_but_not_longer_than_its_patience() -> None:
     grid = Grid("g", [ANGLE, FORCE], patience=0.05)
-    grid.take(block([[1]] * 10))
-    grid.take(block([[1]] * 3, uuid=HAND, channels=(2,)))
+    grid.add_block(block([[1]] * 10))
+    grid.add_block(block([[1]] * 3, uuid=HAND, channels=(2,)))
     assert len(rows(grid, NOW + 0.06).time) == 3, "the second stream has come to the third row"
     assert grid.rows(NOW + 0.06) is None
     assert len(rows(grid, NOW + 0.0851).time) == 1, "row 3 is past the patience"
@@ -60,11 +60,11 @@ def test_a_row_waits_for_all_but_not_longer_than_its_patience() -> None:
 
 def test_a_value_that_comes_after_its_row_is_not_put_into_it() -> None:
     grid = Grid("g", [ANGLE, FORCE], patience=0.02)
-    grid.take(block([[1]] * 10))
-    grid.take(block([[1]], uuid=HAND, channels=(2,)))
+    grid.add_block(block([[1]] * 10))
+    grid.add_block(block([[1]], uuid=HAND, channels=(2,)))
     first = rows(grid, NOW + 0.10)
-    grid.take(block([[k] for k in range(10, 20)], uuid=HAND, channels=(2,), index=1))
-    grid.take(block([[1]] * 10, index=10))
+    grid.add_block(block([[k] for k in range(10, 20)], uuid=HAND, channels=(2,), index=1))
+    grid.add_block(block([[1]] * 10, index=10))
     second = rows(grid, NOW + 0.2)
     assert second.time[0] > first.time[-1]
     assert np.isnan(first.value[5, 1])
@@ -73,10 +73,10 @@ def test_a_value_that_comes_after_its_row_is_not_put_into_it() -> None:
 
 def test_an_event_keeps_its_value() -> None:
     grid = Grid("g", [ANGLE, replace(FORCE, kind="event", period=None)], patience=0.0)
-    grid.take(block([[1]] * 3))
-    grid.take(block([[5]], uuid=HAND, channels=(2,)))
+    grid.add_block(block([[1]] * 3))
+    grid.add_block(block([[5]], uuid=HAND, channels=(2,)))
     for k in range(1, 30):
-        grid.take(block([[1]] * 3, index=3 * k))
+        grid.add_block(block([[1]] * 3, index=3 * k))
     got = rows(grid, NOW + 0.9)
     assert got.value[-1, 1] == 0.5
     assert got.age[-1, 1] > 0.8
@@ -84,7 +84,7 @@ def test_an_event_keeps_its_value() -> None:
 
 def test_channels_of_other_groups_are_left_out() -> None:
     grid = Grid("g", [ANGLE])
-    grid.take(block([[5]], uuid=HAND, channels=(2,)))
+    grid.add_block(block([[5]], uuid=HAND, channels=(2,)))
     assert grid.rows(NOW + 1) is None
 
 
@@ -92,8 +92,8 @@ def test_channels_that_do_not_lie_side_by_side_come_into_their_columns() -> None
     """Two streams of one node whose channels take turns, one of them with channels that are not of the group."""
     facts = [replace(ANGLE, number=number) for number in (1, 2, 3, 4)]
     grid = Grid("g", facts, patience=0.0)
-    grid.take(block([[3, 9, 1], [30, 9, 10]], channels=(3, 9, 1)))
-    grid.take(replace(block([[4, 2]], channels=(4, 2)), stream=1))
+    grid.add_block(block([[3, 9, 1], [30, 9, 10]], channels=(3, 9, 1)))
+    grid.add_block(replace(block([[4, 2]], channels=(4, 2)), stream=1))
     got = rows(grid, NOW + 0.0351)
     np.testing.assert_allclose(got.value[:2], [[0.1, 0.2, 0.3, 0.4], [1.0, 0.2, 3.0, 0.4]])
     assert np.isnan(got.value[3]).tolist() == [False, True, False, True], "the second stream ended a row earlier"
@@ -102,8 +102,8 @@ def test_channels_that_do_not_lie_side_by_side_come_into_their_columns() -> None
 
 def test_how_far_apart_streams_began_is_told() -> None:
     grid = Grid("g", [ANGLE, FORCE])
-    grid.take(block([[1]]))
-    grid.take(block([[1]], uuid=HAND, channels=(2,), start=NOW + 0.004))
+    grid.add_block(block([[1]]))
+    grid.add_block(block([[1]], uuid=HAND, channels=(2,), start=NOW + 0.004))
     np.testing.assert_allclose(grid.began_apart(), 0.004, atol=1e-6)
 
 
@@ -122,7 +122,7 @@ def test_every_row_is_the_definition(sizes: list[tuple[int, bool]], looks: list[
         one = block([[index + k] for k in range(size)], valid=[[good]] * size, index=index)
         samples += zip(one.time.tolist(), one.value[:, 0].tolist(), strict=True)
         index += size + (3 if turn % 3 == 2 else 0)
-        grid.take(one)
+        grid.add_block(one)
         found = grid.rows(samples[-1][0] + looks[turn % len(looks)])
         if found is not None:
             got += zip(found.time.tolist(), found.value[:, 0].tolist(), found.age[:, 0].tolist(), strict=True)

@@ -50,7 +50,7 @@ class Scene:
         fd: bool = True,
     ) -> None:
         self.real = real  # period of a sensor that runs free
-        self.plan = StreamPlan.of(0, ((1, 2), (2, 2)), n=3, period=period, kind=kind)
+        self.plan = StreamPlan.for_channels(0, ((1, 2), (2, 2)), n=3, period=period, kind=kind)
         self.base = time.monotonic_ns() - ago * SECOND
         clock = ClockMap()
         clock.exchange(Exchange(self.base, self.base + 2000, SECOND + 500, SECOND + 1500, 1, 20))

@@ -127,7 +127,7 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
     [*_, one] = sightings.all()
 
     def lost() -> float:
-        sightings.saw(replace(one, at=time.monotonic()))
+        sightings.add_sighting(replace(one, at=time.monotonic()))
         asked_before, began = asked(hub)[0], time.monotonic()
         sightings.wrong(one)
         with suppress(LinkError):

@@ -52,7 +52,7 @@ def find(sightings: Presence, uuid: bytes, **more: Any) -> Sighting:
 
 def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile() -> None:
     sightings = Presence()
-    sightings.saw(seen(ONE, 7))
+    sightings.add_sighting(seen(ONE, 7))
     assert find(sightings, ONE).address == 7
     with pytest.raises(NoNodeError):
         find(sightings, TWO)
@@ -63,7 +63,7 @@ def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile
     until(sightings.missing)
     assert sightings.awaits(Announce(9, 2, uuid_crc(TWO)))
     assert not sightings.awaits(Announce(9, 2, uuid_crc(ONE)))
-    sightings.saw(seen(TWO, 9))
+    sightings.add_sighting(seen(TWO, 9))
     waiting.join(60)
     assert [one.address for one in found] == [9]
 
@@ -94,10 +94,10 @@ def test_who_asks_a_look_out_that_has_nothing_to_do_waits_for_one_round_alone() 
 def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
     sightings = Presence()
     forged, true = seen(ONE, 7), seen(ONE, 8)
-    sightings.saw(forged)
+    sightings.add_sighting(forged)
     sightings.wrong(forged)
     for one in (seen(ONE, 7), true, seen(ONE, 7)):
-        sightings.saw(one)
+        sightings.add_sighting(one)
     assert find(sightings, ONE).address == 8
 
 
@@ -108,18 +108,18 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     monkeypatch.setattr("teds_provision.measure.presence.TWIN", 5.0)
     sightings = Presence()
     copy, true = seen(ONE, 7), seen(ONE, 8)
-    sightings.saw(copy)
-    sightings.saw(true)
+    sightings.add_sighting(copy)
+    sightings.add_sighting(true)
     sightings.wrong(copy)
     lost = time.monotonic()
-    sightings.saw(seen(ONE, 7))
+    sightings.add_sighting(seen(ONE, 7))
     with pytest.raises(NoNodeError):
         find(sightings, ONE, fresh=lost)
-    sightings.saw(seen(ONE, 8))
+    sightings.add_sighting(seen(ONE, 8))
     assert find(sightings, ONE, fresh=lost).address == 8
     sightings.wrong(seen(ONE, 8))
     alone = time.monotonic()
-    sightings.saw(seen(ONE, 7))
+    sightings.add_sighting(seen(ONE, 7))
     monkeypatch.setattr("teds_provision.measure.presence.TWIN", TWIN)
     assert find(sightings, ONE, seconds=PATIENCE, fresh=alone).address == 7, "nobody else answers: it is tried again"
 
@@ -128,11 +128,11 @@ def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhe
     """Who gave himself a node's UUID, and said that he knows no key, ended its measurement before it began."""
     sightings, unknown = Presence(), PolicyError("It knows none of the keys.")
     copy = seen(ONE, 7)
-    sightings.saw(copy)
+    sightings.add_sighting(copy)
     sightings.wrong(copy)
     look = functools.partial(sightings.elsewhere, ONE)
     assert RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look), "nobody else answers"
-    threading.Timer(TWIN / 5, sightings.saw, [seen(ONE, 8)]).start()
+    threading.Timer(TWIN / 5, sightings.add_sighting, [seen(ONE, 8)]).start()
     assert not RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look)
     assert RetryPolicy(60.0).gives_up(unknown, proven=True, elsewhere=look), "said in a session it is the node's word"
     assert not RetryPolicy(None).gives_up(unknown, proven=True, elsewhere=look)
@@ -143,7 +143,7 @@ def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhe
 def test_a_copy_that_refuses_while_the_node_is_silent_for_a_moment_is_no_reason_either() -> None:
     sightings, unknown = Presence(), PolicyError("It knows none of the keys.")
     for silent_then_copy in (8, 7):
-        sightings.saw(seen(ONE, silent_then_copy))
+        sightings.add_sighting(seen(ONE, silent_then_copy))
         sightings.wrong(seen(ONE, silent_then_copy))
     look = functools.partial(sightings.elsewhere, ONE)
     assert not RetryPolicy(60.0).gives_up(unknown, proven=False, elsewhere=look)
@@ -152,19 +152,19 @@ def test_a_copy_that_refuses_while_the_node_is_silent_for_a_moment_is_no_reason_
 def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
     sightings = Presence()
     announced = seen(TWO, 8)
-    sightings.saw(announced)
+    sightings.add_sighting(announced)
     sightings.on_announce(announced, lambda: None)
     for number in range(3 * MOST):
-        sightings.saw(seen(number.to_bytes(10, "big"), number % 239))
+        sightings.add_sighting(seen(number.to_bytes(10, "big"), number % 239))
         if number % 100 == 0:
-            sightings.saw(seen(ONE, 7))  # answers now and then, as everyone is asked every 30 s
+            sightings.add_sighting(seen(ONE, 7))  # answers now and then, as everyone is asked every 30 s
     assert len(sightings.all()) <= MOST
     assert {ONE, TWO} <= {one.uuid for one in sightings.all()}
 
 
 def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
     sightings = Presence()
-    sightings.saw(seen(ONE, 7))
+    sightings.add_sighting(seen(ONE, 7))
     with pytest.raises(NoNodeError):
         find(sightings, ONE, fresh=time.monotonic())
 
@@ -172,7 +172,7 @@ def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
 def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
     told: list[str] = []
     sightings = Presence(note=told.append)
-    sightings.saw(seen(ONE, 7))
+    sightings.add_sighting(seen(ONE, 7))
     sightings.conflict("can:x", 7)
     with pytest.raises(AddressConflictError):
         find(sightings, ONE)
@@ -217,10 +217,10 @@ def test_nodes_that_are_there_in_time_begin_at_one_moment_and_a_late_one_when_it
     moments = [clocks[uuid].host_of(tick) for uuid, tick in ticks.items()]
     assert abs(moments[0] - moments[1]) < 1e-4
     assert min(moments) > began + 1.0 + 2.0
-    assert common.apart == pytest.approx(abs(moments[0] - moments[1]), abs=1e-6)
-    assert 0 <= common.until(ticks[ONE]) < 3
+    assert common.spread == pytest.approx(abs(moments[0] - moments[1]), abs=1e-6)
+    assert 0 <= common.seconds_until(ticks[ONE]) < 3
     assert common.start(ONE, clocks[ONE]) == SOON, "after a restart it begins by itself"
-    while common.until(ticks[ONE]):
+    while common.seconds_until(ticks[ONE]):
         time.sleep(0.01)
     assert common.start(THREE, clock(0)) == SOON
 
@@ -228,7 +228,7 @@ def test_nodes_that_are_there_in_time_begin_at_one_moment_and_a_late_one_when_it
 def test_a_node_alone_waits_for_nobody_and_one_that_is_gone_is_not_waited_for() -> None:
     assert CommonStart({ONE}).start(ONE, clock(0)) == SOON
     common = CommonStart({ONE, TWO}, waiting=60)
-    common.gone(TWO)
+    common.drop_node(TWO)
     assert common.start(ONE, clock(0)) != SOON
 
 
@@ -237,21 +237,21 @@ def test_a_stream_waits_for_the_trigger_until_it_has_gone_out() -> None:
     assert common.start(ONE, clock(0)) == WAITS
     assert not common.due(1, 2)
     assert common.due(2, 2)
-    assert common.left is None
+    assert common.seconds_left is None
     common.triggered()
     assert not common.due(2, 2)
     assert common.start(TWO, clock(0)) == SOON
 
 
 def sheet(uuid: bytes) -> Sheet:
-    return Sheet.of(Image(uuid, load_profile(ANGLE, None).build(uuid).blocks))
+    return Sheet.from_image(Image(uuid, load_profile(ANGLE, None).build(uuid).blocks))
 
 
 def test_datasheets_are_judged_once_all_are_there_and_one_that_is_gone_is_not_waited_for() -> None:
     met = parse_require('[angle]\nrange = ">= 10 deg"\n', "task")
     required = Requirements(met, waiting=60)
     required.expect([ONE, TWO])
-    threading.Timer(0.05, required.gone, [TWO]).start()
+    threading.Timer(0.05, required.drop_node, [TWO]).start()
     with pytest.raises(PolicyError):  # a profile without calibration gives no value
         required.offer(ONE, sheet(ONE), threading.Event())
     assert [fit["uuid"] for fit in required.fits] == [ONE.hex()]

@@ -55,7 +55,7 @@ def test_those_that_come_together_share_and_those_that_run_keep_what_they_have()
     share.expect([third], 0.1)
     assert share.room == 0.0
     assert share.others(third, sharing=True).taken == pytest.approx(0.6)
-    share.gone(second)
+    share.drop_node(second)
     del share.taken[second]
     assert share.room == pytest.approx(0.3)
     assert share.nodes == 2

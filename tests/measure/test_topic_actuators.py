@@ -56,7 +56,7 @@ class Scene:
         began = time.monotonic()
         for k in range(count):
             before = len(self.applied) + self.actuators.refused
-            self.actuators.take(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, began + k * 0.002))
+            self.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, began + k * 0.002))
             until(lambda before=before: len(self.applied) + self.actuators.refused > before)
 
 
@@ -114,7 +114,7 @@ def test_a_claim_that_is_gone_says_nothing_about_drive() -> None:
 def test_a_set_point_older_than_the_dead_man_moves_nothing_and_is_told() -> None:
     scene = Scene(lambda: reply(1))
     for age in (10.5, 9.0):
-        scene.actuators.take(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, time.monotonic() - age))
+        scene.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, time.monotonic() - age))
         until(lambda: len(scene.applied) + scene.actuators.refused > 0)
         if age > 10:
             assert (scene.node.values, scene.applied, scene.messages, scene.actuators.refused) == (0, [], [], 1)
@@ -130,7 +130,7 @@ def test_a_set_point_that_grew_old_while_the_node_was_busy_moves_nothing() -> No
     """It was young when it came; the node's turn was somebody else's until its dead-man had run out."""
     scene = Scene(lambda: reply(1), dead_man=300)
     with scene.turn:
-        scene.actuators.take(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, time.monotonic()))
+        scene.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 1, 0.05, time.monotonic()))
         time.sleep(0.5)  # that much time, and nothing else, is what makes it old
     until(lambda: scene.actuators.refused > 0)
     scene.actuators.close()
@@ -140,7 +140,7 @@ def test_a_set_point_that_grew_old_while_the_node_was_busy_moves_nothing() -> No
 
 def test_a_set_point_beyond_the_limits_moves_nothing_and_is_told() -> None:
     scene = Scene(lambda: reply(1))
-    scene.actuators.take(SetPointCommand(SHEET.uuid.hex(), 1, 5.0, time.monotonic()))
+    scene.actuators.queue_command(SetPointCommand(SHEET.uuid.hex(), 1, 5.0, time.monotonic()))
     until(lambda: scene.actuators.refused > 0)
     scene.actuators.close()
     assert (scene.node.values, scene.applied, scene.messages) == (0, [], [])

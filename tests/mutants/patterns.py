@@ -167,7 +167,7 @@ PATTERNS = (
     ),
     Pattern(
         "a lower counter is a replay",
-        "Sessions.take",
+        "Sessions.open_frame",
         "counter <= session.counter",
         "counter == session.counter",
         "tests/protocol/test_tim_states.py",
@@ -177,7 +177,7 @@ PATTERNS = (
     Pattern("STmin of F1 to F9", "gap_seconds", "241 <= octet <= 249", "False", "tests/links/can/test_can_isotp.py"),
     Pattern(
         "a torn sequence ends a message",
-        "Reassembly.take",
+        "Reassembly.add_frame",
         "data[0] & 15 != self.number + 1 & 15",
         "False",
         "tests/links/can/test_can_isotp.py",
@@ -191,7 +191,7 @@ PATTERNS = (
     ),
     Pattern(
         "forged Announces move a node less and less",
-        "AddressClaim.take",
+        "AddressClaim.handle_announce",
         "self._moves < MOVES_AT_ONCE",
         "True",
         "tests/protocol/test_announce.py",
@@ -207,7 +207,9 @@ PATTERNS = (
     Pattern("an epoch seen before", "_epoch", "shown.key_epoch >= known.key_epoch", "True"),
     Pattern("a sequence seen before", "_sequence", "shown.sequence >= known.sequence", "True"),
     Pattern("an epoch of the future", "_epoch", "shown.key_epoch > known.identity.epoch", "False"),
-    Pattern("only good signatures are floors", "known_of", "datasheet.signature_good(shown, octets, uuid)", "True"),
+    Pattern(
+        "only good signatures are floors", "freshness_floor_of", "datasheet.signature_good(shown, octets, uuid)", "True"
+    ),
     Pattern("no session, no verdict", "Verification.verdict", "_SESSION in failed", "False"),
     Pattern(
         "write refuses another epoch",

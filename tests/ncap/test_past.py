@@ -46,25 +46,25 @@ def test_a_second_has_its_least_its_greatest_and_its_count(monkeypatch: pytest.M
     monkeypatch.setattr("time.time", lambda: NOW)  # which is when this module was loaded
     past = History()
     ramp(past, NOW - 10, 10)
-    said = past.of(NODE, 1, NOW - 600, NOW, points=3600)
+    said = past.channel_history(NODE, 1, NOW - 600, NOW, points=3600)
     assert said["bin"] == 1.0
     assert said["time"] == [NOW - 10 + second for second in range(10)]
     assert (said["low"][3], said["high"][3], said["count"][3]) == (300.0, 399.0, 100)
     assert said["rate"] == pytest.approx(100)
     with pytest.raises(NotFoundError):
-        past.of(NODE, 2)
+        past.channel_history(NODE, 2)
 
 
 def test_the_last_minute_is_fine_and_what_is_older_is_not() -> None:
     past = History()
     ramp(past, NOW - 100, 100, rate=1000.0)
-    fine = past.of(NODE, 1, NOW - 2, NOW, points=3600)
+    fine = past.channel_history(NODE, 1, NOW - 2, NOW, points=3600)
     assert fine["bin"] == pytest.approx(0.01)
     assert (len(fine["time"]), fine["count"][0]) == (200, 10)
     spans = np.array(fine["high"]) - np.array(fine["low"])
     assert ((spans >= 9) & (spans <= 9 * 1.008)).all(), "rounded up, and by less than a hundredth"
-    assert past.of(NODE, 1, NOW - 100, NOW, points=3600)["bin"] == 1.0
-    thin = past.of(NODE, 1, NOW - 100, NOW, points=10)
+    assert past.channel_history(NODE, 1, NOW - 100, NOW, points=3600)["bin"] == 1.0
+    thin = past.channel_history(NODE, 1, NOW - 100, NOW, points=10)
     assert len(thin["time"]) <= 11
     assert (min(thin["low"]), max(thin["high"]), sum(thin["count"])) == (0.0, 99999.0, 100_000)
 
@@ -74,10 +74,10 @@ def test_gaps_invalid_and_lost_samples_are_told_apart() -> None:
     past.block(block(NOW - 8, [[1.0, 5.0]] * 100, index=0))
     past.block(block(NOW - 5, [[1.0, 5.0]] * 100, index=300, valid=[[False, True]] * 100))  # 200 were lost before it
     past.block(block(NOW - 4, [[1.0, 5.0]] * 100, index=0, run=1))  # begun anew: nothing was lost
-    one, two = (past.of(NODE, number, NOW - 60, NOW) for number in (1, 2))
+    one, two = (past.channel_history(NODE, number, NOW - 60, NOW) for number in (1, 2))
     by_second = {at - NOW: place for place, at in enumerate(one["time"]) if one["bin"] == 1.0}
     if not by_second:  # the minute: in 10 ms
-        one, two = (past.of(NODE, number, NOW - 3000, NOW, points=3600) for number in (1, 2))
+        one, two = (past.channel_history(NODE, number, NOW - 3000, NOW, points=3600) for number in (1, 2))
         by_second = {at - NOW: place for place, at in enumerate(one["time"])}
     assert set(by_second) == {-8, -5, -4}, "a bin in which nothing happened is left out"
     at = by_second[-5]
@@ -92,25 +92,25 @@ def test_a_clock_that_is_set_back_writes_that_time_anew_and_one_set_forward_leav
     past = History()
     ramp(past, NOW - 300, 100)
     past.block(block(NOW - 250, [[7.0]] * 100, run=1))  # put back by 150 s
-    said = past.of(NODE, 1, NOW - 3000, NOW, points=3600)
+    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
     assert said["time"][-1] == NOW - 250
     assert (said["low"][-1], said["count"][-1]) == (7.0, 100), "what the old clock called that time is gone"
     assert len(said["time"]) == 51
     past.block(block(NOW - 20, [[8.0]] * 100, run=2))
-    said = past.of(NODE, 1, NOW - 3000, NOW, points=3600)
+    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
     assert (len(said["time"]), said["time"][-1], said["low"][-1]) == (52, NOW - 20, 8.0)
     past.block(block(NOW + 2 * HOUR, [[9.0]] * 100, run=3))
-    said = past.of(NODE, 1, NOW, NOW + 3 * HOUR, points=3600)
+    said = past.channel_history(NODE, 1, NOW, NOW + 3 * HOUR, points=3600)
     assert said["time"] == [NOW + 2 * HOUR], "an hour is an hour of the clock that is"
     past.block(block(NOW, [[3.0]] * 100, run=4))
-    assert past.of(NODE, 1, NOW - HOUR, NOW + 3 * HOUR, points=3600)["time"] == [NOW]
+    assert past.channel_history(NODE, 1, NOW - HOUR, NOW + 3 * HOUR, points=3600)["time"] == [NOW]
 
 
 def test_samples_that_come_a_little_late_belong_where_they_are_dated() -> None:
     past = History()
     ramp(past, NOW - 10, 5)
     past.block(block(NOW - 6.5, [[-1.0]], index=500))
-    said = past.of(NODE, 1, NOW - 3000, NOW, points=3600)
+    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
     assert (said["low"][3], said["count"][3], len(said["time"])) == (-1.0, 101, 5)
 
 
@@ -118,20 +118,20 @@ def test_the_ring_of_an_hour_forgets_what_is_older() -> None:
     past = History()
     for minute in range(70):
         past.block(block(NOW + 60 * minute, [[float(minute)]]))
-    said = past.of(NODE, 1, NOW, NOW + 4200, points=3600)
+    said = past.channel_history(NODE, 1, NOW, NOW + 4200, points=3600)
     assert (said["time"][0], len(said["time"])) == (NOW + 60 * 10, 60)
 
 
 def test_a_channel_takes_less_than_a_hundred_thousand_octets() -> None:
     past = History()
     ramp(past, NOW - 70, 70)
-    past.of(NODE, 1)
+    past.channel_history(NODE, 1)
     channel = past._channels[NODE, 1]
     rings = [ring for bins in vars(channel).values() for ring in (bins._low, bins._high, *bins._counts)]
     held = sum(ring.nbytes for ring in rings if ring is not None)
     assert held <= 78_000, "nothing was lost, nothing invalid"
     past.block(block(NOW, [[1.0]] * 100, index=9000, valid=[[False]] * 100))
-    past.of(NODE, 1)
+    past.channel_history(NODE, 1)
     rings = [ring for bins in vars(channel).values() for ring in (bins._low, bins._high, *bins._counts)]
     held = sum(ring.nbytes for ring in rings if ring is not None)
     assert held <= 98_400

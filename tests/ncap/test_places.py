@@ -26,9 +26,9 @@ from tests.pace import PATIENCE, until
 
 def test_one_token_never_takes_all_places() -> None:
     places = LiveSlots()
-    assert sum(places.take("greedy", lambda: None) for _ in range(3 * MOST_LISTENERS)) == OF_ONE_TOKEN
+    assert sum(places.acquire("greedy", lambda: None) for _ in range(3 * MOST_LISTENERS)) == OF_ONE_TOKEN
     assert OF_ONE_TOKEN < MOST_LISTENERS
-    assert places.take("other", lambda: None)
+    assert places.acquire("other", lambda: None)
 
 
 def test_where_all_are_taken_the_one_that_has_most_gives_its_newest_up() -> None:
@@ -37,19 +37,19 @@ def test_where_all_are_taken_the_one_that_has_most_gives_its_newest_up() -> None
     def leaves(name: str) -> Any:
         return lambda: left.append(name)
 
-    assert all(places.take("a", leaves(f"a{number}")) for number in range(3))
-    assert all(places.take("b", leaves(f"b{number}")) for number in range(3))
-    assert not places.take("a", leaves("a3"))
-    assert places.take("c", leaves("c0"))
-    assert places.take("c", leaves("c1"))
+    assert all(places.acquire("a", leaves(f"a{number}")) for number in range(3))
+    assert all(places.acquire("b", leaves(f"b{number}")) for number in range(3))
+    assert not places.acquire("a", leaves("a3"))
+    assert places.acquire("c", leaves("c0"))
+    assert places.acquire("c", leaves("c1"))
     assert sorted(left) == ["a2", "b2"]
-    assert not places.take("c", leaves("c2")), "two each is an even share"
+    assert not places.acquire("c", leaves("c2")), "two each is an even share"
     one = leaves("d0")
-    assert places.take("d", one)
+    assert places.acquire("d", one)
     assert len(left) == 3
-    places.give("d", one)
-    places.give("d", one)
-    assert places.take("d", one), "a place that was given back is free"
+    places.release("d", one)
+    places.release("d", one)
+    assert places.acquire("d", one), "a place that was given back is free"
     assert len(left) == 3
 
 

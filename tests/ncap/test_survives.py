@@ -312,7 +312,7 @@ def test_an_actuator_that_another_command_holds_is_423(desk: Desk) -> None:
         held.signal(signal.SIGTERM)
         assert held.end().code == 0
         assert asked.set(uuid, 1, 0.02)["applied"]["value"] == pytest.approx(0.02, abs=1e-4)
-        assert asked.let_go(uuid, 1) is True
+        assert asked.release_actuator(uuid, 1) is True
     service.end()
 
 

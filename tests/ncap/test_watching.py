@@ -82,10 +82,10 @@ def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch
     watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
     gone, stays = sighting(1), sighting(2)
     for one in (gone, stays):
-        watch.saw(one)
+        watch.on_sighting(one)
     watch._pending.clear()
     watch._look_for_all()
-    watch.saw(sighting(2))
+    watch.on_sighting(sighting(2))
     assert looked == [gone.uuid.hex(), stays.uuid.hex(), stays.uuid.hex()], "who answers is looked at anew"
     assert list(watch._known) == [gone.uuid.hex(), stays.uuid.hex()]
     gone.at -= 1000.0
@@ -100,7 +100,7 @@ def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, m
 
     def serve(contact: Any) -> None:
         uuid = contact.identity.uuid.hex()
-        with watch._turns.of(uuid, "it is looked at"):
+        with watch._turns.hold(uuid, "it is looked at"):
             time.sleep(0.001)
         with watch._guard:
             watch._pending.discard(uuid)
@@ -109,7 +109,7 @@ def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, m
     with ThreadPoolExecutor(2) as workers:
         watch._for_strangers = workers
         for number in range(count):
-            watch.saw(sighting(number))
+            watch.on_sighting(sighting(number))
             most = max(most, present(watch))
             if number % 100 == 0:
                 time.sleep(0.02)  # some are looked at meanwhile
@@ -124,13 +124,13 @@ def test_what_was_looked_at_while_others_took_its_place_leaves(
     one = sighting(7)
 
     def serve(contact: Any) -> None:
-        with watch._turns.of(one.uuid.hex(), "it is looked at"):
+        with watch._turns.hold(one.uuid.hex(), "it is looked at"):
             watch._gone(one.uuid.hex())
         watch._roster.note(one.uuid.hex(), "problem")
 
     monkeypatch.setattr(watch, "_serve", serve)
     watch._for_strangers = SimpleNamespace(submit=lambda work, contact: work(contact))  # type: ignore[assignment]
-    watch.saw(one)
+    watch.on_sighting(one)
     assert present(watch) == 0
 
 
@@ -141,14 +141,14 @@ def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
     looked: list[str] = []
     watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
     one = sighting(3)
-    watch.saw(one)
+    watch.on_sighting(one)
     watch._pending.clear()
     watch._roster.note(one.uuid.hex(), "problem", problem={"code": "link", "message": "It fell silent."})
-    watch.saw(sighting(3))
+    watch.on_sighting(sighting(3))
     assert len(looked) == 1, "not at once"
     now = time.time() + set_by
     monkeypatch.setattr(link_watch.time, "time", lambda: now)
-    watch.saw(sighting(3))
+    watch.on_sighting(sighting(3))
     assert len(looked) == 2
 
 

@@ -40,7 +40,7 @@ class SealedLine:
     def __init__(self, link: Link, uuid: bytes) -> None:
         self.link = link
         self.session = StationSession(KEY, uuid)
-        counter = self._plain(self.session.ask()).payload
+        counter = self._plain(self.session.request_counter()).payload
         self.session.accept(self._plain(self.session.open(counter)).payload)
         self.digest = hashlib.sha256(self.teds()).digest()[:16]
 
@@ -104,8 +104,8 @@ class MeasuringStation(SealedLine):
                 continue
             if address[:2] != (self.port.spec.source, receiver.plan.subscribe.stream) or address.node != self.address:
                 continue
-            octets = assembly.take(address.segment, frame.data)
-            message = receiver.take(octets, self.now()) if octets is not None else None
+            octets = assembly.add_segment(address.segment, frame.data)
+            message = receiver.open_message(octets, self.now()) if octets is not None else None
             if message is not None:
                 heard.append(message)
         return heard

@@ -16,7 +16,7 @@ PROFILES = [listed.name for listed in list_profiles() if not load_profile(listed
 
 
 def sheet(profile: str) -> Sheet:
-    return Sheet.of(Image(UUID, load_profile(profile).build(UUID).blocks))
+    return Sheet.from_image(Image(UUID, load_profile(profile).build(UUID).blocks))
 
 
 @pytest.mark.parametrize("profile", PROFILES)

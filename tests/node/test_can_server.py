@@ -51,7 +51,7 @@ class Stranger:
         until = time.monotonic() + seconds
         while time.monotonic() < until:
             frame = self.bus.receive(0.01)
-            if frame and pair.take(frame):
+            if frame and pair.handle_frame(frame):
                 self.frames.append(frame)
             pair.run()
             while (message := pair.received()) is not None:
@@ -299,7 +299,7 @@ def test_200_nodes_in_one_process_answer_everyone_and_keep_to_few_threads(hub: H
                 asked = time.monotonic()
                 stranger.everyone("0742000080070000")
             frame = stranger.bus.receive(0.05)
-            if frame is not None and (pair := pairs.get(frame.identifier & 0xFF)) and pair.take(frame):
+            if frame is not None and (pair := pairs.get(frame.identifier & 0xFF)) and pair.handle_frame(frame):
                 while (message := pair.received()) is not None:
                     answers[pair.peer] = message
         assert len(answers) == 200
@@ -372,7 +372,7 @@ def test_a_lost_flow_control_costs_the_next_request_nothing(station: Stranger, s
         if frame is None or frame.identifier != 0x18DAF121:
             continue
         if frame.data[0] >> 4 == 3:
-            pair.take(frame)
+            pair.handle_frame(frame)
         elif frame.data[0] >> 4 == 1:
             break
     assert station.ask(0x21, request) == [b"\x05" + bytes(30)]
@@ -414,7 +414,7 @@ def test_a_question_to_everyone_in_a_station_s_own_name_costs_its_reply_nothing(
             held.append(frame)
             station.everyone("0742000080070000")
             time.sleep(0.1)  # its answer is due after 50 ms
-        pair.take(frame)
+        pair.handle_frame(frame)
         messages += [] if (message := pair.received()) is None else [message]
     assert messages == [b"\x05" + bytes(30)]
 
@@ -444,7 +444,7 @@ def test_a_repetition_that_meets_the_reply_costs_neither(station: Stranger, serv
             continue
         if frame.data[0] >> 4 == 1:
             station.bus.send(Frame(0x18DA21F1, bytes([0x10, len(request)]) + request[:6]))
-        pair.take(frame)
+        pair.handle_frame(frame)
         if (message := pair.received()) is not None:
             messages.append(message)
     assert messages == [b"\x05" + bytes(30)]

@@ -32,7 +32,7 @@ def sheet_of(name: str, tmp_path_factory: pytest.TempPathFactory) -> Sheet:
         path = tmp_path_factory.mktemp("calibration") / "angle.csv"
         path.write_text(CALIBRATIONS[name])
         calibration = load_calibrations(path, profile)
-    return Sheet.of(Image(UUID, profile.build(UUID, calibration=calibration).blocks))
+    return Sheet.from_image(Image(UUID, profile.build(UUID, calibration=calibration).blocks))
 
 
 @pytest.fixture(scope="module", params=["none", *CALIBRATIONS])
@@ -68,7 +68,7 @@ def test_a_turned_scale_gives_the_sample_of_the_same_angle_quickly(zero: float, 
     profile = load_profile("magnetic-angular-position-sensor")
     text = f"# zero-offset: {zero!r}\nraw,value [deg]\n0,0\n16384,360\n"
     calibration = read_calibrations(text, "angle.csv", profile)
-    sheet = Sheet.of(Image(UUID, profile.build(UUID, calibration=calibration).blocks))
+    sheet = Sheet.from_image(Image(UUID, profile.build(UUID, calibration=calibration).blocks))
     converter = Converter(sheet, sheet.channels[0])
     assert converter._table is not None
     back = converter.value(converter.octets(Reading(value=value)))
@@ -85,7 +85,7 @@ def test_raw_numbers_are_rounded_and_kept_within_the_sample(channel: tuple[Sheet
 
 
 def test_floats_carry_si_values() -> None:
-    sheet = Sheet.of(Image(UUID, load_profile("gripper").build(UUID).blocks))
+    sheet = Sheet.from_image(Image(UUID, load_profile("gripper").build(UUID).blocks))
     for each in sheet.channels:
         converter = Converter(sheet, each)
         middle = (converter.low + converter.high) / 2

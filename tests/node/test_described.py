@@ -53,7 +53,7 @@ def test_another_uuid_stands_in_its_meta_teds_too(tmp_path: Path, image: Image) 
     path = tmp_path / "node.json"
     path.write_text(image.to_json())
     made = node_template.create(tmp_path / "node", teds=path, uuid=OTHER)
-    sheet = Sheet.of(Image(OTHER, made.hardware))
+    sheet = Sheet.from_image(Image(OTHER, made.hardware))
     assert (made.load().uuid, sheet.meta.uuid, sheet.errors) == (OTHER, OTHER, ())
 
 
@@ -71,7 +71,7 @@ def test_the_same_command_again_changes_nothing_and_another_is_refused(tmp_path:
 def test_a_profile_gives_its_channels_and_a_random_uuid(tmp_path: Path) -> None:
     made = [node_template.create(tmp_path / name, profile="gripper", name=name) for name in ("left", "right")]
     assert made[0].load().uuid != made[1].load().uuid
-    sheet = Sheet.of(Image(made[0].load().uuid, made[0].hardware))
+    sheet = Sheet.from_image(Image(made[0].load().uuid, made[0].hardware))
     assert sheet.meta.name == "left"
     assert any(channel.actuator for channel in sheet.channels)
 

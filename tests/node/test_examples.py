@@ -21,7 +21,7 @@ UUID = bytes(10)
 
 
 def board(profile: str) -> Board:
-    return Board(Sheet.of(Image(UUID, load_profile(profile).build(UUID).blocks)))
+    return Board(Sheet.from_image(Image(UUID, load_profile(profile).build(UUID).blocks)))
 
 
 def names_in(example: str) -> set[str]:

@@ -184,7 +184,7 @@ def test_an_open_costs_a_slow_node_an_ecdh_and_what_is_left_of_a_key_pair(
     made.commit(replace(made.load(), key=bytes(16), epoch=1))
     slept.clear()
     node, session = VirtualNode(tmp_path / "node", delays=Delays(crypto=0.25)), StationSession(bytes(16), UUID)
-    counter = decode_reply(node.request("nfc", session.ask().encode(), tapped=True)).payload
+    counter = decode_reply(node.request("nfc", session.request_counter().encode(), tapped=True)).payload
     assert slept == [], "asking for c costs nothing"
     session.accept(decode_reply(node.request("nfc", session.open(counter).encode(), tapped=True)).payload)
     pair, ecdh = slept

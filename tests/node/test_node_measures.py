@@ -89,7 +89,7 @@ class Scene:
 
     def sheet(self, name: str) -> Sheet:
         made = keyed_node(self.folder / name)
-        return Sheet.of(Image(made.load().uuid, made.hardware))
+        return Sheet.from_image(Image(made.load().uuid, made.hardware))
 
     def close(self) -> None:
         self._stack.close()
@@ -128,7 +128,7 @@ def test_a_stream_brings_the_source_sample_for_sample(scene: Scene, form: str) -
 
     def missing() -> int:
         """Of twelve messages: a node that a busy machine let wait for too long leaves some out."""
-        receiver, reply = station.subscribe(StreamPlan.of(1, ((1, 2),), n=5, period=4 * MS, gap=100))
+        receiver, reply = station.subscribe(StreamPlan.for_channels(1, ((1, 2),), n=5, period=4 * MS, gap=100))
         messages = station.hear(receiver, 12)
         assert decode_stopped(station.send(stop(1))) >= 12
         assert receiver.counts.bad == 0
@@ -153,7 +153,9 @@ def test_a_classic_bus_takes_a_kilohertz_of_two_streams_and_loses_nothing(scene:
         process = scene.run("angle", can=hub.spec)
         station = scene.station("angle", hub.spec)
         station.operate()
-        receiver, _ = station.subscribe(StreamPlan.of(0, ((1, 2),), n=25, period=1 * MS, gap=300, test_pattern=True))
+        receiver, _ = station.subscribe(
+            StreamPlan.for_channels(0, ((1, 2),), n=25, period=1 * MS, gap=300, test_pattern=True)
+        )
         messages = station.hear(receiver, 40)
         assert all(message.data == receiver.expected(message) for message in messages)
         station.send(idle())
@@ -170,7 +172,7 @@ def test_nothing_of_a_stream_comes_after_the_reply_to_stop(scene: Scene) -> None
     station = scene.station("angle")
     station.operate()
     for _ in range(8):
-        receiver, _ = station.subscribe(StreamPlan.of(0, ((1, 2),), n=5, period=1 * MS, gap=200))
+        receiver, _ = station.subscribe(StreamPlan.for_channels(0, ((1, 2),), n=5, period=1 * MS, gap=200))
         station.hear(receiver, 3)
         station.send(stop(0))
         replied = time.monotonic()
@@ -188,7 +190,9 @@ def test_a_switch_tells_its_events_with_their_times(scene: Scene) -> None:
 
     def wrong() -> list[int]:
         """Ticks from event to event where they are not those of the source: a node that was not run saw them late."""
-        receiver, _ = station.subscribe(StreamPlan.of(2, ((1, 1),), n=1, period=1 * MS, gap=100, kind=StreamKind.EVENT))
+        receiver, _ = station.subscribe(
+            StreamPlan.for_channels(2, ((1, 1),), n=1, period=1 * MS, gap=100, kind=StreamKind.EVENT)
+        )
         events = station.hear(receiver, 4)
         station.send(stop(2))
         assert all(before.data != after.data for before, after in itertools.pairwise(events))
@@ -206,7 +210,7 @@ def test_without_a_sign_of_life_the_lease_silences_the_node(scene: Scene) -> Non
         """Seconds from the last sign of life to the last sample; a lease of one second is over after one."""
         station.operate(lease=1)
         asked = time.monotonic()
-        station.subscribe(StreamPlan.of(0, ((1, 2),), n=1, period=50 * MS, gap=100))
+        station.subscribe(StreamPlan.for_channels(0, ((1, 2),), n=1, period=50 * MS, gap=100))
         began = last = time.monotonic()
         while time.monotonic() - last < 0.6:
             if station.ear.get(0.1) is not None:
@@ -274,7 +278,9 @@ def test_streams_of_two_nodes_start_at_one_trigger(scene: Scene) -> None:
     for station in stations:
         station.operate()
         station.send(token.arm(Action.START, 20).command())
-        receivers.append(station.subscribe(StreamPlan.of(0, ((1, 2),), n=1, period=20 * MS, gap=100, start=WAITS))[0])
+        receivers.append(
+            station.subscribe(StreamPlan.for_channels(0, ((1, 2),), n=1, period=20 * MS, gap=100, start=WAITS))[0]
+        )
     left_at = stations[0].trigger(token.octets)
     starts = []
     for station, receiver in zip(stations, receivers, strict=True):
@@ -311,7 +317,7 @@ def test_a_simulation_brings_its_own_time_and_its_end_is_survived(scene: Scene, 
     degrees = converter.value(sampled.data)
     assert degrees is not None
     assert degrees == pytest.approx(sampled.tick / 1e9 * 10 % 360, abs=6)
-    receiver, _ = station.subscribe(StreamPlan.of(0, ((1, 2),), n=2, period=20 * MS, gap=100))
+    receiver, _ = station.subscribe(StreamPlan.for_channels(0, ((1, 2),), n=2, period=20 * MS, gap=100))
     first, second = station.hear(receiver, 2)
     assert second.tick - first.tick == (second.counter - first.counter) * 40 * MS
     assert first.valid
@@ -351,7 +357,7 @@ def test_values_on_demand_over_nfc_and_a_battery_that_the_field_charges(scene: S
         assert power.current is not None
         assert power.current > 0
         with pytest.raises(NodeRefusedError) as refused:
-            line.send(StreamPlan.of(0, ((1, 2),), n=1, period=50 * MS).command())
+            line.send(StreamPlan.for_channels(0, ((1, 2),), n=1, period=50 * MS).command())
         assert refused.value.reason == 21
         assert line.states().channels[1][1] == 1
     finally:
@@ -422,7 +428,7 @@ def test_two_stations_share_sensors_and_not_an_actuator(scene: Scene) -> None:
     with pytest.raises(NodeRefusedError) as refused:
         second.operate(1, dead_man=10_000)
     assert refused.value.reason == 17
-    plan = StreamPlan.of(0, ((2, 2),), n=2, period=20 * MS, gap=100)
+    plan = StreamPlan.for_channels(0, ((2, 2),), n=2, period=20 * MS, gap=100)
     receivers = [station.subscribe(plan)[0] for station in (first, second)]
     for station, receiver in zip((first, second), receivers, strict=True):
         assert len(station.hear(receiver, 5)) == 5
@@ -462,7 +468,7 @@ def test_hardware_stays_what_the_node_was_made_with(tmp_path: Path) -> None:
     file = tmp_path / "angle.json"
     file.write_text(image.to_json())
     made = keyed_node(tmp_path / "node", teds=file)
-    sheet = Sheet.of(Image(uuid, made.hardware))
+    sheet = Sheet.from_image(Image(uuid, made.hardware))
     assert Converter(sheet, sheet.channels[0]).octets(Reading(value=180.0)) == round(16383 / 2).to_bytes(2, "big")
 
 
@@ -482,7 +488,7 @@ def test_between_two_lines_of_a_simulation_every_sample_is_taken_with_the_value_
     scene.run("angle", "--source", f"exec:{sys.executable} {program}")
     station = scene.station("angle")
     station.operate(lease=60)
-    plan = StreamPlan.of(0, ((1, 2),), n=5, period=100 * MS, gap=100)
+    plan = StreamPlan.for_channels(0, ((1, 2),), n=5, period=100 * MS, gap=100)
     receiver, _ = station.subscribe(plan)
     receiver._oldest = 10**12  # a simulation at seven times real time: the age of its messages says nothing
     station.clock = replace(station.clock, reply=replace(station.clock.reply, step=0xFFFFFFFF))

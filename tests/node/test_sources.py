@@ -134,8 +134,8 @@ def lines(told: list[str], *, needs_time: bool = True) -> tuple[LineSource, Cloc
 def test_lines_set_values_and_drive_the_clock() -> None:
     source, clock = lines([])
     assert clock.own
-    source.take(b'{"t": 0.5, "value": {"angle": 12.5}, "raw": {"force": 4000}}')
-    source.take(b'{"t": 0.75, "value": {"angle": null}}')
+    source.feed_line(b'{"t": 0.5, "value": {"angle": 12.5}, "raw": {"force": 4000}}')
+    source.feed_line(b'{"t": 0.75, "value": {"angle": null}}')
     assert clock.steps == [0.5, 0.75]
     assert source.at(1, 0.0) is None
     assert source.at(2, 0.0) == Reading(raw=4000.0)
@@ -163,40 +163,40 @@ def test_lines_set_values_and_drive_the_clock() -> None:
 def test_a_line_that_is_none_changes_nothing_and_is_counted(line: bytes) -> None:
     told: list[str] = []
     source, clock = lines(told)
-    source.take(b'{"t": 1, "value": {"angle": 1}}')
-    source.take(line)
+    source.feed_line(b'{"t": 1, "value": {"angle": 1}}')
+    source.feed_line(line)
     assert (source.dropped, len(told), clock.seconds) == (1, 1, 1.0)
     assert source.at(1, 1.0) == Reading(value=1.0)
-    source.take(b'{"t": 1, "value": {"angle": 2}}')
+    source.feed_line(b'{"t": 1, "value": {"angle": 2}}')
     assert source.at(1, 1.0) == Reading(value=2.0)
 
 
 @given(st.binary(max_size=60))
 def test_no_octets_stop_the_source(octets: bytes) -> None:
     source, clock = lines([])
-    source.take(octets)
+    source.feed_line(octets)
     assert clock.seconds >= 0
 
 
 def test_the_next_simulation_goes_on_where_the_clock_stands() -> None:
     source, clock = lines([])
-    source.take(b'{"t": 5, "value": {"angle": 1}}')
+    source.feed_line(b'{"t": 5, "value": {"angle": 1}}')
     source.end()
     assert not clock.own
     assert source.at(1, 5.0) is None
     clock.seconds = 8.0  # the host's clock went on
     source.begin(clock)
-    source.take(b'{"t": 0, "value": {"angle": 2}}')
-    source.take(b'{"t": 0.25, "value": {"angle": 3}}')
+    source.feed_line(b'{"t": 0, "value": {"angle": 2}}')
+    source.feed_line(b'{"t": 0.25, "value": {"angle": 3}}')
     assert clock.seconds == 8.25
 
 
 def test_a_program_needs_no_times() -> None:
     source, clock = lines([], needs_time=False)
-    source.take(b'{"value": {"angle": 2}}')
+    source.feed_line(b'{"value": {"angle": 2}}')
     assert source.at(1, 0.0) == Reading(value=2.0)
     assert not clock.own
-    source.take(b'{"t": 3, "value": {"angle": 4}}')
+    source.feed_line(b'{"t": 3, "value": {"angle": 4}}')
     assert clock.own
     assert source.at(1, 0.0) == Reading(value=4.0)
 

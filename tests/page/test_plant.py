@@ -38,7 +38,7 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         south.pins.put(WhitelistEntry(NODE, "cd" * 32, assurance="tap"))
         north.pins.put(WhitelistEntry(NODE, "ab" * 32, assurance="tap"))
         with north.transaction():
-            north.plant.tell("agreed", NODE, fingerprint="ab" * 32, epoch=2, key_id="0123456789abcdef")
+            north.plant.record_event("agreed", NODE, fingerprint="ab" * 32, epoch=2, key_id="0123456789abcdef")
         for station in (south, north):
             plant.sync.sync(station, FolderTransport(stick))
         plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", told=[])

@@ -35,7 +35,7 @@ def test_it_fits_a4_and_tears_no_word_apart(browser: Browser, station: Station, 
     progress = Progress(station.home, read_sheet(station, tmp_path / "boards.csv", BuildOrder(profile="load-cell")))
     for number, row in enumerate(progress.sheet.rows, 1):
         uuid = bytes([number]) * 10
-        progress.take(row, uuid)
+        progress.assign_row(row, uuid)
         why = NodeSilentError(
             "Node 8d4d did not answer on udp_multicast:239.74.163.2?port=43113 within 3 s.", hint="x" * 80
         )

@@ -14,7 +14,7 @@ from teds_provision.plant.transport import CarriedPage, Parcel
 from teds_provision.protocol.keys import PrivateKey, node_key_message, station_key_message
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import LocalState, MergedClaims, view
+from teds_provision.protocol.plant.fold import LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.roster import Member, RemovedMember, Roster, Share, open_roster, seal_roster
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
@@ -148,7 +148,7 @@ class Plant:
             station = self[name]
             with station.transaction():
                 station.plant.tables.put_plant(PlantRecord(REGISTRY))
-                mac = station.seals.note("roster", self.roster_.hash)
+                mac = station.row_macs.note("roster", self.roster_.hash)
                 station.plant.tables.put_roster(
                     RosterRow(self.roster_.version, self.roster_.hash, octets, True, utc_now(), mac)
                 )
@@ -176,10 +176,10 @@ class Plant:
                 for _, _, text in station.plant.tables.outbox(10_000):
                     told = event.read(json.loads(text))
                     if isinstance(told, event.Event) and told.uuid == uuid:
-                        claims.setdefault(station.fingerprint, Claim()).take(told)
+                        claims.setdefault(station.fingerprint, Claim()).apply_event(told)
             own = self[name]
             pin = own.pins.pinned(uuid)
-            return view(self.roster_, claims, LocalState(own.fingerprint, pin, "tap" if pin else "", bool(pin)))
+            return merge_claims(self.roster_, claims, LocalState(own.fingerprint, pin, "tap" if pin else "", bool(pin)))
 
         return lambda uuids: {uuid: see(uuid) for uuid in uuids}
 
@@ -193,10 +193,10 @@ def keyed(station: Station, board: Board) -> None:
         who = identify(station, node)
         agree(station, node, who, newcomer=WhitelistEntry(node.uuid, who.fingerprint, utc_now(), "tap", None))
     told = {"fingerprint": who.fingerprint}
-    keys = station.keys.of(board.uuid)
+    keys = station.keys.keys_of(board.uuid)
     with station.transaction():
-        station.plant.tell("pinned", board.uuid, assurance="tap", **told)
-        station.plant.tell("agreed", board.uuid, epoch=keys[-1].epoch, key_id=keys[-1].key_id, **told)
+        station.plant.record_event("pinned", board.uuid, assurance="tap", **told)
+        station.plant.record_event("agreed", board.uuid, epoch=keys[-1].epoch, key_id=keys[-1].key_id, **told)
 
 
 def board_of(station: Station, uuid: bytes) -> Board:

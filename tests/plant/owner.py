@@ -51,7 +51,7 @@ def join(station: Station, roster: Roster) -> None:
     station.unlock()
     with station.transaction():
         station.plant.tables.put_plant(PlantRecord(REGISTRY))
-        mac = station.seals.note("roster", roster.hash)
+        mac = station.row_macs.note("roster", roster.hash)
         station.plant.tables.put_roster(RosterRow(roster.version, roster.hash, roster.octets, True, "", mac))
 
 

@@ -13,7 +13,7 @@ from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_m
 from teds_provision.protocol.plant import event
 from teds_provision.protocol.plant.chain import CountedPages, counting
 from teds_provision.protocol.plant.claim import Claim
-from teds_provision.protocol.plant.fold import BanStatement, LocalState, MergedClaims, view
+from teds_provision.protocol.plant.fold import BanStatement, LocalState, MergedClaims, merge_claims
 from teds_provision.protocol.plant.page import Page, PageDraft, open_page, seal_page
 from teds_provision.protocol.plant.roster import Member, Place, RemovedMember, Roster, open_roster, seal_roster
 from teds_provision.protocol.plant.signer import SignatureClaim, SignerVerdict, signing
@@ -123,12 +123,12 @@ class Reader:
         elif one.act == "lifted":
             self.liftings.setdefault(one.members["of"], set()).add(station)
         elif one.uuid is not None:
-            self.claims.setdefault(one.uuid, {}).setdefault(station, Claim()).take(one)
+            self.claims.setdefault(one.uuid, {}).setdefault(station, Claim()).apply_event(one)
 
     def view(self, uuid: bytes, own: LocalState | None = None) -> MergedClaims:
         own = own or LocalState("f" * 64)
         claims, said = self.claims.get(uuid, {}), self.statements.get(uuid, [])
-        return view(self.roster, claims, own, said, self.liftings)
+        return merge_claims(self.roster, claims, own, said, self.liftings)
 
     def signing(self, signer: str, digest: str) -> SignerVerdict:
         behind = any(

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import files
-from teds_provision.plant.apply_pages import heads_digest, views
+from teds_provision.plant.apply_pages import heads_digest, merged_views
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import sync
 from teds_provision.station.station import Station
@@ -94,7 +94,7 @@ def carried_on(folder: Path) -> list[object]:
         assert station.plant.tables.alarms() == []
         assert station.plant.tables.unsent(station.fingerprint) == 0
         assert station.plant.tables.to_judge(1) == []
-        said = views(station, roster, NODES)
+        said = merged_views(station, roster, NODES)
         seen.append((heads_digest(station)[1], {uuid: sorted(view.pins.values()) for uuid, view in said.items()}))
         entry = station.pins.entry(NODES[0])
         assert entry is not None

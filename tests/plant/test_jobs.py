@@ -37,7 +37,7 @@ from teds_provision.protocol.plant.job import CalibrationRule, Job, open_job, re
 from teds_provision.station.station import Station
 from teds_provision.steps.board_type import WrongBoardError
 from teds_provision.steps.build import BuildOrder, PreparedOrder, prepare
-from teds_provision.steps.provision import ProvisionResult, inspect, provision
+from teds_provision.steps.provision import ProvisionResult, provision, verify_only
 from teds_provision.store.tables.parcels import ParcelRow
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.profile.load import find_profile
@@ -374,7 +374,7 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
     tester.unlock()
     for attempt in (1, 2):
         with talk(one) as node:
-            done = inspect(tester, node, tests, SilentReporter())
+            done = verify_only(tester, node, tests, SilentReporter())
         assert done.verified.verdict == "authentic"
         assert tests.unit_to_json(one.uuid)["attempt"] == attempt
     assert one.state == before
@@ -387,12 +387,12 @@ def test_a_second_station_tests_what_another_one_made(tmp_path: Path) -> None:
         order = BuildOrder(profile="tactile-finger-sensor")
         provision(plant.north, node, order, accept=lambda who: None, reporter=SilentReporter())
     with talk(other) as node, pytest.raises(WrongBoardError):
-        inspect(tester, node, tests, SilentReporter())
+        verify_only(tester, node, tests, SilentReporter())
     tampered = {**one.state.blocks, (0, 12): one.state.blocks[0, 12][:-3] + b"\0\0\0"}
     one.flash.state = replace(one.state, blocks=tampered)
     one.power_on()
     with talk(one) as node:
-        assert inspect(tester, node, tests, SilentReporter()).verified.verdict == "not authentic"
+        assert verify_only(tester, node, tests, SilentReporter()).verified.verdict == "not authentic"
     last = codec.read(list(tester.plant.line.evidence(uuid=one.uuid))[-1].document)
     assert (last.verdict, last.facts.failure) == ("failed", "not-authentic")
     assert codec.faults(last, plant.north.identity.ca) == []
@@ -405,7 +405,7 @@ def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> No
     line.scans = Scans([])
     with pytest.raises(PolicyError, match="Scan the label"):
         build(line, one)
-    line.scans.take(f"TEDS1:{one.uuid.hex()}:{fingerprint(one.key.point)}")
+    line.scans.add_label(f"TEDS1:{one.uuid.hex()}:{fingerprint(one.key.point)}")
     with pytest.raises(WrongBoardError, match="label"):
         build(line, two)
     assert units(line) == []
@@ -415,7 +415,7 @@ def test_a_scan_says_which_board_must_come(owner: Station, tmp_path: Path) -> No
     assert line.unit_to_json(one.uuid)["label"] == str(label)
     with pytest.raises(PolicyError, match="Scan the label"):
         build(line, one)
-    line.scans.take(one.uuid.hex())
+    line.scans.add_label(one.uuid.hex())
     build(line, one)
     said: list[str] = []
     Scans(["nonsense\n", "\n"], said.append).listen()
@@ -441,7 +441,7 @@ def test_a_stolen_stations_evidence_does_not_hold_beside_a_roster(tmp_path: Path
     assert faults() == []
     plant.change(owning.with_roles(plant.north, "west", frozenset({"audit"}), (0, "")))
     assert "its station has no role for working on boards" in faults()
-    plant.change(owning.without(plant.north, "west", "stolen", 0))
+    plant.change(owning.draft_removal(plant.north, "west", "stolen", 0))
     assert "its station was removed: stolen" in faults()
     plant.close()
 

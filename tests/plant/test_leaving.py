@@ -46,7 +46,7 @@ class Scene:
 
     def remove(self, station: Station, why: Why) -> None:
         last = self.north.plant.tables.chain(station.fingerprint).counted[0]
-        self.plant.change(plant.owner.without(self.north, station.identity.name, why, last))
+        self.plant.change(plant.owner.draft_removal(self.north, station.identity.name, why, last))
         self.sync(self.north)
 
     def marks(self, station: Station) -> list[bytes]:
@@ -73,11 +73,11 @@ def test_who_made_a_key_that_a_thief_has_rotates_it_at_the_next_contact(scene: S
     scene.sync(scene.north, scene.south, scene.north)
     scene.remove(scene.south, "stolen")
     assert scene.marks(scene.north) == [board.uuid]
-    assert removed_members.due(scene.north) == 1
-    before = scene.north.keys.of(board.uuid)[-1].epoch
+    assert removed_members.rotations_due(scene.north) == 1
+    before = scene.north.keys.keys_of(board.uuid)[-1].epoch
     with talk(board) as node:
         session_if_keyed(scene.north, node)
-    assert scene.north.keys.of(board.uuid)[-1].epoch == before + 1
+    assert scene.north.keys.keys_of(board.uuid)[-1].epoch == before + 1
     scene.sync(scene.north)
     assert scene.marks(scene.north) == []
     scene.sync(scene.west)
@@ -111,7 +111,7 @@ def test_a_retired_one_that_forgot_has_no_key_any_more(scene: Scene) -> None:
     kept, forgotten = (board_of(scene.north, os.urandom(10)).uuid for _ in range(2))
     scene.sync(scene.north, scene.south, scene.north)
     with scene.south.transaction():
-        scene.south.plant.tell("forgot", forgotten, epoch=1)
+        scene.south.plant.record_event("forgot", forgotten, epoch=1)
     scene.sync(scene.south, scene.north)
     scene.remove(scene.south, "retired")
     assert scene.marks(scene.north) == [kept]
@@ -121,7 +121,7 @@ def test_a_stolen_one_that_says_it_forgot_is_not_believed(scene: Scene) -> None:
     uuid = board_of(scene.north, os.urandom(10)).uuid
     scene.sync(scene.north, scene.south, scene.north)
     with scene.south.transaction():
-        scene.south.plant.tell("forgot", uuid, epoch=1)
+        scene.south.plant.record_event("forgot", uuid, epoch=1)
     scene.sync(scene.south, scene.north)
     scene.remove(scene.south, "stolen")
     assert scene.marks(scene.north) == [uuid]
@@ -130,22 +130,22 @@ def test_a_stolen_one_that_says_it_forgot_is_not_believed(scene: Scene) -> None:
 def test_a_key_that_a_thief_names_on_another_history_is_rotated_too(scene: Scene, tmp_path: Path) -> None:
     """The roster's ``last`` is page 2 of one branch; the copy said on its own page 2 that it had the key."""
     board = board_of(scene.north, os.urandom(10))
-    (key,) = scene.north.keys.of(board.uuid)
+    (key,) = scene.north.keys.keys_of(board.uuid)
     scene.plant.change(plant.owner.unshared(scene.north, ("all", "")))
     scene.sync(scene.north, scene.west)
     with scene.west.transaction():
-        scene.west.plant.tell("named", bytes(10), name="one")
+        scene.west.plant.record_event("named", bytes(10), name="one")
     scene.sync(scene.west)
     shutil.copytree(scene.west.home, tmp_path / "copy")
     copy = Station.open(tmp_path / "copy", ask=ask)
     other = tmp_path / "other stick"
     other.mkdir()
     with copy.transaction():
-        copy.plant.tell("agreed", board.uuid, fingerprint="ab" * 32, epoch=key.epoch, key_id=key.key_id)
+        copy.plant.record_event("agreed", board.uuid, fingerprint="ab" * 32, epoch=key.epoch, key_id=key.key_id)
     scene.plant.sync(copy, other)
     copy.close()
     with scene.west.transaction():
-        scene.west.plant.tell("named", bytes(10), name="two")
+        scene.west.plant.record_event("named", bytes(10), name="two")
     scene.sync(scene.west, scene.north)
     scene.plant.sync(scene.north, other)
     branch = scene.west.plant.tables.chain(scene.west.fingerprint).counted[1]
@@ -162,12 +162,12 @@ def test_what_only_the_lost_one_held_is_counted_as_a_tap(scene: Scene) -> None:
     scene.remove(scene.west, "lost")
     review = removed_members.last(scene.north)
     assert review is not None
-    assert (review.alone, removed_members.due(scene.north)) == (1, 0)
+    assert (review.alone, removed_members.rotations_due(scene.north)) == (1, 0)
 
 
 def test_nobody_left_and_nothing_is_due(scene: Scene) -> None:
     scene.keyed_by(scene.west)
-    assert (removed_members.last(scene.north), removed_members.due(scene.west)) == (None, 0)
+    assert (removed_members.last(scene.north), removed_members.rotations_due(scene.west)) == (None, 0)
 
 
 @pytest.mark.parametrize(("why", "cut"), [("stolen", True), ("lost", False), ("retired", False)])
@@ -193,7 +193,7 @@ def test_a_key_that_was_due_for_somebody_else_is_cut_off_when_one_is_stolen(scen
     scene.plant.change(plant.owner.unshared(scene.north, ("all", "")))
     scene.plant.change(plant.owner.shared(scene.north, Share(("all", ""), to)))
     scene.sync(scene.north, scene.west, scene.south, scene.north, scene.west, scene.south, scene.north)
-    assert scene.north.keys.of(uuid)
+    assert scene.north.keys.keys_of(uuid)
     scene.remove(scene.west, "lost")
     later(scene.north, 25)
     assert scene.north.keys.stolen(uuid) is None

@@ -21,7 +21,7 @@ from teds_provision.plant.jobs import take_job
 from teds_provision.plant.line import LineRun
 from teds_provision.plant.office import MOST_ANSWERS, answer
 from teds_provision.plant.sign_requests import OfficeRefusedError, OfficeSilentError, RemoteOffice, send
-from teds_provision.plant.yield_stats import attempts_of, yields
+from teds_provision.plant.yield_stats import attempts_of, yield_stats
 from teds_provision.protocol.keys import SoftwareKey, node_key_message, prove_message
 from teds_provision.protocol.plant import evidence as codec
 from teds_provision.protocol.plant.job import CalibrationRule, Job
@@ -180,16 +180,16 @@ def test_an_office_counts_the_boards_that_it_signed_before_their_line_reports(de
     run, one = desk.run(), board(1)
     build(run, one)
     assert run.job is not None
-    (part,) = yields(desk.office, run.job, attempts_of(desk.office, run.job.id))
+    (part,) = yield_stats(desk.office, run.job, attempts_of(desk.office, run.job.id))
     assert (part.station, part.units, part.passed, part.failures) == (desk.line.fingerprint, 1, 0, {})
     desk.plant.round()
-    (part,) = yields(desk.office, run.job, attempts_of(desk.office, run.job.id))
+    (part,) = yield_stats(desk.office, run.job, attempts_of(desk.office, run.job.id))
     assert (part.units, part.passed, part.attempts) == (1, 1, 1)
     (row,) = desk.line.plant.line.evidence(uuid=one.uuid)
     build(run, board(2))
     desk.plant.round()
     found = attempts_of(desk.office, run.job.id, [row.document])
-    (part,) = yields(desk.office, run.job, found)
+    (part,) = yield_stats(desk.office, run.job, found)
     assert (part.units, part.passed, part.attempts) == (2, 2, 2), "one by its evidence, the other by its page"
 
 
@@ -292,7 +292,7 @@ def test_a_stolen_line_gets_nothing_after_its_removal(desk: Desk) -> None:
     run, one = desk.run(), board(1)
     request = desk.request(run, one)
     assert desk.asks(request).security
-    desk.plant.change(plant.owner.without(desk.office, "west", "stolen", 0))
+    desk.plant.change(plant.owner.draft_removal(desk.office, "west", "stolen", 0))
     assert desk.asks(request).refused == "not-line", "not even what was answered before"
 
 

@@ -30,7 +30,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
 
 
 def test_who_joined_no_registry_tells_nothing(station: Station) -> None:
-    station.plant.tell("named", UUID, name="grip")
+    station.plant.record_event("named", UUID, name="grip")
     assert station.plant.tables.unsent(station.fingerprint) == 0
 
 
@@ -39,14 +39,14 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
 
     def fails() -> None:
         with station.transaction():
-            station.plant.tell("named", UUID, name="grip")
+            station.plant.record_event("named", UUID, name="grip")
             raise KeyError
 
     with pytest.raises(KeyError):
         fails()
     assert station.plant.tables.unsent(station.fingerprint) == 0
     with station.transaction():
-        station.plant.tell("named", UUID, name="grip")
+        station.plant.record_event("named", UUID, name="grip")
     ((_, name, text),) = station.plant.tables.outbox(10)
     told = json.loads(text)
     assert (told["id"], told["act"], told["name"]) == (name, "named", "grip")
@@ -55,7 +55,7 @@ def test_an_event_shares_the_fate_of_its_act(station: Station) -> None:
 
 def test_who_left_tells_nothing_any_more(station: Station) -> None:
     station.plant.tables.put_plant(PlantRecord(REGISTRY, left="2026-01-31T12:00:00Z"))
-    station.plant.tell("named", UUID, name="grip")
+    station.plant.record_event("named", UUID, name="grip")
     assert station.plant.tables.unsent(station.fingerprint) == 0
 
 

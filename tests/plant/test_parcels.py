@@ -47,7 +47,7 @@ def sync(plant: Plant, *names: str, at: datetime | None = None) -> None:
 
 
 def holds(station: Station, uuid: bytes) -> list[tuple[int, str]]:
-    return [(key.epoch, key.source) for key in station.keys.of(uuid)]
+    return [(key.epoch, key.source) for key in station.keys.keys_of(uuid)]
 
 
 def waits(station: Station) -> list[str]:
@@ -82,7 +82,7 @@ def test_a_group_is_the_senders_own_or_a_keepers(plant: Plant) -> None:
     own, keepers, strangers = (board_of(plant["west"], os.urandom(10)) for _ in range(3))
     for name, board in (("west", own), ("north", keepers), ("south", strangers)):
         with plant[name].transaction():
-            plant[name].plant.tell("grouped", board.uuid, group="cell 3", member=True)
+            plant[name].plant.record_event("grouped", board.uuid, group="cell 3", member=True)
     sync(plant, "west", "south")
     assert [bool(holds(plant["south"], board.uuid)) for board in (own, keepers, strangers)] == [True, True, False]
 
@@ -213,7 +213,7 @@ def test_a_node_on_which_keepers_do_not_agree_waits_and_holds_up_no_other(plant:
     clear, disputed = (board_of(plant["west"], os.urandom(10)) for _ in range(2))
     for name, key in (("north", "aa"), ("south", "bb")):
         with plant[name].transaction():
-            plant[name].plant.tell("pinned", disputed.uuid, fingerprint=key * 32, assurance="tap")
+            plant[name].plant.record_event("pinned", disputed.uuid, fingerprint=key * 32, assurance="tap")
     sync(plant, "west", "south")
     assert holds(plant["south"], clear.uuid)
     assert holds(plant["south"], disputed.uuid) == []
@@ -328,7 +328,7 @@ def test_another_holder_shares_for_a_maker_that_was_removed(plant: Plant) -> Non
     board = board_of(plant["west"], os.urandom(10))
     sync(plant, "west", "north", "west")
     north = plant["north"]
-    [key] = north.keys.of(board.uuid)
+    [key] = north.keys.keys_of(board.uuid)
     north._store.activate_key(board.uuid, key.key_id)  # proven in a session
     plant.roster({"north": "base", "south": "base"}, everything(plant, "south"), removed={"west": (1, "ab" * 32)})
     sync(plant, "north")

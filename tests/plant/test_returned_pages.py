@@ -43,11 +43,11 @@ class Loss(Office):
     def write(self, station: Station) -> None:
         """Have the station say something with its next page."""
         with station.transaction():
-            station.plant.tell("named", os.urandom(10), name="a board")
+            station.plant.record_event("named", os.urandom(10), name="a board")
 
     def remove(self, station: Station, why: Why = "stolen") -> None:
         last = self.north.plant.tables.chain(station.fingerprint).counted[0]
-        self.plant.change(plant_room.owner.without(self.north, station.identity.name, why, last))
+        self.plant.change(plant_room.owner.draft_removal(self.north, station.identity.name, why, last))
         self.sync(self.north)
         self.database.sql(close_sql(station.fingerprint))
         self.sync(self.south)
@@ -97,7 +97,7 @@ def test_a_datasheet_of_a_removed_signer_is_judged_by_a_station_that_joins_after
     west = loss.leaver("line", "sign")
     signed = os.urandom(32)
     with west.transaction():
-        west.plant.tell("signed", os.urandom(10), epoch=1, sequence=1, teds_sha256=signed.hex())
+        west.plant.record_event("signed", os.urandom(10), epoch=1, sequence=1, teds_sha256=signed.hex())
     loss.sync(west, loss.north, loss.south)
     loss.remove(west)
     loss.lose(loss.north, loss.south)

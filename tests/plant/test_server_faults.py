@@ -55,7 +55,7 @@ def survived(office: Office, cluster: Cluster, *steps: int) -> int:
         for station in (office.north, south, office.north):
             reached += died(office, cluster, station, step)
         office.sync(office.north, south, office.north, south)
-        assert [key.epoch for key in south.keys.of(board.uuid)] == [1], step
+        assert [key.epoch for key in south.keys.keys_of(board.uuid)] == [1], step
         assert office.database.sql("select count(*) from registry.parcel") == [["0"]], step
         assert office.database.sql("select count(*) = max(n) from registry.page group by station") == [["t"], ["t"]]
         assert office.database.sql("select count(distinct jws) from registry.roster") == [["1"]], step

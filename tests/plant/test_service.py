@@ -47,7 +47,7 @@ def by_url(office: Office, station: Station) -> Station:
 
 
 def synced(station: Station) -> None:
-    post = connecting.post_of(station)
+    post = connecting.open_transport(station)
     assert post is not None
     sync(station, post)
     post.close()
@@ -118,7 +118,7 @@ def test_a_removed_station_is_told_so_once_and_goes_on_by_itself(office: Office)
     from teds_provision import plant
 
     south = by_url(office, office.plant.stations[1])
-    office.plant.change(plant.owner.without(office.north, "south", "retired", None))
+    office.plant.change(plant.owner.draft_removal(office.north, "south", "retired", None))
     office.sync(office.north)
     watch, told, _ = watching(south)
     watch.start()

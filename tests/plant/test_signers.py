@@ -12,7 +12,7 @@ from teds_provision.errors import PolicyError, UnprovenError
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
-from teds_provision.steps.verify import Verification, remember, require_authentic, verify_image, verify_images
+from teds_provision.steps.verify import Verification, require_authentic, snapshot_trust, verify_image, verify_images
 from teds_provision.talk.progress import SilentReporter
 from teds_provision.teds.image import Image
 from tests.bench import Board, talk
@@ -43,7 +43,7 @@ def judged(station: Station, image: Image) -> Verification:
 def verdict(station: Station, image: Image) -> str:
     """The verdict of a station, and of what it remembered for many files, which must be the same."""
     alone = judged(station, image)
-    (together,) = verify_images(remember(station), [image])
+    (together,) = verify_images(snapshot_trust(station), [image])
     assert tuple(together) == alone.checks
     return alone.verdict
 
@@ -61,7 +61,7 @@ def test_a_stolen_lines_datasheets_count_up_to_its_last_page_and_none_after(plan
     after = made_by(west, Board(bytes([7] * 10)))
     plants.round()
     assert verdict(south, after) == "authentic"
-    plants.change(plant.owner.without(plants.north, "west", "stolen", last))
+    plants.change(plant.owner.draft_removal(plants.north, "west", "stolen", last))
     plants.sync(plants.north)
     plants.sync(south)
     assert (verdict(south, before), verdict(south, after)) == ("authentic", "not authentic")
@@ -73,7 +73,7 @@ def test_a_removal_without_the_pages_proves_nothing_until_they_come(plants: Plan
     image = made_by(west, Board())
     plants.sync(west)
     plants.sync(plants.north)
-    plants.change(plant.owner.without(plants.north, "west", "lost", newest(plants, west)))
+    plants.change(plant.owner.draft_removal(plants.north, "west", "lost", newest(plants, west)))
     held = plants.north.plant.roster
     assert held is not None
     plant.apply_pages.take_rosters(south, [held.octets])
@@ -131,7 +131,7 @@ def test_a_store_of_today_joins_its_owner_retires_it_and_its_datasheets_stay(pla
     plant.owner.join(west, plants.north.plant.roster, url=None, told=told)
     plants.stations.append(west)
     plants.round()
-    plants.change(plant.owner.without(plants.north, "west", "retired", None))
+    plants.change(plant.owner.draft_removal(plants.north, "west", "retired", None))
     plants.sync(plants.north)
     assert verdict(plants.north, image) == "authentic"
 

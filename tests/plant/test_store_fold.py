@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision import plant
-from teds_provision.plant.apply_pages import apply_claims, put_roster, recount, take_pages, views
+from teds_provision.plant.apply_pages import apply_claims, merged_views, put_roster, recount, take_pages
 from teds_provision.protocol.plant.page import open_page
 from teds_provision.protocol.plant.roster import Roster, open_roster, seal_roster
 from teds_provision.station.station import Station
@@ -31,7 +31,7 @@ def held(station: Station, roster: Roster, monkeypatch: pytest.MonkeyPatch) -> N
     from teds_provision.store.tables.plant import PlantRecord
 
     monkeypatch.setattr(type(station.identity), "ca", property(lambda self: CA.point))
-    station.plant.tables.put_plant(PlantRecord(REGISTRY, mac=station.seals.note("plant", REGISTRY)))
+    station.plant.tables.put_plant(PlantRecord(REGISTRY, mac=station.row_macs.note("plant", REGISTRY)))
     put_roster(station, open_roster(seal_roster(roster, CA), CA.point))
 
 
@@ -65,7 +65,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     roster = station.plant.roster
     assert roster is not None
     oracle = Reader(roster, [octets for one in speakers for octets in one.pages])
-    seen = views(station, roster, NODES)
+    seen = merged_views(station, roster, NODES)
     from teds_provision.protocol.plant.fold import LocalState
 
     for uuid in NODES:
@@ -83,7 +83,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
             assert found == oracle.signing(one.fingerprint, digest)
     for one in speakers:  # said anew, nothing changes
         recount(station, station.plant.tables.chain(one.fingerprint), roster)
-    assert views(station, roster, NODES) == seen
+    assert merged_views(station, roster, NODES) == seen
     assert plant.apply_pages.heads_digest(station)[1] == sum(
         counts.newest[0] > 0 for counts in oracle.counting.values()
     )

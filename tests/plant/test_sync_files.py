@@ -13,7 +13,7 @@ import pytest
 
 from teds_provision import plant
 from teds_provision.errors import ForkError, LinkError, NotMemberError, PolicyError, StoreLockedError
-from teds_provision.plant.apply_pages import heads_digest, views
+from teds_provision.plant.apply_pages import heads_digest, merged_views
 from teds_provision.plant.folder_transport import FolderTransport
 from teds_provision.plant.sync import resume
 from teds_provision.protocol.plant.document import hash_of
@@ -50,7 +50,7 @@ def test_what_one_station_says_reaches_all_and_all_see_the_same(plants: Plant) -
     for station in (plants.north, south):
         roster = station.plant.roster
         assert roster is not None
-        assert views(station, roster, [UUID])[UUID].pins == {west.fingerprint: KEY}
+        assert merged_views(station, roster, [UUID])[UUID].pins == {west.fingerprint: KEY}
         assert not alarms(station)
 
 
@@ -88,7 +88,9 @@ def test_a_removed_station_hears_of_it_and_is_asked_for_nothing_more(plants: Pla
     west = plants.member("west", "line", "sign")
     plants.round()
     plants.change(
-        plant.owner.without(plants.north, "west", "lost", plants.north.plant.tables.chain(west.fingerprint).counted[0])
+        plant.owner.draft_removal(
+            plants.north, "west", "lost", plants.north.plant.tables.chain(west.fingerprint).counted[0]
+        )
     )
     plants.sync(plants.north)
     with pytest.raises(NotMemberError, match="removed"):
@@ -144,7 +146,7 @@ def test_a_copy_of_a_home_at_work_finds_itself_out(plants: Plant) -> None:
     plants.sync(plants.north)
     roster = plants.north.plant.roster
     assert roster is not None
-    said = views(plants.north, roster, [bytes(10), bytes([1] * 10)])
+    said = merged_views(plants.north, roster, [bytes(10), bytes([1] * 10)])
     assert all(view.pins for view in said.values())
     assert "two-histories" not in alarms(plants.north)
     west.close()
@@ -171,7 +173,7 @@ def test_two_histories_on_two_sticks_are_found_where_they_meet(plants: Plant) ->
     assert chain.counted[0] == 1, "the part that both share goes on counting"
     roster = plants.north.plant.roster
     assert roster is not None
-    seen = views(plants.north, roster, [UUID, bytes([1] * 10)])
+    seen = merged_views(plants.north, roster, [UUID, bytes([1] * 10)])
     assert seen[UUID].pins
     assert not seen[bytes([1] * 10)].pins
     west.close()

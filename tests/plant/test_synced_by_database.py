@@ -111,7 +111,7 @@ def test_a_shared_key_arrives_and_its_receipt_returns(office: Office) -> None:
     board = board_of(office.north, os.urandom(10))
     office.sync(office.north)
     assert office.sync(south).parcels_in == 1
-    assert [key.epoch for key in south.keys.of(board.uuid)] == [1]
+    assert [key.epoch for key in south.keys.keys_of(board.uuid)] == [1]
     assert office.sync(office.north).parcels_in == 1
     assert office.database.sql("select count(*) from registry.parcel") == [["0"]]
     assert plant_room.parcels.waiting_out(office.north) == 0
@@ -190,7 +190,7 @@ def test_a_sync_that_is_cut_anywhere_is_followed_by_the_same_sync(office: Office
                 way.cut_after = 0
                 post.close()
     office.sync(office.north, south, office.north)
-    assert [key.epoch for key in south.keys.of(board.uuid)] == [1]
+    assert [key.epoch for key in south.keys.keys_of(board.uuid)] == [1]
     assert office.database.sql("select count(*) from registry.parcel") == [["0"]]
     assert office.database.sql("select count(*) = max(n) from registry.page group by station") == [["t"], ["t"]]
 
@@ -210,7 +210,7 @@ def test_what_the_database_allows_too_much_is_kept_for_the_status(office: Office
     west, post = office.member("west", "line"), office.post(office.north)
     office.sync(office.north, west)
     assert plant_room.connecting.check_database(office.north, post) == []
-    office.plant.change(plant_room.owner.without(office.north, "west", "stolen", 0))
+    office.plant.change(plant_room.owner.draft_removal(office.north, "west", "stolen", 0))
     assert plant_room.connecting.check_database(office.north, post) == ["login of west, which was removed"]
     shown = call(office.north.home, "--json", "registry", "status").json
     assert shown["open_doors"] == ["login of west, which was removed"]

@@ -88,7 +88,7 @@ class Desk:
     def open(self, *, link: str = "nfc") -> Desk:
         """Open a session on a link."""
         self.session = StationSession(self.key, UUID)
-        counter = self.plain(self.session.ask(), link=link, tapped=link == "nfc")
+        counter = self.plain(self.session.request_counter(), link=link, tapped=link == "nfc")
         reply = self.plain(self.session.open(counter.payload), link=link, tapped=link == "nfc")
         assert reply.ok, f"Open refused: {reply.reason}"
         self.session.accept(reply.payload)

@@ -58,7 +58,7 @@ def test_the_first_announce_waits_up_to_half_a_second_and_leaves_once() -> None:
 
 def test_the_smaller_crc_stays_and_announces_again() -> None:
     claim = AddressClaim(5, uniform=lambda low, high: high)
-    assert claim.take(Announce(33, 0, 6), 33, 1.0) == 33
+    assert claim.handle_announce(Announce(33, 0, 6), 33, 1.0) == 33
     assert claim.due(1.0) == 1.05
 
 
@@ -66,46 +66,46 @@ def test_the_greater_crc_moves_to_the_next_address_that_it_has_not_heard() -> No
     claim = AddressClaim(6, uniform=soon)
     for source in (239, 1, 3):
         claim.hear(source)
-    assert claim.take(Announce(238, 0, 5), 238, 1.0) == 2
+    assert claim.handle_announce(Announce(238, 0, 5), 238, 1.0) == 2
     assert claim.due(1.0) == 1.0
 
 
 def test_with_an_actuator_claimed_it_stays_and_announces() -> None:
     claim = AddressClaim(6, uniform=soon)
-    assert claim.take(Announce(33, 0, 5), 33, 1.0, pinned=True) == 33
+    assert claim.handle_announce(Announce(33, 0, 5), 33, 1.0, pinned=True) == 33
     assert claim.due(1.0) == 1.0
 
 
 def test_other_addresses_and_equal_crcs_move_nobody() -> None:
     claim = AddressClaim(6, uniform=soon)
-    assert claim.take(Announce(34, 0, 5), 33, 1.0) == 33
+    assert claim.handle_announce(Announce(34, 0, 5), 33, 1.0) == 33
     assert not claim.conflict
-    assert claim.take(Announce(33, 0, 6), 33, 1.0) == 33
+    assert claim.handle_announce(Announce(33, 0, 6), 33, 1.0) == 33
     assert claim.conflict
     assert claim.due(1.0) is None
 
 
 def test_an_address_from_which_an_announce_came_is_taken() -> None:
     claim = AddressClaim(6, uniform=soon)
-    claim.take(Announce(34, 0, 5), 33, 1.0)
-    assert claim.take(Announce(33, 0, 5), 33, 1.0) == 35
+    claim.handle_announce(Announce(34, 0, 5), 33, 1.0)
+    assert claim.handle_announce(Announce(33, 0, 5), 33, 1.0) == 35
 
 
 def test_at_most_twenty_announces_a_minute() -> None:
     claim, left = AddressClaim(5, uniform=soon), 0
     for attempt in range(100):
-        claim.take(Announce(33, 0, 6), 33, attempt * 0.1)
+        claim.handle_announce(Announce(33, 0, 6), 33, attempt * 0.1)
         if claim.due(attempt * 0.1) is not None:
             claim.announced(attempt * 0.1)
             left += 1
     assert left == MOST_A_MINUTE
-    claim.take(Announce(33, 0, 6), 33, 60.05)
+    claim.handle_announce(Announce(33, 0, 6), 33, 60.05)
     assert claim.due(60.05) == 60.05
 
 
 def forge(claim: AddressClaim, own: int, now: float) -> int:
     """Return the address after an Announce of a smaller CRC from the node's own address."""
-    return claim.take(Announce(own, 0, 1), own, now)
+    return claim.handle_announce(Announce(own, 0, 1), own, now)
 
 
 def test_forged_announces_move_a_node_less_and_less() -> None:
@@ -165,7 +165,7 @@ def bus_of(nodes: int, seed: int, addresses: int = LAST_ADDRESS) -> list[int]:
         announce = Announce(at[speaker], 0, crcs[speaker])
         for index, claim in enumerate(claims):
             if index != speaker:
-                at[index] = claim.take(announce, at[index], now)
+                at[index] = claim.handle_announce(announce, at[index], now)
     return at
 
 

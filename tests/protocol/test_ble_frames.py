@@ -17,7 +17,7 @@ def test_a_piece_has_at_most_what_an_attribute_value_holds(mtu: int, octets: int
 @given(st.integers(0, 0xFFFF), st.binary(max_size=4094), st.integers(23, 517))
 def test_messages_are_cut_and_put_together(transaction: int, message: bytes, mtu: int) -> None:
     frames, assembly = list(cut(transaction, message, mtu)), BleAssembly(4094)
-    assert [assembly.take(frame) for frame in frames] == [None] * (len(frames) - 1) + [
+    assert [assembly.add_frame(frame) for frame in frames] == [None] * (len(frames) - 1) + [
         ReceivedMessage(transaction, message)
     ]
     assert all(len(frame) <= min(mtu - 3, 512) for frame in frames)
@@ -49,19 +49,19 @@ def test_a_frame_that_does_not_continue_drops_its_message_and_no_other(fault: st
             hurt[2] = hurt[2][:3] + bytes([61]) + hurt[2][4:]
         case _:
             hurt[-1] += bytes(9)
-    assert not [found for frame in hurt if (found := assembly.take(frame)) is not None]
-    assert [assembly.take(frame) for frame in frames][-1] == ReceivedMessage(7, message)
+    assert not [found for frame in hurt if (found := assembly.add_frame(frame)) is not None]
+    assert [assembly.add_frame(frame) for frame in frames][-1] == ReceivedMessage(7, message)
 
 
 def test_a_message_too_long_is_never_begun() -> None:
     assembly = BleAssembly(1024)
-    assert not [found for frame in cut(1, bytes(1025), 247) if (found := assembly.take(frame)) is not None]
-    assert [assembly.take(frame) for frame in cut(2, bytes(1024), 247)][-1] == ReceivedMessage(2, bytes(1024))
+    assert not [found for frame in cut(1, bytes(1025), 247) if (found := assembly.add_frame(frame)) is not None]
+    assert [assembly.add_frame(frame) for frame in cut(2, bytes(1024), 247)][-1] == ReceivedMessage(2, bytes(1024))
 
 
 @given(st.lists(st.binary(max_size=40), max_size=20))
 def test_junk_makes_no_message_of_another_length(frames: list[bytes]) -> None:
     assembly = BleAssembly(100)
     for frame in frames:
-        found = assembly.take(frame)
+        found = assembly.add_frame(frame)
         assert found is None or len(found.message) == int.from_bytes(frame[2:4], "big")

@@ -86,8 +86,8 @@ def test_agreement_and_session_from_both_roles_give_the_vectors_frames() -> None
     assert node.handle(agreed.confirm.encode(), link="nfc", tapped=True) == octets("agreement", "confirm_reply")
 
     session = StationSession(agreed.key, UUID, one_time=SoftwareKey(int(KAT["session"]["Es"]["d"], 16)))
-    assert session.ask().encode() == octets("session", "c_frame")
-    counter = node.handle(session.ask().encode(), link="nfc", tapped=True)
+    assert session.request_counter().encode() == octets("session", "c_frame")
+    counter = node.handle(session.request_counter().encode(), link="nfc", tapped=True)
     assert counter == octets("session", "c_reply")
     frame = session.open(decode_reply(counter).payload).encode()
     assert frame == octets("session", "open_frame")

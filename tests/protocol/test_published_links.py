@@ -46,7 +46,7 @@ def test_a_station_cuts_its_requests_as_published(document: Entry, entry: Entry)
         assert piece_in(step) == requester.next(), step["note"]
         taken = piece_in(answer)
         assert taken is not None
-        assert requester.take(taken)
+        assert requester.handle_piece(taken)
         if requester.reply is not None:
             assert requester.reply.hex() == wanted
             requester, done = None, done + 1
@@ -126,7 +126,7 @@ def test_our_ends_of_the_bus_send_the_published_frames(document: Entry, entry: E
                 break
         frame = sent[by].pop(0)
         assert (f"{frame.identifier:08x}", frame.data.hex(), frame.fd) == (step["id"], step["data"], step["fd"])
-        ends[other].take(frame)
+        ends[other].handle_frame(frame)
         if ends["node"].received() is not None:
             ends["node"].send(bytes([entry["transaction"]]) + bytes.fromhex(entry["reply"]))
     answer = ends["station"].received()
@@ -141,7 +141,7 @@ def check_gathering(entry: Entry) -> None:
     for step in entry["steps"]:
         frame = Frame(int(step["id"], 16), bytes.fromhex(step["data"]), step["fd"])
         if step["by"] != "station":
-            flow = gathering.take(frame)
+            flow = gathering.add_frame(frame)
             flows += [flow.data.hex()] if flow else []
     published = [step["data"] for step in entry["steps"][1:] if step["by"] == "station"]
     assert flows == published

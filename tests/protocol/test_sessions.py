@@ -19,7 +19,7 @@ OFF_CURVE = b"\x04" + bytes(63) + b"\x01"
 def opening(desk: Desk, *, one_time: SoftwareKey | None = None) -> tuple[StationSession, Command]:
     """A session half made: c was asked for, the Open is not sent yet."""
     session = StationSession(desk.key, UUID, one_time=one_time)
-    return session, session.open(desk.plain(session.ask()).payload)
+    return session, session.open(desk.plain(session.request_counter()).payload)
 
 
 @pytest.mark.parametrize("size", [0, 7, 9])
@@ -45,7 +45,7 @@ def test_a_static_key_at_hand_is_no_one_time_key_of_an_open() -> None:
         session.open(bytes(8))
         with pytest.raises(NotAuthenticError, match="is no one-time key"):
             session.accept(static.point + bytes(16))
-        counter = desk.plain(session.ask()).payload
+        counter = desk.plain(session.request_counter()).payload
         wrong = StationSession(desk.key, UUID, one_time=static).open(counter)
         assert desk.plain(wrong).reason == Reason.BAD_POINT
 

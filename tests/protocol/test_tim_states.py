@@ -377,7 +377,7 @@ def test_an_open_with_an_old_key_gets_16() -> None:
     desk.agree()
     assert key_id(old) != key_id(desk.key)
     session = StationSession(old, UUID)
-    assert desk.plain(session.open(desk.plain(session.ask()).payload)) == refusal(Reason.UNKNOWN_KEY)
+    assert desk.plain(session.open(desk.plain(session.request_counter()).payload)) == refusal(Reason.UNKNOWN_KEY)
 
 
 def test_the_security_teds_of_a_keyed_node_is_initial_with_the_present_epoch() -> None:

@@ -42,7 +42,7 @@ def factory(uuid: bytes = UUID, name: str = "joint", slope: float = 359.9) -> di
 def board(folder: Path, blocks: Mapping[BlockId, bytes], uuid: bytes = UUID) -> VirtualNode:
     FlashFile.create(folder, uuid=uuid, name="", max_message=2048, blocks=blocks).release()
     good = factory(uuid)
-    return VirtualNode(folder, board=lambda _file: Hardware(Sheet.of(Image(uuid, good))))
+    return VirtualNode(folder, board=lambda _file: Hardware(Sheet.from_image(Image(uuid, good))))
 
 
 def adopted(
@@ -90,7 +90,7 @@ def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> N
 def test_another_name_goes_before_its_own(station: Station, tmp_path: Path) -> None:
     node = board(tmp_path / "n", factory())
     done, [shown] = adopted(station, node, BuildOrder(adopt=True, name="elbow"))
-    assert shown.name == Sheet.of(done.image).meta.name == "elbow"
+    assert shown.name == Sheet.from_image(done.image).meta.name == "elbow"
     assert station.nodes.resolve("elbow") == UUID
     adopted(station, node, BuildOrder(adopt=True, name="wrist"))
     assert station.nodes.resolve("wrist") == UUID

@@ -38,7 +38,7 @@ def whitelist(station: Station, board: Board) -> None:
 
 
 def held(station: Station, board: Board) -> list[tuple[str, int]]:
-    return [(record.state, record.epoch) for record in station.keys.of(board.uuid)]
+    return [(record.state, record.epoch) for record in station.keys.keys_of(board.uuid)]
 
 
 def test_a_whitelisted_node_gets_a_key_and_its_entry_is_pinned(station: Station, board: Board) -> None:
@@ -89,7 +89,7 @@ def test_a_board_that_replaces_another_begins_at_its_own_epoch(station: Station,
     whitelist(station, board)
     run(station, board)
     run(station, board, rotate=True)
-    station.pins.let_go(board.uuid)
+    station.pins.unpin(board.uuid)
     station.pins.remove(board.uuid)
     new = Board()
     whitelist(station, new)
@@ -294,14 +294,14 @@ def test_a_confirm_that_is_held_back_finds_its_key_at_the_station(station: Stati
     whitelist(station, board)
     run(station, board)
     with talk(board) as node:
-        who, real = identify(station, node), node.send
+        who, real = identify(station, node), node.request
 
         def hold_back(command: Command, why: str) -> bytes:
             if why == "the key confirmation":
                 raise KeyboardInterrupt  # the Confirm is on its way, and this station ends here
             return real(command, why)
 
-        node.send = hold_back  # type: ignore[method-assign]
+        node.request = hold_back  # type: ignore[method-assign]
         with pytest.raises(KeyboardInterrupt):
             agree(station, node, who, rotate=True)
     assert [state for state, _ in held(station, board)] == ["pending", "active"]

@@ -17,7 +17,7 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.teds_read import NodeSnapshot
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
-from teds_provision.talk.meeting import the_one
+from teds_provision.talk.meeting import pick_single_node
 from teds_provision.teds.image import Image
 from tests.bench import Board, MemoryLink, contact, talk
 
@@ -111,16 +111,16 @@ def test_of_several_nodes_the_one_that_is_not_finished_is_meant(station: Station
     boards = [Board(uuid=bytes([number]) * 10) for number in range(3)]
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
     with pytest.raises(UsageError, match="3 nodes answer"):
-        the_one(station, contacts)
+        pick_single_node(station, contacts)
     provision(station, boards[0])
     provision(station, boards[2])
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
-    assert the_one(station, contacts).identity.uuid == boards[1].uuid
+    assert pick_single_node(station, contacts).identity.uuid == boards[1].uuid
     provision(station, boards[1])
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
     with pytest.raises(UsageError, match="3 nodes answer"):
-        the_one(station, contacts)
-    assert the_one(station, contacts[1:2]).identity.uuid == boards[1].uuid
+        pick_single_node(station, contacts)
+    assert pick_single_node(station, contacts[1:2]).identity.uuid == boards[1].uuid
 
 
 def test_a_node_whose_last_verdict_was_not_good_is_not_finished(station: Station) -> None:
@@ -131,4 +131,4 @@ def test_a_node_whose_last_verdict_was_not_good_is_not_finished(station: Station
     assert row is not None
     station.nodes.keep_reading(replace(row, checks='[["form", "failed", "a checksum is wrong"]]'))
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
-    assert the_one(station, contacts).identity.uuid == boards[1].uuid
+    assert pick_single_node(station, contacts).identity.uuid == boards[1].uuid

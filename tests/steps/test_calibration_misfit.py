@@ -95,7 +95,7 @@ def test_a_spare_of_the_same_type_takes_the_calibration_with_its_unit(
     take_over(station, plan_takeover(station, board.uuid, spare.uuid, copy_calibration=True), None)
     draft = station.nodes.draft(spare.uuid)
     assert draft is not None
-    channel = Sheet.of(draft.image).channel(1)
+    channel = Sheet.from_image(draft.image).channel(1)
     assert channel is not None
     assert channel.calibration is not None
     assert channel.calibration.unit.text == "°"
@@ -123,7 +123,7 @@ def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
 def angle() -> tuple[Calibration, Channel]:
     profile = load_profile(ANGLE)
     made = read_calibrations(DEGREES, "angle.csv", profile)
-    sheet = Sheet.of_blocks(profile.build(bytes(10), calibration=made).blocks)
+    sheet = Sheet.from_blocks(profile.build(bytes(10), calibration=made).blocks)
     return sheet.calibrations[1], sheet.channels[0]
 
 

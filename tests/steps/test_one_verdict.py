@@ -26,8 +26,8 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.inventory import inventory
 from teds_provision.steps.sign import known_node_keys
 from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify import possession
-from teds_provision.steps.verify_node import NodeVerification, look_at_node, look_in_session, verify_node
+from teds_provision.steps.verify import possession_check
+from teds_provision.steps.verify_node import NodeVerification, verify_at_node, verify_in_session, verify_node
 from teds_provision.store import NodeReading, RevocationRecord, utc_now
 from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.codec.model import AccessCode
@@ -62,12 +62,12 @@ def looked(station: Station, board: Board) -> NodeVerification:
     """What a measurement does before it claims anything."""
     with talk(board, over_the_bus(board)) as node:
         require_session(station, node)
-        return look_in_session(station, node, by="measure")
+        return verify_in_session(station, node, by="measure")
 
 
 def verified(station: Station, board: Board) -> str:
     with talk(board) as node:
-        return look_at_node(station, node, identify(station, node)).verified.verdict
+        return verify_at_node(station, node, identify(station, node)).verified.verdict
 
 
 def shown(station: Station, board: Board) -> tuple[str | None, str | None]:
@@ -150,7 +150,7 @@ def test_in_the_same_power_up_nothing_is_read_again(station: Station, board: Boa
     link = over_the_bus(board)
     with talk(board, link) as node:
         require_session(station, node)
-        look_in_session(station, node, by="measure")
+        verify_in_session(station, node, by="measure")
     assert link.count <= 6, "c, Open, Identify, one TEDS, Close"
     assert shown(station, board) == ("authentic", "session")
 
@@ -269,7 +269,7 @@ def test_a_reset_forgets_the_reading(station: Station, board: Board) -> None:
 
 
 def test_a_board_that_was_replaced_under_its_uuid_has_no_reading(station: Station, board: Board) -> None:
-    station.pins.let_go(board.uuid)
+    station.pins.unpin(board.uuid)
     assert station.nodes.reading(board.uuid) is None
 
 
@@ -324,6 +324,6 @@ def test_a_node_without_its_key_is_not_authentic_by_any_row(station: Station, bo
     """A failed challenge is part of what was read: it stays in the row."""
     with talk(board) as node:
         require_session(station, node)
-        failed = possession(lambda: (_ for _ in ()).throw(NotAuthenticError("It does not hold the key.")))  # type: ignore[arg-type, return-value]
+        failed = possession_check(lambda: (_ for _ in ()).throw(NotAuthenticError("It does not hold the key.")))  # type: ignore[arg-type, return-value]
         readings.keep(station, node, read_image(node), by="verify", known=None, more=[failed])
     assert shown(station, board) == ("not authentic", "session")

@@ -119,7 +119,7 @@ def test_cut_at_every_message_the_same_command_carries_on(tmp_path: Path, half: 
         with pytest.raises(NodeSilentError):
             run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
         assert run(station, board).verified.verdict == "authentic", f"{half} {lost}"
-        assert [record.state for record in station.keys.of(board.uuid)] == ["active"]
+        assert [record.state for record in station.keys.keys_of(board.uuid)] == ["active"]
         station.close()
 
 

@@ -87,7 +87,7 @@ def test_rows_go_to_boards_in_the_order_of_the_taps_and_to_a_spare_at_last(stati
         row = progress.row_for(board_of(number), "")
         assert row is not None
         assert row.number == number
-        progress.take(row, board_of(number))
+        progress.assign_row(row, board_of(number))
         progress.rows[number].result = "failed" if error else "passed"
         if error:
             progress.note(row, BoardResult(board_of(number), 1.0, error=error, row=number))
@@ -108,15 +108,15 @@ def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station
     sheet = read(station, tmp_path, "name\na\nb\nc\n")
     one, other = Progress(station.home, sheet), Progress(station.home, sheet)
     first, second, third = sheet.rows
-    one.take(first, board_of(1))
+    one.assign_row(first, board_of(1))
     assert other.row_for(board_of(2), "") is first, "it does not know yet"
     with pytest.raises(NodeBusyError, match="by another run of this sheet"):
-        other.take(first, board_of(2))
+        other.assign_row(first, board_of(2))
     assert other.row_for(board_of(2), "") is second
-    other.take(second, board_of(2))
+    other.assign_row(second, board_of(2))
     other.note(second, BoardResult(board_of(2), 1.0, error=NodeSilentError("It was pulled."), row=2))
     one.note(first, BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
-    one.take(third, board_of(3))
+    one.assign_row(third, board_of(3))
     again = Progress(station.home, sheet)
     assert [again.board_of(row) for row in sheet.rows] == [board_of(number).hex() for number in (1, 2, 3)]
     assert [again.rows[number].result for number in (1, 2)] == ["failed", "failed"]
@@ -125,7 +125,7 @@ def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station
 
 def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tmp_path: Path) -> None:
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
-    progress.take(progress.sheet.rows[0], board_of(1))
+    progress.assign_row(progress.sheet.rows[0], board_of(1))
     progress.note(progress.sheet.rows[0], BoardResult(board_of(1), 1.0, error=NodeSilentError("It was pulled."), row=1))
     row = progress.row_for(board_of(2), "")
     assert row is not None
@@ -138,7 +138,7 @@ CERTIFICATE = "# date: 2026-11-20\nraw,value [N]\n4194304,-500\n12582912,{high}\
 def finished(station: Station, folder: Path, text: str) -> Progress:
     """A sheet of one row that has passed, kept on the disk."""
     progress = Progress(station.home, read(station, folder, text))
-    progress.take(progress.sheet.rows[0], board_of(1))
+    progress.assign_row(progress.sheet.rows[0], board_of(1))
     progress.rows[1].result = "passed"
     progress.save()
     return progress
@@ -228,7 +228,7 @@ def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path
 
 def test_the_report_for_people_says_yield_and_leaves_out_what_was_not_reached(station: Station, tmp_path: Path) -> None:
     progress = Progress(station.home, read(station, tmp_path, "name\n<b>\nb\n"))
-    progress.take(progress.sheet.rows[0], bytes(10))
+    progress.assign_row(progress.sheet.rows[0], bytes(10))
     progress.note(progress.sheet.rows[0], BoardResult(bytes(10), 1.23, error=NodeSilentError("It is <silent>."), row=1))
     about = ReportHead("bench <1>", "ab" * 32, "Ada", "teds-provision 9")
     write_report(tmp_path / "day.html", progress, about)

@@ -22,10 +22,10 @@ from teds_provision.steps.agree import proof_of_reset, require_session
 from teds_provision.steps.commands import NodeVisit, ReadReport, read_at, verify_at
 from teds_provision.steps.identify import identify
 from teds_provision.steps.verify import Verification, require_authentic
-from teds_provision.steps.verify_node import look_at_node
+from teds_provision.steps.verify_node import verify_at_node
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, refused
-from teds_provision.talk.meeting import refuse_twins, without_twins
+from teds_provision.talk.meeting import drop_duplicate_uuids, refuse_duplicate_uuids
 from teds_provision.teds.image import SECURITY, Image
 from tests.bench import Board, MemoryLink, contact, make_station, talk
 
@@ -73,7 +73,7 @@ class Attacker:
 def looked_at(station: Station, attacker: Attacker) -> Verification:
     node = Conversation(Contact(attacker.identity, attacker, address=FORGED_ADDRESS), notice=lambda notice: None)
     with node:
-        return look_at_node(station, node, identify(station, node)).verified
+        return verify_at_node(station, node, identify(station, node)).verified
 
 
 @pytest.mark.parametrize("state", list(NodeState))
@@ -128,7 +128,7 @@ def test_a_node_that_was_reset_shows_it_by_its_signature(station: Station, board
     run(station, board)
     board.tim.reset_by_hand()
     with talk(board) as node:
-        verified = look_at_node(station, node, identify(station, node)).verified
+        verified = verify_at_node(station, node, identify(station, node)).verified
     assert verified.verdict == "unsigned"
     (check,) = [check for check in verified.checks if check.name == "session"]
     assert (check.result, "was reset" in check.why) == ("passed", True)
@@ -148,7 +148,7 @@ def test_in_its_session_a_node_is_held_against_what_this_station_saw(station: St
     board.flash.state = copy
     board.power_on()
     with talk(board) as node:
-        verified = look_at_node(station, node, identify(station, node)).verified
+        verified = verify_at_node(station, node, identify(station, node)).verified
     assert verified.verdict == "not authentic"
     assert [check.name for check in verified.checks if check.result == "failed"] == ["sequence"]
     assert station.nodes.datasheet(board.uuid) == newer, "what it had stays known"
@@ -157,9 +157,9 @@ def test_in_its_session_a_node_is_held_against_what_this_station_saw(station: St
 def test_one_uuid_at_two_addresses_is_a_conflict_that_names_both(board: Board) -> None:
     here, there = (replace(contact(board, MemoryLink(board, via="can")), address=at) for at in (0x11, 0x22))
     with pytest.raises(AddressConflictError, match=f"{board.uuid.hex()} answers at 0x11 and at 0x22"):
-        refuse_twins([here, there])
+        refuse_duplicate_uuids([here, there])
     other = replace(contact(Board(uuid=bytes(10))), address=0x22)
-    assert refuse_twins([here, other]) == [here, other]
+    assert refuse_duplicate_uuids([here, other]) == [here, other]
 
 
 def test_a_copied_uuid_costs_its_own_node_alone(board: Board) -> None:
@@ -167,10 +167,10 @@ def test_a_copied_uuid_costs_its_own_node_alone(board: Board) -> None:
     here, there = (replace(contact(board, MemoryLink(board, via="can")), address=at) for at in (0x11, 0x22))
     other = replace(contact(Board(uuid=bytes(10))), address=0x33)
     told: list[Notice] = []
-    assert without_twins([here, other, there], told.append) == [other]
+    assert drop_duplicate_uuids([here, other, there], told.append) == [other]
     assert [notice.uuid for notice in told] == [board.uuid]
     with pytest.raises(AddressConflictError):
-        without_twins([here, there], told.append)
+        drop_duplicate_uuids([here, there], told.append)
 
 
 def test_a_stranger_without_the_key_judges_by_signatures(station: Station, board: Board, tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -242,7 +242,7 @@ def test_a_session_moves_last_seen(station: Station, board: Board) -> None:
     run(station, board)
     station.nodes.remember(board.uuid, last_seen="2020-01-01T00:00:00Z")
     with talk(board, MemoryLink(board, via="can")) as node:
-        look_at_node(station, node, identify(station, node))
+        verify_at_node(station, node, identify(station, node))
     known = station.nodes.get(board.uuid)
     assert known is not None
     assert str(known.last_seen) > "2026"
@@ -255,7 +255,7 @@ def test_a_refusal_outside_a_session_is_told_as_heard_and_not_proven(station: St
     with talk(board) as node, pytest.raises(PolicyError, match="proves nothing"):
         require_session(station, node)
     with talk(board) as node, pytest.raises(NodeRefusedError, match="Not verified"):
-        node.plain(security_command(Function.CLOSE), "to close")
+        node.request_plain(security_command(Function.CLOSE), "to close")
 
 
 def test_a_refusal_in_a_session_is_the_nodes_own_word(station: Station, board: Board) -> None:
@@ -263,7 +263,7 @@ def test_a_refusal_in_a_session_is_the_nodes_own_word(station: Station, board: B
     with talk(board) as node:
         require_session(station, node)
         with pytest.raises(NodeRefusedError, match="The node refused to do the unknown"):
-            node.send(security_command(99), "to do the unknown")
+            node.request(security_command(99), "to do the unknown")
 
 
 @pytest.mark.parametrize("answer", [bytes(64), b"", b"the wrong signature".ljust(64)])

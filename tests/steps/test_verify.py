@@ -18,7 +18,7 @@ from teds_provision.steps.commands import SignOrder, sign_image
 from teds_provision.steps.identify import identify
 from teds_provision.steps.sign import known_node_keys, sign
 from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify import FreshnessFloor, Verification, known_of, verify_image
+from teds_provision.steps.verify import FreshnessFloor, Verification, freshness_floor_of, verify_image
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import write
 from teds_provision.store import TrustRecord
@@ -202,7 +202,7 @@ def test_an_epoch_older_than_one_that_was_seen_is_caught_without_a_session_too(s
     with talk(board) as node:
         agree(station, node, identify(station, node), rotate=True)
     new = run(station, board).image
-    known = known_of(station, board.uuid, None)
+    known = freshness_floor_of(station, board.uuid, None)
     assert (known.identity, known.sequence, known.key_epoch) == (None, 2, 2)
     for image, expected in ((old, "failed"), (new, "passed")):
         checks = {check.name: check for check in verify_image(station, image, known=replace(known, sequence=1))}
@@ -227,10 +227,10 @@ def test_what_a_stranger_signed_is_no_floor_for_sequence_and_epoch(
     )
     signed = sign_datasheet(theirs, board.uuid, stranger.credentials())
     station.nodes.keep_datasheet(image.with_block(SECURITY, signed))
-    assert known_of(station, board.uuid, None) == FreshnessFloor()
+    assert freshness_floor_of(station, board.uuid, None) == FreshnessFloor()
     broken = replace(ours, sequence=900, key_epoch=900).encode()
     station.nodes.keep_datasheet(image.with_block(SECURITY, broken))
-    assert known_of(station, board.uuid, None) == FreshnessFloor(), "field 100 is not over these numbers"
+    assert freshness_floor_of(station, board.uuid, None) == FreshnessFloor(), "field 100 is not over these numbers"
 
 
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:

@@ -18,7 +18,7 @@ from teds_provision.protocol.operation.commands import OPERATION, ChannelState, 
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session, reset_node
 from teds_provision.steps.batch import BatchRun, ProvisionRequest, Questions
-from teds_provision.steps.board_type import WrongBoardError, bears, differences, operate
+from teds_provision.steps.board_type import WrongBoardError, check_hardware, differences, operate
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import ProvisionResult, provision
@@ -40,7 +40,7 @@ def virtual(folder: Path, profile: str) -> VirtualNode:
     create(folder, profile=profile)
 
     def board(file: FlashFile) -> Hardware:
-        return Hardware(Sheet.of(Image(file.load().uuid, file.hardware)))
+        return Hardware(Sheet.from_image(Image(file.load().uuid, file.hardware)))
 
     return VirtualNode(folder, board=board)
 
@@ -171,7 +171,7 @@ def test_the_check_shows_one_real_reading_and_claims_nothing(
     assert 0 <= sample["value"] < 6.2832
     with Conversation(on_reader(angle), notice=lambda _notice: None) as node:
         require_session(station, node)
-        told = OperationReply.decode(node.send(OPERATION, "to tell its mode"))
+        told = OperationReply.decode(node.request(OPERATION, "to tell its mode"))
     assert (told.measuring, told.channels[1]) == (False, (ChannelState(0), 0)), "nothing is claimed"
 
 
@@ -187,7 +187,7 @@ def test_reason_6_and_23_of_operate_have_words_of_their_own(
             operate(node, 1, bytes(16), lease=5)
         assert caught.value.reason == Reason.DIGEST_MISMATCH
         assert "TEDS does not match its signed digest" not in caught.value.message
-        borne = bears(node, read_image(node))
+        borne = check_hardware(node, read_image(node))
         assert borne.channels == {1: True}
 
 
@@ -200,7 +200,7 @@ def test_a_session_that_the_node_lost_before_the_check_is_opened_anew(
         require_session(station, node)
         image = read_image(node)
         angle.lost("nfc")
-        assert bears(node, image).channels == {1: True}
+        assert check_hardware(node, image).channels == {1: True}
 
 
 def test_a_node_that_keeps_no_session_is_told_and_is_no_bug(
@@ -219,7 +219,7 @@ def test_a_node_that_keeps_no_session_is_told_and_is_no_bug(
         monkeypatch.setattr(node, "open", lost_at_once)
         angle.lost("nfc")
         with pytest.raises(NodeRefusedError, match="reason 2"):
-            bears(node, image)
+            check_hardware(node, image)
 
 
 # -- sheets ----------------------------------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
 ) -> None:
     """The signature is in the TEDS that is written last; the others may go while the disk is waited for."""
     told: list[str] = []
-    plain, send = os.fdatasync, Conversation.send
+    plain, send = os.fdatasync, Conversation.request
     slowly = threading.Event()
 
     def synced(descriptor: int) -> None:
@@ -110,7 +110,7 @@ def test_the_key_is_on_the_disk_before_its_confirmation_leaves_and_the_sequence_
             told.append("commit")
 
     monkeypatch.setattr("os.fdatasync", synced)
-    monkeypatch.setattr(Conversation, "send", sent)
+    monkeypatch.setattr(Conversation, "request", sent)
     watched.station._store._database._connection.set_trace_callback(stated)
     with talk(Board()) as node:
         provision(
@@ -142,12 +142,12 @@ def test_what_comes_later_is_on_the_disk_with_the_next_entry_or_when_it_is_asked
         store.put_node(node)
     with store.transaction():
         store.put_node(node)  # the same again: SQLite may find nothing to write
-    store.settle()
+    store.flush()
     assert synced == ["store.sqlite3-wal"]
     with store.transaction(later=True):
         store.put_node(node)
     store.audit.append("identify", node.uuid, "done")
-    store.settle()
+    store.flush()
     assert synced == ["store.sqlite3-wal"]
 
 
@@ -219,7 +219,7 @@ def test_what_is_not_waited_for_does_not_bring_what_came_before_onto_the_disk(
         for act in ("identify", "whitelist"):
             with watched.station.durable(act, more_follows=True):
                 watched.station.audit(act, None, "done")
-        watched.station._store.settle(1)
+        watched.station._store.flush(1)
         assert synced == ["store.sqlite3-wal"]
 
 
@@ -251,9 +251,9 @@ def test_what_a_run_asks_of_the_store_comes_after_the_steps_that_it_takes_behind
             station.nodes.remember(bytes(10), name="left")
 
     with station.run():
-        station.behind(slow)
+        station.run_in_background(slow)
         assert station.nodes.get(bytes(10)) == NodeRecord(bytes(10), name="left")
-        station.behind(slow)
+        station.run_in_background(slow)
         with station.durable("sign"):  # takes the locks that the step takes too
             station.nodes.remember(bytes(10), name="right")
     record = station.nodes.get(bytes(10))
@@ -271,20 +271,20 @@ def test_a_step_that_fails_behind_a_run_fails_the_run(watched: Watched) -> None:
 
     def ask() -> None:
         with station.run():
-            station.behind(full)
+            station.run_in_background(full)
             station.nodes.get(bytes(10))
             went_on.append("after a question")
 
     def end() -> None:
         with station.run():
-            station.behind(full)
+            station.run_in_background(full)
             went_on.append("at the end")
 
     for run in (ask, end):
         with pytest.raises(StoreError, match="full"):
             run()
     with pytest.raises(StoreError, match="full"):
-        station.behind(full)
+        station.run_in_background(full)
     assert went_on == ["at the end"]
 
 
@@ -292,7 +292,7 @@ def test_what_is_done_behind_a_run_is_done_by_the_same_person(watched: Watched) 
     before = ACTOR.set("token lab")
     try:
         with watched.station.run():
-            watched.station.behind(lambda: watched.station.audit("agree", None, "done"))
+            watched.station.run_in_background(lambda: watched.station.audit("agree", None, "done"))
     finally:
         ACTOR.reset(before)
     assert [entry.who for entry in watched.station.audit_log.entries()][-1] == "token lab"

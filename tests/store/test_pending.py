@@ -21,7 +21,7 @@ def test_the_ninth_pending_key_takes_the_place_of_the_oldest(tmp_path: Path) -> 
         station.keys.promote(NODE, bytes(8).hex())
         for number in range(1, 30):
             station.keys.add_pending(NODE, key=bytes(16), key_id=bytes([number] * 8), epoch=2)
-        kept = station.keys.of(NODE)
+        kept = station.keys.keys_of(NODE)
         assert [record.key_id for record in kept if record.state == "pending"] == [
             bytes([number] * 8).hex() for number in range(29, 29 - MAX_PENDING, -1)
         ]

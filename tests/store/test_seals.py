@@ -79,7 +79,7 @@ def test_an_untouched_store_says_nothing(opened: Open) -> None:
     station = opened(said)
     station.unlock()
     assert said == []
-    assert list(station.seals.all_broken()) == []
+    assert list(station.row_macs.all_broken()) == []
     assert station.pins.pinned(NODE) == fingerprint(POINT)
     assert {record.name for record in station.policy.trusted()} == {"peer", "owner"}
 
@@ -123,9 +123,9 @@ def test_changed_trust_is_named_and_does_not_count(home: Path, opened: Open, sta
     assert "peer" in said[0]
     assert "peer" not in {record.name for record in station.policy.trusted()}
     assert OTHER not in station.policy.trusted_stations()
-    assert list(station.seals.all_broken()) == ["trust in peer"]
+    assert list(station.row_macs.all_broken()) == ["trust in peer"]
     assert station.policy.distrust("peer")  # it is still listed, and can be taken away
-    assert list(station.seals.all_broken()) == []
+    assert list(station.row_macs.all_broken()) == []
 
 
 def test_planted_trust_does_not_count(home: Path, opened: Open) -> None:
@@ -153,7 +153,7 @@ def test_a_planted_end_of_trust_and_a_planted_lifting_do_not_count(home: Path, o
         for sentence in said
         if "another program added" in sentence.lower() and fingerprint(OTHER)[:16] in sentence
     ]
-    assert len(list(station.seals.all_broken())) == 2
+    assert len(list(station.row_macs.all_broken())) == 2
 
 
 def test_a_lifting_needs_the_vault(opened: Open) -> None:
@@ -177,7 +177,7 @@ def test_an_end_of_trust_and_a_lifting_that_a_person_made_hold(opened: Open) -> 
     assert not station.policy.counts(OTHER)
     assert station.policy.was_lifted("a ban")
     assert not said
-    assert not list(station.seals.all_broken())
+    assert not list(station.row_macs.all_broken())
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_a_changed_pin_is_not_believed_and_can_be_made_anew(home: Path, opened: 
     for use in (station.pins.pinned, station.pins.entry, station.policy.require_whitelisted):
         with pytest.raises(StoreChangedError, match=NODE.hex()):
             use(NODE)
-    station.pins.let_go(NODE)
+    station.pins.unpin(NODE)
     station.pins.remove(NODE)
     station.pins.put(WhitelistEntry(NODE, fingerprint(POINT)))
     assert station.pins.pinned(NODE) == fingerprint(POINT)
@@ -233,7 +233,7 @@ def test_lists_need_no_passphrase_and_changes_do(opened: Open) -> None:
     for change in (
         lambda: station.pins.put(WhitelistEntry(b"\1" * 10)),
         lambda: station.pins.remove(NODE),
-        lambda: station.pins.let_go(NODE),
+        lambda: station.pins.unpin(NODE),
         lambda: station.policy.trust(TrustRecord("x", "ca", OTHER, fingerprint(OTHER))),
         lambda: station.policy.distrust("peer"),
     ):
@@ -257,7 +257,7 @@ def test_a_new_master_key_leaves_the_seals_whole(opened: Open) -> None:
     rewrap(opened())
     station = opened()
     station.unlock()
-    assert list(station.seals.all_broken()) == []
+    assert list(station.row_macs.all_broken()) == []
 
 
 def test_a_changed_identity_key_is_not_handed_over(home: Path, opened: Open) -> None:

@@ -94,7 +94,7 @@ def test_a_node_with_a_fault_in_its_agreement_is_refused_and_named(station: Ours
         run(station, node)
     assert node.requests == requests
     if fault != "the epoch little-endian":  # which shows after its Confirm
-        assert (node.key, station.keys.of(UUID)) == (b"", [])
+        assert (node.key, station.keys.keys_of(UUID)) == (b"", [])
 
 
 # -- a stranger's station, our node ------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ class Stranger:
         file = FlashFile(self.hall.folder / self.name)
         flash, document = file.load(), json.loads(file.path.read_text())
         file.release()
-        sheet = Sheet.of(Image(flash.uuid, dict(flash.blocks)))
+        sheet = Sheet.from_image(Image(flash.uuid, dict(flash.blocks)))
         channels = {
             one.number: {
                 "kind": KINDS[ChannelKind(one.kind)],

@@ -49,7 +49,7 @@ def test_an_open_that_came_second_is_tried_once_more(board: Board) -> None:
     with talk(board, FasterStation(board, key, times=1)) as node:
         node.open(key)
         assert node.sealed
-        node.send(security_command(Function.IDENTIFY), "to identify")
+        node.request(security_command(Function.IDENTIFY), "to identify")
 
 
 def test_after_the_second_refusal_the_operator_is_told(board: Board) -> None:
@@ -99,10 +99,10 @@ def test_a_refusal_of_a_plain_question_on_a_bus_counts_when_it_comes_twice(board
     """A disturbed octet made of "read TEDS 128" another one, which the node does not have: no word of the node's."""
     question = read_teds(*SECURITY, 0)
     with talk(board, Disturbed(board, {1}, 6)) as node:
-        assert node.ask(question, "to read") == node.ask(question, "to read")
+        assert node.request_idempotent(question, "to read") == node.request_idempotent(question, "to read")
     link = Disturbed(board, {1, 2}, 6)
     with talk(board, link) as node, pytest.raises(NodeRefusedError):
-        node.ask(question, "to read")
+        node.request_idempotent(question, "to read")
     assert link.count == 2
 
 
@@ -113,7 +113,7 @@ def test_a_request_that_was_disturbed_on_a_bus_is_sent_once_more(board: Board) -
         Credentials(STATION, CA.sign(station_key_message(STATION.point)), CA.point), board.uuid
     )
     with talk(board, link) as node:
-        reply = node.sure(agreement.request(), "the key agreement")
+        reply = node.request_retry_once(agreement.request(), "the key agreement")
     assert agreement.accept(reply, board.state.security_teds(), pinned=None, epoch=0).epoch == 1
     assert link.count == 2
 
@@ -133,7 +133,7 @@ def test_a_node_that_stays_busy_is_asked_for_one_patience_and_no_new_session_is_
     with Conversation(contact(board, link), notice=lambda _notice: None, busy_seconds=0.05) as node:
         node.open(key)
         with pytest.raises(NodeRefusedError) as caught:
-            node.ask(security_command(Function.LIST), "to list its TEDS")
+            node.request_idempotent(security_command(Function.LIST), "to list its TEDS")
         assert caught.value.reason == Reason.BUSY
         node.forget()
     asked = [frame.startswith(sealed) for frame in link.frames]

@@ -238,7 +238,7 @@ def test_a_calibration_survives_its_teds(calibration: Calibration, edition: teds
 def test_the_calibrated_unit_is_recognized_again(magnetic: Profile) -> None:
     table = replace(fit([(0, 0.0), (65535, 360.0)], "table", channel=1), unit=parse_unit("degree"))
     built = magnetic.build(bytes(10), calibration={1: table})
-    again = dict(Sheet.of_blocks(built.blocks).calibrations)[1]
+    again = dict(Sheet.from_blocks(built.blocks).calibrations)[1]
     assert again.unit.text == "°"
     assert again.unit.to_si(value(again, 65535)) == pytest.approx(2 * math.pi)
 
@@ -474,7 +474,7 @@ def test_a_calibration_kept_from_a_node_gives_the_same_octets(magnetic: Profile)
     kept = from_decoded(teds.decode(built.blocks[1, 5]))
     assert magnetic.build(bytes(10), calibration={1: kept}).blocks == built.blocks
     assert (
-        magnetic.build(bytes(10), calibration=dict(Sheet.of_blocks(built.blocks).calibrations)).blocks == built.blocks
+        magnetic.build(bytes(10), calibration=dict(Sheet.from_blocks(built.blocks).calibrations)).blocks == built.blocks
     )
 
 

@@ -30,7 +30,7 @@ def angle(**more: object) -> Sheet:
         uncertainty=1.0,
     )
     built = load_profile("magnetic-angular-position-sensor").build(bytes(10), calibration={1: line})
-    sheet = Sheet.of(Image(bytes(10), built.blocks))
+    sheet = Sheet.from_image(Image(bytes(10), built.blocks))
     return replace(sheet, channels=(replace(sheet.channels[0], **more),))  # type: ignore[arg-type]
 
 

@@ -41,7 +41,7 @@ def blocks_of(profile: str, calibrations: dict[int, Calibration] | None = None) 
 
 
 def sheet_of(profile: str, calibrations: dict[int, Calibration] | None = None) -> Sheet:
-    return Sheet.of(Image(UUID, blocks_of(profile, calibrations)))
+    return Sheet.from_image(Image(UUID, blocks_of(profile, calibrations)))
 
 
 def changed(sheet: Sheet, number: int = 1, **more: object) -> Sheet:
@@ -343,7 +343,7 @@ def actuator(calibration: Calibration | None = None) -> Sheet:
         low, high = own.unit.from_si(own.low), own.unit.from_si(own.high)
         part = CalibrationInput(number, 1, (low, high), (low,))
         calibration = Calibration(number, "linear", (part,), (0.0, 4000 / (high - low)), unit=own.unit, actuator=True)
-    return Sheet.of(Image(UUID, blocks_of("gripper", {number: calibration})))
+    return Sheet.from_image(Image(UUID, blocks_of("gripper", {number: calibration})))
 
 
 def test_an_actuator_is_set_within_its_limits_and_read_back() -> None:
@@ -406,7 +406,7 @@ def test_a_calibration_in_a_unit_without_a_name_is_shown_in_the_usual_one() -> N
     odd = replace(TABLE, unit=WrittenUnit("(× 0.1 rad)", TABLE.unit.units, 0.1), coefficients=TABLE.coefficients)
     blocks = blocks_of("magnetic-angular-position-sensor")
     blocks[1, AccessCode.CALIBRATION] = teds.compose(AccessCode.CALIBRATION, replace(odd, uncertainty=0.1).fields())
-    interpreter = ChannelInterpreter(Sheet.of_blocks(blocks), 1)
+    interpreter = ChannelInterpreter(Sheet.from_blocks(blocks), 1)
     assert interpreter.unit.text == "°"
     shown = interpreter.decode(bytes.fromhex("0100")).value[0]
     assert shown == pytest.approx(math.degrees(evaluate(odd, 256.0).value * 0.1))

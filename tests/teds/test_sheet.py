@@ -36,7 +36,7 @@ def line(channel: int = 1, unit: str = "degree", **more: object) -> Calibration:
 
 
 def test_the_magnetic_sensor_reads_as_its_paper_says() -> None:
-    sheet = Sheet.of(image_of("magnetic-angular-position-sensor"))
+    sheet = Sheet.from_image(image_of("magnetic-angular-position-sensor"))
     assert sheet.uuid == UUID == sheet.meta.uuid
     assert not sheet.errors
     (channel,) = sheet.channels[:1]
@@ -61,7 +61,7 @@ def test_every_shipped_profile_gives_a_sheet_that_says_what_the_profile_says() -
         profile = load_profile(file)
         if profile.abstract:
             continue
-        sheet = Sheet.of(Image(UUID, profile.build(UUID, now=WHEN).blocks))
+        sheet = Sheet.from_image(Image(UUID, profile.build(UUID, now=WHEN).blocks))
         said = [(c.number, c.name, c.type, c.units, c.raw_range) for c in profile.channels]
         read = [(c.number, c.name, c.kind, c.units, c.sample.raw_range if c.sample else None) for c in sheet.channels]
         if [row[:4] for row in said] != [row[:4] for row in read] or sheet.errors:
@@ -73,7 +73,7 @@ def test_every_shipped_profile_gives_a_sheet_that_says_what_the_profile_says() -
 
 def test_a_calibration_gives_unit_uncertainty_and_due_date() -> None:
     calibration = line(date=WHEN, interval=365 * 86_400.0, uncertainty=0.5)
-    (channel, *_) = Sheet.of(image_of("magnetic-angular-position-sensor", {1: calibration})).channels
+    (channel, *_) = Sheet.from_image(image_of("magnetic-angular-position-sensor", {1: calibration})).channels
     assert channel.unit.text == "°"
     assert channel.calibrated_at == WHEN
     assert channel.due == datetime(2027, 3, 1, tzinfo=UTC)
@@ -96,7 +96,7 @@ def test_a_calibration_that_cannot_be_computed_is_said_and_left_out() -> None:
     for words, calibration in broken.items():
         blocks = dict(image_of("magnetic-angular-position-sensor").blocks)
         blocks[1, AccessCode.CALIBRATION] = teds.compose(AccessCode.CALIBRATION, calibration.fields())
-        sheet = Sheet.of_blocks(blocks)
+        sheet = Sheet.from_blocks(blocks)
         assert sheet.channels[0].calibration is None
         assert words in sheet.channels[0].calibration_problem
         assert "calibration" in {finding.code for finding in sheet.findings}
@@ -107,25 +107,25 @@ def test_what_the_teds_say_against_each_other_is_found() -> None:
     blocks[2, AccessCode.NAME] = blocks[1, AccessCode.NAME]
     blocks[40, AccessCode.CALIBRATION] = teds.compose(AccessCode.CALIBRATION, line(40).fields())
     blocks[1, AccessCode.CHANNEL], blocks[0, AccessCode.PHY] = blocks[0, AccessCode.META], blocks[1, AccessCode.CHANNEL]
-    sheet = Sheet.of(Image(bytes(10), blocks))
+    sheet = Sheet.from_image(Image(bytes(10), blocks))
     found = {(finding.channel, finding.code) for finding in sheet.findings}
     assert {(0, "uuid"), (2, "same-name"), (40, "undescribed"), (1, "class"), (0, "class")} <= found
     assert sheet.channel(40) is None
     assert 40 in sheet.calibrations
     del blocks[3, AccessCode.CHANNEL]
-    assert (0, "channels") in {(finding.channel, finding.code) for finding in Sheet.of_blocks(blocks).findings}
+    assert (0, "channels") in {(finding.channel, finding.code) for finding in Sheet.from_blocks(blocks).findings}
 
 
 def test_a_name_finds_its_channel_only_if_it_is_alone() -> None:
     blocks = dict(image_of("tactile-finger-sensor").blocks)
-    first = Sheet.of_blocks(blocks).channels[0]
-    assert Sheet.of_blocks(blocks).named(first.name) == first
+    first = Sheet.from_blocks(blocks).channels[0]
+    assert Sheet.from_blocks(blocks).named(first.name) == first
     blocks[2, AccessCode.NAME] = blocks[1, AccessCode.NAME]
-    assert Sheet.of_blocks(blocks).named(first.name) is None
+    assert Sheet.from_blocks(blocks).named(first.name) is None
 
 
 def test_an_actuator_says_how_it_halts() -> None:
-    sheet = Sheet.of(image_of("gripper"))
+    sheet = Sheet.from_image(image_of("gripper"))
     (actuator, *_) = [channel for channel in sheet.channels if channel.actuator]
     assert actuator.kind is ChannelKind.ACTUATOR
     assert actuator.kind.word == "actuator"
@@ -133,7 +133,7 @@ def test_an_actuator_says_how_it_halts() -> None:
 
 
 def test_an_empty_node_has_an_empty_sheet() -> None:
-    sheet = Sheet.of(Image(UUID, {}))
+    sheet = Sheet.from_image(Image(UUID, {}))
     assert (sheet.channels, sheet.findings, sheet.meta.name) == ((), (), "")
     nothing = channel_of(1, {})
     assert not nothing.described
@@ -176,7 +176,7 @@ def test_no_octets_make_a_sheet_raise(data: st.DataObject) -> None:
     junk = data.draw(st.lists(st.tuples(st.integers(0, 65535), st.sampled_from([1, 3, 5, 12, 16, 128])), max_size=2))
     for key in junk:
         blocks[key] = data.draw(st.binary(max_size=60))
-    sheet = Sheet.of(Image(data.draw(st.binary(max_size=16)), blocks))
+    sheet = Sheet.from_image(Image(data.draw(st.binary(max_size=16)), blocks))
     for channel in sheet.channels:
         assert channel.unit.text is not None
         assert channel.si_unit

@@ -39,7 +39,7 @@ def test_side_by_side_is_one_by_one(unit: str, raw: list[list[int]]) -> None:
     known = sheet(unit)
     channels = [ChannelInterpreter(known, number) for number in range(1, 13)]
     usable = [not one.problem for one in channels]
-    many = ManyChannels.of(channels, usable)
+    many = ManyChannels.side_by_side(channels, usable)
     assert many is not None
     octets = np.array(raw, dtype=">u2").view(np.uint8).reshape(len(raw), 24)
     raws = many.raw(octets.tobytes())
@@ -65,7 +65,7 @@ def test_angles_wrap_side_by_side_with_what_does_not(raw: list[list[int]], zero:
     )
     together = replace(sheet(), channels=(wide, *others))
     channels = [ChannelInterpreter(together, number) for number in (1, 2, 3)]
-    many = ManyChannels.of(channels, [True, True, True])
+    many = ManyChannels.side_by_side(channels, [True, True, True])
     assert many is not None
     octets = np.array(raw, dtype=">u2").view(np.uint8).reshape(len(raw), 6)
     value, valid = many.values(many.raw(octets.tobytes()))
@@ -88,7 +88,7 @@ def test_every_value_that_a_channel_can_have_is_calibrated_beforehand(number: in
     assert first.sample is not None
     narrow = replace(first, sample=replace(first.sample, bits=15), high=2.0)
     one = ChannelInterpreter(replace(known, channels=(narrow,)), number)
-    many = ManyChannels.of([one], [True])
+    many = ManyChannels.side_by_side([one], [True])
     assert many is not None
     octets = np.arange(65536).astype(">u2")
     value, valid = many.values(many.raw(octets.tobytes()))
@@ -104,7 +104,7 @@ def test_channels_of_8_bits_are_looked_up_each_in_its_own(raw: list[list[int]], 
     known = sheet()
     small = [replace(one, sample=SampleForm(0, 1)) for one in known.channels[:4]]
     channels = [ChannelInterpreter(replace(known, channels=tuple(small)), number) for number in range(1, 5)]
-    many = ManyChannels.of(channels, [True, True, True, last])
+    many = ManyChannels.side_by_side(channels, [True, True, True, last])
     assert many is not None
     octets = np.array(raw, dtype=np.uint8)
     value, valid = many.values(many.raw(octets.tobytes()))
@@ -118,9 +118,9 @@ def test_channels_of_8_bits_are_looked_up_each_in_its_own(raw: list[list[int]], 
 def test_channels_of_other_forms_stay_alone() -> None:
     known = sheet()
     channels = [ChannelInterpreter(known, number) for number in (1, 2)]
-    assert ManyChannels.of(channels, [True, True]) is not None
+    assert ManyChannels.side_by_side(channels, [True, True]) is not None
     (first, *rest) = known.channels
     wider = replace(known, channels=(replace(first, sample=SampleForm(0, 3), calibration=None), *rest))
-    assert ManyChannels.of([ChannelInterpreter(wider, number) for number in (1, 2)], [True, True]) is None
+    assert ManyChannels.side_by_side([ChannelInterpreter(wider, number) for number in (1, 2)], [True, True]) is None
     floats = replace(known, channels=(replace(first, sample=SampleForm(1, 4), calibration=None), *rest))
-    assert ManyChannels.of([ChannelInterpreter(floats, 1)], [True]) is None
+    assert ManyChannels.side_by_side([ChannelInterpreter(floats, 1)], [True]) is None

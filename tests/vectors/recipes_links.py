@@ -136,7 +136,7 @@ class Tap:
                 "Te 00 and a part of the answer." if taken.body else "Te 00 and what is held so far: an empty answer."
             )
             self.entry["steps"][-1]["note"] = part
-            requester.take(taken)
+            requester.handle_piece(taken)
         self.entry["steps"][begin] |= {"command": frame.hex(), "reply": requester.reply.hex()}
         return self
 
@@ -269,7 +269,7 @@ def _transfer(name: str, note: str, command: Command, *, state: str = "factory",
     for _ in range(2000):
         given = wire.next()
         if given is not None:
-            ends["node" if given[0] == "station" else "station"].take(given[1])
+            ends["node" if given[0] == "station" else "station"].handle_frame(given[1])
         for end in ends.values():
             end.run()
         body = ends["node"].received()
@@ -311,12 +311,12 @@ def _functional(name: str, note: str, *, fd: bool = False, twins: bool = False) 
             break
         who, frame = given
         if who != "station":
-            flow = gathering.take(frame)
+            flow = gathering.add_frame(frame)
             if flow is not None:
                 wire.send("station", flow)
         else:
             for pair in pairs:
-                pair.take(frame)
+                pair.handle_frame(frame)
         for pair in pairs:
             pair.run()
     return {

@@ -70,7 +70,7 @@ class OperationScene:
         station, node = (named_key(self.name, number, side) for side in ("Es", "En"))
         self.bench.tim._sessions._one_time = lambda: node
         session = StationSession(K, UUID, one_time=station)
-        counter = self.bench.plain(session.ask(), link).payload
+        counter = self.bench.plain(session.request_counter(), link).payload
         session.accept(self.bench.plain(session.open(counter), link).payload)
         self.bench.sessions[link] = session
         told = {"link": link, "K": K.hex(), "Es": station.secret().hex(), "En": node.secret().hex(), "c": counter.hex()}

@@ -50,7 +50,7 @@ def _session(name: str, note: str) -> tuple[Line, Command]:
     """A line with a session open, and its first Sealed."""
     line = Line(name, note)
     session = StationSession(K, UUID, one_time=named_key(name, "Es"))
-    counter = decode_reply(line.send(0, session.ask(), "Open without payload asks for c.")).payload
+    counter = decode_reply(line.send(0, session.request_counter(), "Open without payload asks for c.")).payload
     reply = line.send(1, session.open(counter), "Open.")
     session.accept(decode_reply(reply).payload)
     return line, session.seal(security_command(Function.LIST))
@@ -71,7 +71,9 @@ def repetition() -> Iterator[Scene]:
 
     line = Line("open", "An Open whose reply was lost: the stored octets. Anew it would get 12.")
     session = StationSession(K, UUID, one_time=named_key("open", "Es"))
-    opening = session.open(decode_reply(line.send(1, session.ask(), "Open without payload asks for c.")).payload)
+    opening = session.open(
+        decode_reply(line.send(1, session.request_counter(), "Open without payload asks for c.")).payload
+    )
     line.send(2, opening, "Open.")
     line.send(2, opening, "Equal octet for octet: the stored reply, the same En.")
     line.send(3, opening, "Another transaction: run: 12.")

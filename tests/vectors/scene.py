@@ -217,7 +217,7 @@ class Scene:
         """Open under a link key; ``label`` names the session for later steps."""
         one_time = named_key(self.name, len(self.steps), "Es")
         session = StationSession(held, UUID, one_time=one_time)
-        counter = self.say(session.ask(), "Open without payload asks for c.", **more).payload
+        counter = self.say(session.request_counter(), "Open without payload asks for c.", **more).payload
         told = {"session": label, "K": held.hex(), "Es": one_time.secret().hex(), "c": counter.hex()}
         reply = self.say(session.open(counter), note, open=told, **more)
         if reply.ok:
@@ -234,7 +234,7 @@ class Scene:
 
     def crafted_open(self, note: str, *, ahead: int = 0, point: bytes | None = None, held: bytes = K) -> Reply:
         """An Open whose mac is right for the node's c plus ``ahead``, with any point as Es."""
-        counter = self.say(StationSession(held, UUID).ask(), "Open without payload asks for c.").payload
+        counter = self.say(StationSession(held, UUID).request_counter(), "Open without payload asks for c.").payload
         used = ((int.from_bytes(counter, "big") + ahead) % (1 << 64)).to_bytes(8, "big")
         station = named_key(self.name, len(self.steps), "Es").point if point is None else point
         payload = key_id(held) + station + open_mac(held, UUID, used, station)

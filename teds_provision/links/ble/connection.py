@@ -197,7 +197,7 @@ class BleConnection:
             if octets is None:
                 raise ConnectionLostError("the connection ended")
             self._note("in", octets)
-            received = assembly.take(octets)
+            received = assembly.add_frame(octets)
             if received is not None and received.transaction == transaction:
                 return received.message
 

@@ -58,7 +58,7 @@ class RememberedNodes:
         """Every address and who was there, the newest first."""
         return list(reversed(self._known.items()))
 
-    def learn(self, address: str, identity: Identity) -> None:
+    def remember_node(self, address: str, identity: Identity) -> None:
         """A node was met; an address at which it was before is forgotten."""
         others = {at: one for at, one in self._known.items() if at != address and one.uuid != identity.uuid}
         self._changed = self._changed or self._known.get(address) is None or len(others) + 1 != len(self._known)
@@ -329,7 +329,7 @@ class BlePort:
         except Exception:
             self._leave(link, in_use=in_use)
             raise
-        self._known.learn(address, identity)
+        self._known.remember_node(address, identity)
         if not wanted(identity):
             self._leave(link, in_use=in_use)
             if identity.uuid not in told:

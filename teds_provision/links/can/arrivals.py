@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from teds_provision.errors import AddressConflictError
-from teds_provision.links.can.identify_broadcast import FunctionalAnswers, ask_all, conflict_text, settle
+from teds_provision.links.can.identify_broadcast import FunctionalAnswers, ask_all, ask_unclear_again, conflict_text
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
 from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
@@ -144,7 +144,7 @@ class Arrivals:
             elif self._is_news(*news):
                 yield news
         ask_again = partial(self._port.identify, seconds=_UNCLEAR_SECONDS)
-        settled = settle(found, ask_again, until=time.monotonic() + _LONGEST_SECONDS)
+        settled = ask_unclear_again(found, ask_again, until=time.monotonic() + _LONGEST_SECONDS)
         clashing |= settled.conflicts
         for address in found.conflicts | found.unfinished:
             identity = settled.identities.get(address)

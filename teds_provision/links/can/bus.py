@@ -56,7 +56,7 @@ class SentFrames:
             if len(self._sent) > _KEPT:  # some were lost on their way back
                 self._sent.popitem(last=False)
 
-    def take(self, frame: Frame) -> bool:
+    def discard_echo(self, frame: Frame) -> bool:
         """Whether this is one of them; it will not be another time."""
         key = (frame.identifier, frame.data)
         with self._lock:
@@ -213,7 +213,7 @@ class Bus:
         if message.is_remote_frame or not message.is_extended_id or own:
             return None
         frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, self._arrival(message.timestamp))
-        return None if self._echoes and self._echoes.take(frame) else frame
+        return None if self._echoes and self._echoes.discard_echo(frame) else frame
 
     def _arrival(self, timestamp: float) -> float:
         """Time of arrival on the monotonic clock: taken back by the age of a time stamp of this machine's clock."""

@@ -238,7 +238,7 @@ class BroadcastReplies:
         """Addresses of which an answer began and did not end."""
         return set(self._partial)
 
-    def take(self, frame: Frame) -> Frame | None:
+    def add_frame(self, frame: Frame) -> Frame | None:
         """Take any frame of the bus; returns the flow control that it asks for, if any. Never raises."""
         ends = addresses(frame.identifier)
         if ends is None or ends[0] != self.own or len(frame.data) < 2:
@@ -272,7 +272,7 @@ class BroadcastReplies:
         partial = self._partial.get(node)
         if partial is None:
             return None
-        match partial.take(frame.data):
+        match partial.add_frame(frame.data):
             case "again" | "torn":
                 self.conflicts.add(node)
                 del self._partial[node]
@@ -514,7 +514,7 @@ class BusMultiplexer:
         with self._lock:
             self._listeners = tuple(other for other in self._listeners if other is not listener)
 
-    def line(self, node: int, own: int | None = None) -> AddressPair:
+    def address_pair(self, node: int, own: int | None = None) -> AddressPair:
         """The line to the node at this address; ``own`` is another address than this station's, to try a node out."""
         pair = node, self.own if own is None else own
         line = self._lines.get(pair)  # there already for all frames but the first: a new one costs more than a frame
@@ -569,7 +569,7 @@ class BusMultiplexer:
         if ends is not None and len(frame.data) >= 2:
             own, node = ends
             if own == self.own or (node, own) in self._lines:
-                self._from_node(self.line(node, own), frame)
+                self._from_node(self.address_pair(node, own), frame)
         for listener in self._listeners:
             listener.offer(frame)
 
@@ -640,7 +640,7 @@ class BusMultiplexer:
         partial = line.partial
         if partial is None:
             return
-        match partial.take(frame.data):
+        match partial.add_frame(frame.data):
             case "whole":
                 line.partial = None
                 line.events.put(ReplyEvent("whole", bytes(partial.octets), frame.at))
@@ -655,7 +655,7 @@ class BusMultiplexer:
         gathering = asked.gathering
         asked.heard_at = max(asked.heard_at, frame.at)
         before = len(gathering.answers), len(gathering.conflicts)
-        answer = gathering.take(frame)
+        answer = gathering.add_frame(frame)
         if answer is not None:
             self._reply(answer)
         if node in gathering.clashes:

@@ -89,7 +89,7 @@ def _news(bus: BusMultiplexer, asked: PendingBroadcast, silence: float, longest:
             return
 
 
-def settle(found: FunctionalAnswers, ask: AskOne, *, until: float) -> FunctionalAnswers:
+def ask_unclear_again(found: FunctionalAnswers, ask: AskOne, *, until: float) -> FunctionalAnswers:
     """Ask each address that remained unclear by itself: a lost frame does not come twice, two nodes do.
 
     ``until`` is a monotonic time. Keeps as ``conflicts`` where two really answer, as ``unfinished`` where nobody does.

@@ -135,7 +135,7 @@ class Pair:
         self._logic.send(body)
         self.run()
 
-    def take(self, frame: Frame) -> bool:
+    def handle_frame(self, frame: Frame) -> bool:
         """Give in one frame; whether it was of this pair. We answer in the form (classic, FD) in which we are asked."""
         if frame.identifier != self._receive_id:
             return False
@@ -353,7 +353,7 @@ class Reassembly:
         """Whether no message of the profile has that length."""
         return self.length > LONGEST
 
-    def take(self, data: bytes) -> Taken:
+    def add_frame(self, data: bytes) -> Taken:
         """Take a consecutive frame.
 
         ``block`` asks for a flow control, ``again`` is the frame before once more, ``torn`` one out of sequence.

@@ -107,7 +107,7 @@ class CanLink:
 
     def exchange(self, frame: bytes) -> bytes:
         """Send one command frame and return its reply; see ``Link.exchange``."""
-        return self.ask(frame, tries=TRIES, seconds=self._reply_seconds)
+        return self.exchange_limited(frame, tries=TRIES, seconds=self._reply_seconds)
 
     def exchange_within(self, frame: bytes, seconds: float) -> bytes:
         """Send one command frame that is of no use after ``seconds``; see ``DeadlineLink.exchange_within``."""
@@ -143,7 +143,7 @@ class CanLink:
         """Who answers Identify at this address."""
         link = CanLink(self._bus, self._number, address, source=self._source)
         try:
-            reply = decode_reply(link.ask(IDENTIFY.encode(), tries=1, seconds=_HELLO_SECONDS))
+            reply = decode_reply(link.exchange_limited(IDENTIFY.encode(), tries=1, seconds=_HELLO_SECONDS))
             return Identity.decode(reply.payload)
         except (NodeSilentError, GarbledError, BadDataError):
             return None
@@ -151,7 +151,7 @@ class CanLink:
     def begin(self, octets: int) -> bytes:
         """The frame by which the node answers the first frame of a request of so many octets."""
         bus, transaction = self._bus(), self._number()
-        with bus.line(self.address, self._source).exchange(transaction) as line:
+        with bus.address_pair(self.address, self._source).exchange(transaction) as line:
             head, _ = first_frame(bytes([transaction]).ljust(octets, b"\0"), fd=bus.spec.fd)
             bus.send(Frame(physical_id(line.node, line.own), head, bus.spec.fd))
             until = time.monotonic() + _HELLO_SECONDS
@@ -164,7 +164,7 @@ class CanLink:
                     return single(event.body, fd=bus.spec.fd) if event.kind == "whole" else b"\x10"
         return b""
 
-    def ask(self, frame: bytes, *, tries: int, seconds: float) -> bytes:
+    def exchange_limited(self, frame: bytes, *, tries: int, seconds: float) -> bytes:
         """As ``exchange``, at most ``tries`` times, each with ``seconds`` of silence allowed."""
         self._last = self._number()
         return self._ask(frame, self._last, tries=tries, seconds=seconds)
@@ -172,7 +172,7 @@ class CanLink:
     def _ask(self, frame: bytes, transaction: int, *, tries: int, seconds: float, prompt: bool = False) -> bytes:
         bus = self._bus()
         try:
-            with bus.line(self.address, self._source).exchange(transaction) as line:
+            with bus.address_pair(self.address, self._source).exchange(transaction) as line:
                 line.gap = self.gap
                 body = bytes([transaction]) + frame
                 exchange = _Exchange(bus, line, body, tries, seconds, prompt=prompt, hopeless=self.hopeless)

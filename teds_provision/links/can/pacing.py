@@ -86,7 +86,7 @@ class Pacer:
         # a controller has a queue: the next frame is made ready while this one is still on the wire
         queued = now - self._free_at < self._last
         begin = self._free_at if queued else now
-        self._free_at = begin + duration if self._wire is None else self._wire.take(begin, duration)
+        self._free_at = begin + duration if self._wire is None else self._wire.occupy(begin, duration)
         self._last = duration
         if (left := self._free_at - time.perf_counter()) > _BEFORE:
             time.sleep(left - _BEFORE)
@@ -115,7 +115,7 @@ class Wire:
         os.ftruncate(self._file, _UNTIL.size)  # as it is, or zero
         self._shared = mmap.mmap(self._file, _UNTIL.size)
 
-    def take(self, begin: float, duration: float) -> float:
+    def occupy(self, begin: float, duration: float) -> float:
         """Take the wire for so many seconds, at ``begin`` or as soon as it is free; returns the end (perf_counter)."""
         with self._turn:
             fcntl.lockf(self._file, fcntl.LOCK_EX)

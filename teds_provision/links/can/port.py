@@ -21,8 +21,8 @@ from teds_provision.links.can.identify_broadcast import (
     FunctionalAnswers,
     ask_all,
     ask_one,
+    ask_unclear_again,
     conflict_text,
-    settle,
     twice_text,
     unfinished_text,
 )
@@ -123,7 +123,7 @@ class CanPort:
         link = self.link(address)
         if until_announced:
             link.hopeless = partial(self.bus().announced_since, address, time.monotonic())
-        return ask_one(partial(link.ask, tries=1, seconds=seconds))
+        return ask_one(partial(link.exchange_limited, tries=1, seconds=seconds))
 
     # -- finding ---------------------------------------------------------------------------------------------------
 
@@ -234,7 +234,7 @@ class CanPort:
         left = until - time.monotonic()
         if found.conflicts and left > 0:
             found = found.cleared_by(self._asked_once(min(LONGEST_SECONDS, left)))
-        return settle(found, self.identify, until=until)
+        return ask_unclear_again(found, self.identify, until=until)
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
         """Yield each node once: when it first answers, when it comes back, and when it is in factory state again.
@@ -283,7 +283,7 @@ class CanPort:
             return None
         if wanted(identity):
             return self._contact(node, identity)
-        _tell(notice, told, node, identity)
+        _report_unwanted(notice, told, node, identity)
         return None
 
     def _among_all(
@@ -304,14 +304,14 @@ class CanPort:
         for node, identity in sorted(found.identities.items()):
             if wanted(identity):
                 return self._contact(node, identity)
-            _tell(notice, told, node, identity)
+            _report_unwanted(notice, told, node, identity)
         self.tell_of_rivals(notice)
         if found.conflicts:
             raise conflict(min(found.conflicts))
         return None
 
 
-def _tell(notice: NoticeSink, told: set[bytes], node: int, identity: Identity) -> None:
+def _report_unwanted(notice: NoticeSink, told: set[bytes], node: int, identity: Identity) -> None:
     if identity.uuid not in told:
         told.add(identity.uuid)
         text = f"Node {identity.uuid.hex()} answers at 0x{node:02X}, but it is not the node that was requested."

@@ -101,7 +101,7 @@ class Requester:
         more = self._held + len(body) < total
         return Piece(self._transaction, total, self._held if body else 0, body, more=more and bool(body))
 
-    def take(self, piece: Piece) -> bool:
+    def handle_piece(self, piece: Piece) -> bool:
         """Take in what the node wrote; False when it is not an answer of this transaction and must be dropped.
 
         Raises GarbledError when the pieces do not fit together.

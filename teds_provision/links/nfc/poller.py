@@ -74,7 +74,7 @@ class Poller:
                 raise NodeSilentError(f"The node did not finish its reply within {LONGEST:.0f} s.")
             steps += 1
             request = message.encode([tnep.payload_record(requester.next().encode())])
-            self._exchange(request, lambda records: _take(records, requester))
+            self._exchange(request, lambda records: _handle_records(records, requester))
         return reply
 
     def deselect(self) -> None:
@@ -116,11 +116,11 @@ class Poller:
             self._sleep(min(interval, left))
 
 
-def _take(records: Sequence[NdefRecord], requester: Requester) -> bool:
+def _handle_records(records: Sequence[NdefRecord], requester: Requester) -> bool:
     payload = tnep.external(records, tnep.TIM_TYPE)
     if payload is None:
         raise GarbledError("The node answered without a payload record.")
-    return requester.take(Piece.decode(payload))
+    return requester.handle_piece(Piece.decode(payload))
 
 
 def _successful(records: Sequence[NdefRecord]) -> Sequence[NdefRecord]:

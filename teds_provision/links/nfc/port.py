@@ -136,7 +136,7 @@ class NfcPort:
             if isinstance(seen, NodeInField) and wanted(seen.identity):
                 return self._contact(seen, notice)
             if seen is not None:
-                told = _tell(seen, told, notice)
+                told = _report_tag(seen, told, notice)
                 self._stay(seen, never, _LOOK_AGAIN)
                 continue
             if not waiting:
@@ -182,7 +182,7 @@ class NfcPort:
                 stop.wait(_SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE)
                 continue
             if isinstance(seen, ForeignTag):
-                told = _tell(seen, told, notice)
+                told = _report_tag(seen, told, notice)
                 self._stay(seen, stop, _LOOK_AGAIN)
                 continue
             told = ""
@@ -387,7 +387,7 @@ def _contact(visit: NodeInField, link: NfcLink, trace: Trace | None) -> Contact:
     return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble, trace=trace)
 
 
-def _tell(seen: NodeInField | ForeignTag, told: str, notice: NoticeSink) -> str:
+def _report_tag(seen: NodeInField | ForeignTag, told: str, notice: NoticeSink) -> str:
     """Name a tag that is waited past, unless it was the last one named; return what was said."""
     if isinstance(seen, ForeignTag):
         text = seen.text

@@ -124,15 +124,15 @@ def integers(values: Sequence[int]) -> NDArray[Any]:
 class BlockJoiner:
     """Joins blocks of a stream that follow each other, so that few and large ones go on.
 
-    :meth:`take` gives back what is ready, at the latest when :data:`ROWS` rows wait; nodes stay as near to each other
-    as the rows of so many instants are.
+    :meth:`add_block` gives back what is ready, at the latest when :data:`ROWS` rows wait; nodes stay as near to each
+    other as the rows of so many instants are.
     """
 
     def __init__(self) -> None:
         self._waiting: dict[tuple[str, int, tuple[int, ...]], list[list[Block]]] = {}
         self._rows = 0
 
-    def take(self, block: Block) -> list[Entry]:
+    def add_block(self, block: Block) -> list[Entry]:
         """Take one more."""
         runs = self._waiting.setdefault((block.uuid, block.stream, block.channels), [])
         if runs and _follows(runs[-1], block):

@@ -99,7 +99,7 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
                     writer.finish()
                     made.append(path.with_suffix(f".{len(made) + 1}{path.suffix}"))
                     writer = ParquetWriter(made[-1], list(known.values()), recording.station, wide=wide)
-            writer.take(entry)
+            writer.add_entry(entry)
         writer.finish()
     finally:
         writer.close()
@@ -115,7 +115,7 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
 def _counted(recording: Recording, summary: RecordingSummary) -> Iterator[Entry]:
     """The entries, each counted; a channel that no head named gets a place among the facts."""
     for entry in recording.entries():
-        summary.take(entry)
+        summary.add_entry(entry)
         if isinstance(entry, Block):
             for number in entry.channels:
                 if (entry.uuid, number) not in recording.facts:
@@ -154,7 +154,7 @@ def _rows_until(until: float, waiting: list[Block], grid: Grid) -> tuple[list[Bl
         for one in waiting:
             count = int(np.searchsorted(one.time, end, "right"))
             if count:
-                grid.take(part_of(one, slice(None, count)))
+                grid.add_block(part_of(one, slice(None, count)))
             if count < len(one.time):
                 left.append(part_of(one, slice(count, None)))
         waiting = left

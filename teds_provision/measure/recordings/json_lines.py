@@ -91,7 +91,7 @@ class JsonLines(Recording):
         for line in self._lines():
             event = self._event(line)
             if together and not _goes_with(together, event):
-                yield from joined.take(self._block(together, numbers))
+                yield from joined.add_block(self._block(together, numbers))
                 together = []
             if event.get("event") == "data":
                 together.append(event)
@@ -99,7 +99,7 @@ class JsonLines(Recording):
                 yield from joined.rest()
                 yield entry
         if together:
-            yield from joined.take(self._block(together, numbers))
+            yield from joined.add_block(self._block(together, numbers))
         yield from joined.rest()
 
     def _other(self, event: dict[str, Any]) -> Entry | None:

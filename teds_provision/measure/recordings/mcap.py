@@ -221,7 +221,7 @@ class McapRecording(Recording):
         for (number, length), contents in waiting.items():
             topic = topics[number]
             for block in self._decoded(topic, contents, length):
-                yield from joined.take(block)
+                yield from joined.add_block(block)
 
     def _decoded(self, topic: _Topic, contents: list[bytes], length: int) -> Iterator[Block]:
         """Blocks of messages of one length, so of one layout; a jump of the sample number begins another one."""

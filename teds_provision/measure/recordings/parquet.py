@@ -81,7 +81,7 @@ class ParquetWriter:
         pa = self._pa
         return {"float": pa.float64(), "uint64": pa.uint64(), "int64": pa.int64()}.get(raw_kind(form), pa.string())
 
-    def take(self, entry: Entry) -> None:
+    def add_entry(self, entry: Entry) -> None:
         """One entry; raises BadDataError for a raw value that is not what its channel's datasheet says."""
         if isinstance(entry, Block | GroupRows):
             self._waiting.append(entry)

@@ -55,7 +55,7 @@ class RecordingSummary:
     _before: dict[str, NodeReport] = field(default_factory=dict)
     _next: dict[tuple[str, int, tuple[int, ...]], int] = field(default_factory=dict)
 
-    def take(self, entry: Entry) -> None:
+    def add_entry(self, entry: Entry) -> None:
         """One entry."""
         if isinstance(entry, Block):
             self._block(entry)

@@ -59,31 +59,31 @@ class CommonStart:
     def _waited(self) -> int:
         return len(self._begun) + len(self._coming) + 1
 
-    def gone(self, uuid: bytes) -> None:
+    def drop_node(self, uuid: bytes) -> None:
         """A node that will not come: nobody waits for it any more."""
         with self._turn:
             self._coming.discard(uuid)
             self._turn.notify_all()
 
-    def late(self, uuid: bytes) -> None:
+    def start_by_itself(self, uuid: bytes) -> None:
         """The node called its start too late: it begins by itself."""
         self._begun.pop(uuid, None)
 
-    def until(self, start: int) -> float:
+    def seconds_until(self, start: int) -> float:
         """Seconds from now to a start; 0 where it is soon, or waits."""
         if start in (SOON, WAITS) or self._at is None:
             return 0.0
         return max(0.0, self._at - time.monotonic())
 
     @property
-    def left(self) -> float | None:
+    def seconds_left(self) -> float | None:
         """Seconds from now until the first values are taken; None where the trigger has not gone out yet."""
         if self._trigger:
             return 0.0 if self._triggered else None
         return max(0.0, (self._at or 0.0) - time.monotonic())
 
     @property
-    def apart(self) -> float:
+    def spread(self) -> float:
         """By how many seconds the beginnings differ, by the clocks as they are known now; 0.0 for one node."""
         moments = [clock.host_of(tick) for clock, tick in self._begun.values()]
         return max(moments) - min(moments) if moments else 0.0

@@ -141,17 +141,17 @@ class MeasurementJob:
         if self._thread is not None:
             self._thread.join(seconds)
 
-    def let_go(self, uuid: bytes, why: str, seconds: float) -> bool:
-        """Measure a node no more until :meth:`take_back`; False where it did not end in order within ``seconds``."""
+    def suspend_node(self, uuid: bytes, why: str, seconds: float) -> bool:
+        """Measure a node no more until :meth:`resume_node`; False where it did not end in order within ``seconds``."""
         self.lent.add(uuid)
         measurement = self.measurement
-        return measurement is None or measurement.let_go(uuid, why, seconds)
+        return measurement is None or measurement.suspend_node(uuid, why, seconds)
 
-    def take_back(self, uuid: bytes) -> None:
+    def resume_node(self, uuid: bytes) -> None:
         """Measure a node again that was let go."""
         measurement = self.measurement
         if measurement is not None:
-            measurement.take_back(uuid)
+            measurement.resume_node(uuid)
         self.lent.discard(uuid)
 
     @property

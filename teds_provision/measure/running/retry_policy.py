@@ -34,13 +34,13 @@ class RetryPolicy:
         self._until = math.inf
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds in which a first value has to come."""
         return max(0.0, self._until - time.monotonic())
 
     def again(self, pause: float) -> str:
         """When it is tried again, and for how long that goes on."""
-        left = self.left
+        left = self.seconds_left
         return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, giving up in {left:.0f} s"
 
     def gives_up(
@@ -52,11 +52,11 @@ class RetryPolicy:
         ``proven``: the error came in a session. Outside one anybody on the bus can have given himself the node's UUID
         and refuse to open one: then it is looked for ``elsewhere``.
         """
-        if self.left == math.inf:  # a datasheet that was changed under its values ends what has an end
+        if self.seconds_left == math.inf:  # a datasheet that was changed under its values ends what has an end
             return self._ends and (decided or (proven and isinstance(error, BadDatasheetError)))
         if decided:
             return True
         passing = isinstance(error, NodeRefusedError) and error.reason in CURED_BY_TIME
         if not isinstance(error, _FINAL) or passing:
-            return not self.left
+            return not self.seconds_left
         return proven or not elsewhere()

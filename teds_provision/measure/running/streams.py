@@ -128,7 +128,7 @@ class NodeStreams:
         """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
         bus.hearing.expect(address, number)
-        payload = trusted.node.send(plan.command(), "to stream")
+        payload = trusted.node.request(plan.command(), "to stream")
         with self.mapping:
             reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()), after=self._run)
         self._run = reply.run
@@ -165,7 +165,7 @@ class NodeStreams:
         for number, heard in list(self.running.items()):
             if trusted is not None:
                 with suppress(TedsProvisionError, SessionLostError):
-                    counter = decode_stopped(trusted.node.send(stop(number), "to stop a stream"))
+                    counter = decode_stopped(trusted.node.request(stop(number), "to stop a stream"))
                     due = min(counter, wanted[number]) if wanted[number] else counter
                     heard.hear_out(due)
                     heard.receiver.finish(counter, due)

@@ -61,7 +61,7 @@ def _arm(
             continue
         try:
             with keeper.turn:
-                trusted.node.send(token.arm(Action.START, TRIGGER_LIFE).command(), "to wait for the trigger")
+                trusted.node.request(token.arm(Action.START, TRIGGER_LIFE).command(), "to wait for the trigger")
             armed.append((keeper, trusted))
         except (TedsProvisionError, SessionLostError) as error:
             note(f"Node {keeper.uuid.hex()} did not accept the trigger: {error}")

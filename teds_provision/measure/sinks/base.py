@@ -92,8 +92,8 @@ class Sink(Protocol):
 class ThreadedSink(ABC):
     """A sink whose work is done by one thread of its own; subclasses fill in four steps and the name.
 
-    The steps are called on that thread alone, one after another: ``_begin`` before anything else, ``_take`` for each
-    item, ``_idle`` at least every TICK, ``_finish`` at the end (also after an error of ``_take``).
+    The steps are called on that thread alone, one after another: ``_begin`` before anything else, ``_process_item`` for
+    each item, ``_idle`` at least every TICK, ``_finish`` at the end (also after an error of ``_process_item``).
     """
 
     recorder = False
@@ -165,7 +165,7 @@ class ThreadedSink(ABC):
         """First step on the sink's own thread."""
 
     @abstractmethod
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         """One item."""
 
     def _first(self) -> None:
@@ -173,8 +173,8 @@ class ThreadedSink(ABC):
         self._begin()
 
     def _one(self, item: Item) -> None:
-        """Call ``_take``."""
-        self._take(item)
+        """Call ``_process_item``."""
+        self._process_item(item)
 
     def _beat(self, now: float) -> None:
         """Call ``_idle``."""
@@ -195,7 +195,7 @@ class ThreadedSink(ABC):
             tally.octets += octets
             tally.messages += messages
 
-    def _say(self, state: Literal["running", "waiting", "ended"], detail: str = "") -> None:
+    def _set_state(self, state: Literal["running", "waiting", "ended"], detail: str = "") -> None:
         """Set the state that people see; a failure stays."""
         with self._lock:
             if self._tally.state != "failed":
@@ -258,7 +258,7 @@ class ThreadedSink(ABC):
         try:
             self._first()
             if self.stats.state == "starting":  # a sink that waits for somebody has said so by now
-                self._say("running")
+                self._set_state("running")
             self._run()
         except TedsProvisionError as error:
             self._fail(error)
@@ -286,7 +286,7 @@ class ThreadedSink(ABC):
             self._fail(error)
         except OSError as error:
             self._fail(as_sink_failure(error, self.name))
-        self._say("ended")
+        self._set_state("ended")
 
 
 def as_sink_failure(error: OSError, name: str) -> TedsProvisionError:

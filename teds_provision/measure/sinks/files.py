@@ -181,7 +181,7 @@ class FileSink(ThreadedSink):
                     if first and entry.samples:
                         self._tell_counts(entry)
                         continue
-                self._take(entry)
+                self._process_item(entry)
             self._close_part()
         finally:
             part, self._part = self._part, None
@@ -196,7 +196,7 @@ class FileSink(ThreadedSink):
 
     def _tell_counts(self, report: NodeReport) -> None:
         """Write what was counted of a node by now, as the beginning of a part needs it (summary.py)."""
-        self._take(report)
+        self._process_item(report)
 
     def _first(self) -> None:
         try:
@@ -218,7 +218,7 @@ class FileSink(ThreadedSink):
                 self._new_part()
                 self._note(item.time, item.words)
             else:
-                self._take(item)
+                self._process_item(item)
         except OSError as error:
             self._wait_for_room(error)
 
@@ -253,7 +253,7 @@ class FileSink(ThreadedSink):
         self._full = time.time(), before, what
         lost = self._abandon()
         self._count(written=-lost, dropped=lost)
-        self._say("waiting", f"The {what} since {iso(self._full[0])}: nothing is recorded until space is free.")
+        self._set_state("waiting", f"The {what} since {iso(self._full[0])}: nothing is recorded until space is free.")
 
     def _abandon(self) -> int:
         """Let the part go, and one without a whole piece altogether; how many values are lost with it."""
@@ -297,7 +297,7 @@ class FileSink(ThreadedSink):
             return
         self._full, self._unsaid = None, []
         self._gaps.append(gap)
-        self._say("running", gap)
+        self._set_state("running", gap)
 
     # -- parts ---------------------------------------------------------------------------------------------------------
 

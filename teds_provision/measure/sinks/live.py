@@ -173,7 +173,7 @@ class TopicSink(ThreadedSink):
         if scalars is None or time.monotonic() >= scalars.due:
             super().write(block)
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):
             self._block(item)
         elif isinstance(item, GroupRows):
@@ -346,7 +346,7 @@ class TopicSink(ThreadedSink):
         self._sent, self._second = 0, now
         if self.stats.state == "running":
             over = f", above the {BUDGET} that one process can handle: lower --scalar-rate" if rate > BUDGET else ""
-            self._say("running", f"{rate:.0f} messages/s{over}")
+            self._set_state("running", f"{rate:.0f} messages/s{over}")
         self._diagnose(time.time(), self._statuses(rate))
 
     def _statuses(self, rate: float) -> list[DiagnosticEntry]:

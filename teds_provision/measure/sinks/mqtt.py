@@ -180,7 +180,7 @@ class MqttSink(ThreadedSink):
 
     def _waits(self, why: str) -> None:
         self._why = why
-        self._say("waiting", why or f"waiting for the broker at {self._host}")
+        self._set_state("waiting", why or f"waiting for the broker at {self._host}")
 
     def _begin(self) -> None:
         self._waits("")
@@ -202,7 +202,7 @@ class MqttSink(ThreadedSink):
         if renamed:
             self._owed_entities |= dict.fromkeys(key for key in self._facts if key[0] in renamed)
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         self._greet()
         if isinstance(item, Block):
             self._block(item)
@@ -223,7 +223,7 @@ class MqttSink(ThreadedSink):
         if self._anew.is_set() and self._client.publish(self._status, "online", qos=1, retain=True).rc != _FULL:
             self._anew.clear()
             self._why = ""
-            self._say("running", f"connected to {self._host}")
+            self._set_state("running", f"connected to {self._host}")
             self._owed_entities = dict.fromkeys(self._facts)
             self._announce()
 

@@ -42,7 +42,7 @@ class TextSink(FileSink):
         self._templates: dict[tuple[str, tuple[int, ...], bool, str], tuple[str, list[int]]] = {}
         self._not_a_number = re.compile(f"(?<={self._comma})nan(?=[{self._comma}\n])")
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):
             self._block(item)
         elif isinstance(item, tuple):
@@ -231,7 +231,7 @@ class JsonLinesSink(FileSink):
                 self.facts[one.key] = one
                 self._add(as_line({"event": "channel", **facts_as_json(one)}))
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):
             self._count(written=item.value.size, messages=len(item.channels))
             self._add(b"".join(as_line(line) for line in data_lines(item, self.facts)), item.value.size)

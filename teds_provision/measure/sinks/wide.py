@@ -35,14 +35,14 @@ class WideSink(TextSink):
         self._unwritten: list[tuple[float, str]] = []  # notes that wait for the head of their part
         self._nan = re.compile(f"(?<=[{self._comma}])nan(?=[{self._comma}\n])")
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         if isinstance(item, GroupRows):
             self._rows_of(item)
         elif isinstance(item, tuple):
             if self._learn(item):  # other columns, or another datasheet: the next rows begin another part
                 self._changed = bool(self._columns)
         elif not isinstance(item, Block):
-            super()._take(item)
+            super()._process_item(item)
 
     def _begin(self) -> None:
         """Begin with the first row, which says what channels there are."""

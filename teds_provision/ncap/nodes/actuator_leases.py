@@ -179,7 +179,7 @@ class ActuatorLeases:
         held.until = time.monotonic() + seconds
         return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
 
-    def let_go(self, uuid: str, channel: int) -> dict[str, Any]:
+    def release_actuator(self, uuid: str, channel: int) -> dict[str, Any]:
         """Let go now; ``safe`` is what the node itself said, None where it did not say."""
         with self._guard:
             held = self._held.get((uuid, channel))
@@ -197,7 +197,7 @@ class ActuatorLeases:
         with self._guard:
             every = list(self._held)
         for uuid, channel in every:
-            self.let_go(uuid, channel)
+            self.release_actuator(uuid, channel)
 
     # -- the thread of one actuator ----------------------------------------------------------------------------------
 
@@ -218,7 +218,7 @@ class ActuatorLeases:
                 asked = {"value": held.order.value, "unit": held.order.unit or ""}
                 why = {} if held.error is None else {"why": held.error.message}
                 self._station.audit("set", node, outcome, safe=held.safe, **asked, **why, **facts)
-            self._tell(held, safe=held.safe)
+            self._publish_state(held, safe=held.safe)
             with self._guard:
                 if self._held.get((held.uuid, held.channel)) is held:  # not the one after it
                     del self._held[held.uuid, held.channel]
@@ -252,7 +252,7 @@ class ActuatorLeases:
         contact = self._desk.contact(uuid)
         if contact is None:
             raise NoNodeError(f"Node {uuid} is not on any bus of this station.", hint="Connect it to a bus.")
-        with self._turns.of(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
+        with self._turns.hold(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
             yield open_trusted(self._station, node, by="ncap")
 
     def _hold(self, held: _HeldActuator, session: Measured) -> None:
@@ -282,7 +282,7 @@ class ActuatorLeases:
                 with held.news:
                     held.applied, held.answered = applied.as_json(), order.number
                     held.news.notify_all()
-                self._tell(held, safe=False)
+                self._publish_state(held, safe=False)
                 self._until_news(held, answered, actuator.pause)
         finally:
             if actuator is not None:
@@ -335,7 +335,7 @@ class ActuatorLeases:
             left = max(0.0, min(pause, held.until - time.monotonic()))
             held.news.wait_for(lambda: held.let_go or held.order.number != answered, left)
 
-    def _tell(self, held: _HeldActuator, *, safe: bool | None) -> None:
+    def _publish_state(self, held: _HeldActuator, *, safe: bool | None) -> None:
         applied = held.applied or {}
         facts = {"value": applied.get("value"), "unit": applied.get("unit"), "safe": safe}
         self._last[held.uuid, held.channel] = facts

@@ -95,7 +95,7 @@ class NodeDirectory:
             return known[1]
         image = self._station.nodes.datasheet(bytes.fromhex(uuid))
         shown = shown_units(self._station, bytes.fromhex(uuid))
-        sheet = Sheet.of(image).shown_in(shown) if image is not None else None
+        sheet = Sheet.from_image(image).shown_in(shown) if image is not None else None
         channels = [channel_facts(one) for one in sheet.channels] if sheet is not None else []
         with self._lock:
             self.changes += 1

@@ -18,8 +18,8 @@ from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import IdentifiedNode, identify
 from teds_provision.steps.readings import NodeVerdict, is_keyed, keep
 from teds_provision.steps.teds_read import list_blocks, read_block, read_identity, read_image
-from teds_provision.steps.verify import Verification, known_of, session, verify_image
-from teds_provision.steps.verify_node import look_in_session
+from teds_provision.steps.verify import Verification, freshness_floor_of, session_check, verify_image
+from teds_provision.steps.verify_node import verify_in_session
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, Image
@@ -56,8 +56,8 @@ def _in_session(station: Station, node: Conversation) -> NodeInspection | None:
     """In a session, as before a measurement."""
     if session_if_keyed(station, node) is None:
         return None
-    looked = look_in_session(station, node, by="ncap")
-    sheet = Sheet.of(looked.image) if looked.verified.verdict == "not authentic" else None
+    looked = verify_in_session(station, node, by="ncap")
+    sheet = Sheet.from_image(looked.image) if looked.verified.verdict == "not authentic" else None
     return NodeInspection(looked.judged, sheet, power_of(node))
 
 
@@ -67,7 +67,7 @@ def read_anew(station: Station, node: Conversation) -> tuple[Image, NodeVerdict]
         return None
     c, identity = node.c, read_identity(node)
     image = read_image(node)
-    known = known_of(station, node.uuid, identity)
+    known = freshness_floor_of(station, node.uuid, identity)
     with station.durable("read"):
         return image, keep(station, node, image, by="ncap", known=known, c=c)
 
@@ -87,14 +87,16 @@ def _stranger(station: Station, node: Conversation, who: IdentifiedNode) -> Node
         blocks[block] = octets
     image = Image(node.uuid, blocks)
     why = "the node does not open a session with any key held here" if is_keyed(station, node.uuid) else ""
-    checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
-    return NodeInspection(NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"), Sheet.of(image))
+    checks = (*verify_image(station, image, known=freshness_floor_of(station, node.uuid, None)), session_check("", why))
+    return NodeInspection(
+        NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"), Sheet.from_image(image)
+    )
 
 
 def power_of(node: Conversation) -> dict[str, Any] | None:
     """128.18 in an open session, None where the node does not tell."""
     try:
-        return PowerReply.decode(node.send(POWER, "to tell its power")).as_json()
+        return PowerReply.decode(node.request(POWER, "to tell its power")).as_json()
     except (NodeRefusedError, BadDataError):
         return None
 

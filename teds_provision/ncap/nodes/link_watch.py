@@ -187,7 +187,7 @@ class LinkWatch:
                 if self.port is None:
                     self.port = open_place(self.place, self._trace)
                     pause = FIRST_PAUSE
-                self._say("up")
+                self._publish_state("up")
                 self._watch(self.port)
             except TedsProvisionError as error:
                 self._down(error)
@@ -199,7 +199,7 @@ class LinkWatch:
                 pause = min(2 * pause, LAST_PAUSE)
 
     def _down(self, error: TedsProvisionError) -> None:
-        self._say("down", error)
+        self._publish_state("down", error)
         self._roster.forget_place(self.place)
         self._close()
 
@@ -218,7 +218,10 @@ class LinkWatch:
             self._came(contact)
 
     def _watch_bus(self, port: CanPort | BlePort, poll: float) -> None:
-        """The look-out tells of who answers (:meth:`saw`); here is seen who does not any more, and whether it works."""
+        """The look-out tells of who answers (:meth:`on_sighting`).
+
+        Here is seen who does not any more, and whether it works.
+        """
         bus = self._buses.add(port)
         bus.lookout.poll(poll)
         asked = PresenceCheck(port, self._is_held) if isinstance(port, CanPort) else None
@@ -229,13 +232,13 @@ class LinkWatch:
                 with suppress(LinkError):
                     bus.lookout.discover()
             failure = bus.lookout.failure
-            self._say("up" if failure is None else "down", failure)
+            self._publish_state("up" if failure is None else "down", failure)
             if isinstance(port, CanPort) and failure is None:
                 port.tell_of_rivals(self._notice)
             if asked is not None and failure is None:
                 for uuid, sighting in asked.look(dict(self._known)):
                     if sighting is not None:
-                        self.saw(sighting)
+                        self.on_sighting(sighting)
                     elif not self._is_held(uuid):
                         self._gone(uuid)
             else:
@@ -250,7 +253,7 @@ class LinkWatch:
     def _is_held(self, uuid: str) -> bool:
         return self._turns.holder(uuid) is not None
 
-    def saw(self, sighting: Sighting) -> None:
+    def on_sighting(self, sighting: Sighting) -> None:
         """A node answered on this bus; called from the look-out's thread."""
         uuid, identity = sighting.uuid.hex(), sighting.identity
         before = self._known.pop(uuid, None)  # who was seen last stands last
@@ -298,7 +301,7 @@ class LinkWatch:
         """Close the reader for as long as somebody has it."""
         self._close()
         self._roster.forget_place(self.place)
-        self._say("lent")
+        self._publish_state("lent")
         self._free.set()
         while self._borrowers and not self._stop.is_set():
             while self._borrowers and not self._stop.wait(0.1):
@@ -316,14 +319,14 @@ class LinkWatch:
         if notice.kind == "node-left" and notice.uuid is not None:
             self._left(notice.uuid.hex())
         elif notice.kind == "reader-lost":
-            self._say("down", LinkError(notice.text))
+            self._publish_state("down", LinkError(notice.text))
             self._roster.forget_place(self.place)
         elif notice.kind == "reader-ready":
-            self._say("up")
+            self._publish_state("up")
         elif notice.kind == "waiting":
             self.state.waiting = notice.text
         elif notice.kind != "retry":
-            self._tell(notice)
+            self._publish_notice(notice)
 
     def _left(self, uuid: str) -> None:
         if self._roster.stranger(self.place, uuid, there=False) or self._turns.holder(uuid) is not None:
@@ -331,13 +334,13 @@ class LinkWatch:
         if self._roster.seen(uuid).place == self.place:  # else it was carried to another link
             self._roster.note(uuid, "left", present=False)
 
-    def _tell(self, notice: Notice) -> None:
+    def _publish_notice(self, notice: Notice) -> None:
         """Something else that a person should know of, once."""
         if notice.text != self.state.told:
             self.state.told = notice.text
             self._live.event("link", place=self.place, state=notice.kind, text=notice.text)
 
-    def _say(self, state: str, error: TedsProvisionError | None = None) -> None:
+    def _publish_state(self, state: str, error: TedsProvisionError | None = None) -> None:
         problem = as_problem(error) if error is not None else None
         if (self.state.state, self.state.problem) != (state, problem):
             self.state.state, self.state.problem, self.state.since = state, problem, time.time()
@@ -391,7 +394,7 @@ class LinkWatch:
     def _serve(self, contact: Contact) -> None:
         uuid = contact.identity.uuid.hex()
         try:
-            with self._turns.of(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
+            with self._turns.hold(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
                 if not self._taps.serve_node(node):
                     self._look(node)
         except FrozenError:  # its measurement verified it, and says how it does
@@ -441,7 +444,7 @@ class LinkWatch:
         uuid = contact.identity.uuid.hex()
         try:
             with (
-                self._turns.of(uuid, "the rest of its datasheet is read"),
+                self._turns.hold(uuid, "the rest of its datasheet is read"),
                 Conversation(contact, notice=self._notice) as node,
             ):
                 found = read_anew(self._station, node)

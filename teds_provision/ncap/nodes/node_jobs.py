@@ -40,7 +40,7 @@ class NodeLocks:
         with self._news:
             return self._holders.get(uuid)
 
-    def take(self, uuid: str, what: str, *, wait: float = WAIT, frozen: bool = False) -> None:
+    def acquire(self, uuid: str, what: str, *, wait: float = WAIT, frozen: bool = False) -> None:
         """Begin; raises FrozenError (a measurement has it) at once, NodeBusyError after ``wait`` seconds."""
         until = time.monotonic() + wait
         with self._news:
@@ -60,7 +60,7 @@ class NodeLocks:
             if frozen:
                 self._frozen.add(uuid)
 
-    def give(self, uuid: str) -> None:
+    def release(self, uuid: str) -> None:
         """End."""
         with self._news:
             self._holders.pop(uuid, None)
@@ -71,13 +71,13 @@ class NodeLocks:
             self.given(uuid)
 
     @contextmanager
-    def of(self, uuid: str, what: str, *, wait: float = WAIT) -> Iterator[None]:
+    def hold(self, uuid: str, what: str, *, wait: float = WAIT) -> Iterator[None]:
         """Work on one node for the length of the block."""
-        self.take(uuid, what, wait=wait)
+        self.acquire(uuid, what, wait=wait)
         try:
             yield
         finally:
-            self.give(uuid)
+            self.release(uuid)
 
 
 Result = TypeVar("Result")
@@ -85,7 +85,7 @@ FOR_A_TAP: Final = 45.0  # seconds that a request waits for a tap
 ON_A_BUS: Final = 10.0
 
 
-def untold(error: Exception) -> TedsProvisionError:
+def as_program_error(error: Exception) -> TedsProvisionError:
     """What a thread tells of an exception that is none of ours: the disk's, or a bug."""
     if isinstance(error, OSError):
         return StoreError(f"The system refused: {error.strerror or type(error).__name__}.", hint="See the log.")
@@ -117,7 +117,7 @@ class NodeJob(Generic[Result]):
         except TedsProvisionError as error:
             self.error = error
         except Exception as error:
-            self.error = untold(error)  # else whoever waits takes it for done
+            self.error = as_program_error(error)  # else whoever waits takes it for done
             raise
         finally:
             self.done.set()
@@ -140,7 +140,7 @@ class NodeJobs:
         """
         port = self._bus_of(uuid)
         if port is not None:
-            with self._turns.of(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
+            with self._turns.hold(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
                 try:
                     return work(node)
                 except SessionLostError as lost:

@@ -29,7 +29,7 @@ from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.directory import NodeDirectory
 from teds_provision.ncap.nodes.inspection import STRANGERS_TEDS, as_problem
-from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, untold
+from teds_provision.ncap.nodes.node_jobs import NodeJob, NodeJobs, as_program_error
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
@@ -38,7 +38,7 @@ from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, prepare
 from teds_provision.steps.datasheet_edit import write_sheet
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import ProvisionResult, newcomer, provision
+from teds_provision.steps.provision import ProvisionResult, new_whitelist_entry, provision
 from teds_provision.steps.teds_read import list_blocks
 from teds_provision.steps.verify import Verification, require_authentic
 from teds_provision.store.audit import ACTOR
@@ -87,7 +87,7 @@ class Provisioning:
         self._runs: dict[str, ProvisioningRun] = {}
         self._guard = threading.Lock()
 
-    def of(self, uuid: str) -> dict[str, Any]:
+    def run_of(self, uuid: str) -> dict[str, Any]:
         """How the last request for a node stands; raises NotFoundError."""
         with self._guard:
             run = self._runs.get(uuid)
@@ -154,7 +154,7 @@ class Provisioning:
                 ACTOR.reset(before)
 
         if uuid != NEXT and self._desk.on_a_bus(uuid):
-            self._tell(run)
+            self._publish(run)
             threading.Thread(
                 target=self._on_the_bus, args=(run, work, folder.cleanup), name=f"provision {uuid[:8]}", daemon=True
             ).start()
@@ -171,7 +171,7 @@ class Provisioning:
         if run.errand is not None and self._desk.cancel(run.errand):
             run.state, run.waits_for, run.until = "cancelled", None, None
             run.errand.done.set()
-            self._tell(run)
+            self._publish(run)
         return run.as_json()
 
     # -- the ways to the node ----------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ class Provisioning:
     ) -> None:
         run.state, run.waits_for, run.until = "waiting", "tap", time.time() + WAITING
         errand = run.errand = self._desk.wait_for(None if run.uuid == NEXT else run.uuid, "provision", work, WAITING)
-        self._tell(run)
+        self._publish(run)
 
         def watch() -> None:
             if not errand.done.wait(WAITING) and self._desk.cancel(errand):
@@ -218,7 +218,7 @@ class Provisioning:
             clean()
         except Exception as error:  # noqa: BLE001 - a thread that ends without a word leaves a run that never ends
             _log.exception("Provisioning node %s failed.", run.uuid)
-            self._fail(run, as_problem(untold(error)))
+            self._fail(run, as_problem(as_program_error(error)))
             clean()
 
     def _work(self, run: ProvisioningRun, node: Conversation, order: BuildOrder) -> None:
@@ -229,7 +229,7 @@ class Provisioning:
                 self._runs.pop(NEXT, None)
                 run.uuid = uuid
                 self._runs[uuid] = run
-        self._tell(run)
+        self._publish(run)
         reporter = _RunReporter(run, self._live)
         try:
             # Whoever asks for this very node, or for the one that they are about to tap, has accepted its key.
@@ -245,13 +245,13 @@ class Provisioning:
             self._roster.refresh([uuid])
         self._roster.note(uuid, "verified", verdict=run.verdict, heard=None, looked=time.time(), problem=None)
         run.state = "done"  # last: who hears it asks for the node next
-        self._tell(run)
+        self._publish(run)
 
     def _fail(self, run: ProvisioningRun, error: dict[str, str]) -> None:
         run.state, run.error, run.waits_for, run.until = "failed", error, None, None
-        self._tell(run)
+        self._publish(run)
 
-    def _tell(self, run: ProvisioningRun) -> None:
+    def _publish(self, run: ProvisioningRun) -> None:
         facts = {"waits_for": run.waits_for, "until": run.until, "error": run.error, "verdict": run.verdict}
         self._live.event("provision", uuid=run.uuid, state=run.state, **facts)
 
@@ -352,8 +352,8 @@ class AutoProvisioner:
                 raise BadDataError(
                     f"Node {uuid} lists {listed} TEDS; one with more than {STRANGERS_TEDS} is not adopted."
                 )
-            entry = None if who.whitelisted is not None else newcomer(self._station, node, who)
-            with self._station.turn(node.uuid):
+            entry = None if who.whitelisted is not None else new_whitelist_entry(self._station, node, who)
+            with self._station.node_lock(node.uuid):
                 agreed = agree(self._station, node, who, newcomer=entry)
             # else it would be looked at as the stranger that it was, and found unproven
             node.identity = replace(node.identity, state=NodeState.KEYED, epoch=agreed.epoch)
@@ -398,7 +398,7 @@ class AutoProvisioner:
             )
             return provision(station, node, order, accept=lambda _who: None, reporter=SilentReporter()).verified
         blocks = placed((self._virtuals.document_of(uuid) or "").encode())
-        with station.turn(node.uuid):
+        with station.node_lock(node.uuid):
             agree(station, node, identify(station, node))
             done = write_sheet(station, node, blocks, SilentReporter())
         if self._virtuals.name_of(uuid):

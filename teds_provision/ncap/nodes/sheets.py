@@ -18,7 +18,7 @@ from teds_provision.steps.datasheet_edit import SheetPlan, plan_sheet, write_she
 from teds_provision.steps.identify import identify
 from teds_provision.steps.readings import NodeVerdict, is_keyed, verdict_of
 from teds_provision.steps.teds_read import read_image
-from teds_provision.steps.verify import Verification, known_of, session, verify_image
+from teds_provision.steps.verify import Verification, freshness_floor_of, session_check, verify_image
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import SilentReporter
@@ -80,7 +80,10 @@ class Sheets:
         identify(station, node)
         image = read_image(node)
         why = "it opens no session under our key" if is_keyed(station, node.uuid) else ""
-        checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
+        checks = (
+            *verify_image(station, image, known=freshness_floor_of(station, node.uuid, None)),
+            session_check("", why),
+        )
         return DatasheetRead(image, NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
 
     def document(self, uuid: str, form: str) -> tuple[str, str]:
@@ -132,7 +135,7 @@ class Sheets:
         blocks = parsed(content)
 
         def work(node: Conversation) -> dict[str, Any]:
-            with self._station.turn(node.uuid):
+            with self._station.node_lock(node.uuid):
                 done = write_sheet(
                     self._station, node, blocks, SilentReporter(), accept_calibration=accept, retype=retype
                 )
@@ -181,7 +184,7 @@ def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
     An angle over a full turn is drawn as it is measured: within its limits, with a gap (the value None) where it goes
     on at the other end.
     """
-    sheet = Sheet.of_blocks(blocks)
+    sheet = Sheet.from_blocks(blocks)
     found = []
     for number, calibration in sheet.calibrations.items():
         channel = sheet.channel(number)

@@ -152,7 +152,7 @@ class Virtuals:
         folders = default_folders(self._station.home)
         flash = create(folder, uuid=uuid_, name=name, teds=teds, profile=profile, folders=folders)
         state = flash.load()
-        sheet = Sheet.of_blocks(flash.hardware)
+        sheet = Sheet.from_blocks(flash.hardware)
         one = Virtual(state.uuid.hex(), name or sheet.meta.name, source, folder, len(sheet.channels))
         check_name(one.name or None)
         self._require_free(state.uuid, state.can_address, one.name)
@@ -264,7 +264,7 @@ class Virtuals:
             if self._stop.is_set() or one.uuid not in self._all:
                 return
             last = log.read_text(errors="replace").strip().splitlines()
-            self._say(one, "ended", last[-1] if last else "")
+            self._publish_state(one, "ended", last[-1] if last else "")
             self._stop.wait(pause)
             pause = min(2 * pause, _LONGEST)
 
@@ -275,11 +275,11 @@ class Virtuals:
         for line in process.stdout:
             if b'"ready"' in line:
                 ready = True
-                self._say(one, "running")
+                self._publish_state(one, "running")
         process.wait()
         return ready
 
-    def _say(self, one: Virtual, state: str, why: str = "") -> None:
+    def _publish_state(self, one: Virtual, state: str, why: str = "") -> None:
         one.state, one.why = state, why
         self._live.event("virtual", uuid=one.uuid, state=state, why=why)
 

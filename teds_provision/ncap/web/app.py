@@ -128,7 +128,7 @@ class LiveSlots:
         self._most, self._of_one = most, of_one
         self._taken: dict[str, list[Callable[[], object]]] = {}
 
-    def take(self, token: str, leave: Callable[[], object]) -> bool:
+    def acquire(self, token: str, leave: Callable[[], object]) -> bool:
         """Have a place; ``leave`` is called where it has to be given up for another token. False: there is none."""
         own = self._taken.get(token, [])
         if len(own) >= self._of_one:
@@ -138,12 +138,12 @@ class LiveSlots:
             if len(self._taken[greedy]) <= len(own) + 1:
                 return False
             out = self._taken[greedy][-1]
-            self.give(greedy, out)
+            self.release(greedy, out)
             out()
         self._taken.setdefault(token, []).append(leave)
         return True
 
-    def give(self, token: str, leave: Callable[[], object]) -> None:
+    def release(self, token: str, leave: Callable[[], object]) -> None:
         """Give it back; one that was given up already is none any more."""
         own = self._taken.get(token, [])
         if leave in own:
@@ -159,7 +159,7 @@ def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
         caller: Caller = socket.scope[CALLER]
         leaving = asyncio.Event()
         leave = leaving.set
-        if not places.take(caller.digest, leave):
+        if not places.acquire(caller.digest, leave):
             await socket.close(_FULL)
             return
         tasks: list[asyncio.Task[None]] = []
@@ -174,7 +174,7 @@ def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
             finally:
                 daemon.live.leave(listener)
         finally:
-            places.give(caller.digest, leave)
+            places.release(caller.digest, leave)
             for task in tasks:
                 task.cancel()
 

@@ -75,7 +75,7 @@ class Resources:
             Route("/login-link", self.login_link, methods=["POST"]),
             Route("/openapi.json", self.openapi),
             Route("/lend", self.lend),
-            Route("/nodes/{uuid}/let-go", self.let_go),
+            Route("/nodes/{uuid}/let-go", self.lend_until_closed),
         ]
 
     async def _node_of(self, request: Request) -> str:
@@ -209,7 +209,7 @@ class Resources:
 
         return StreamingResponse(lent(), media_type="text/plain")
 
-    async def let_go(self, request: Request) -> Response:
+    async def lend_until_closed(self, request: Request) -> Response:
         """GET /nodes/UUID/let-go: a measured node is the caller's to write to until this answer is ended.
 
         Over the socket alone. A caller that dies closes it, and one that hangs has the node for a while only.
@@ -225,7 +225,7 @@ class Resources:
         async def had() -> AsyncIterator[str]:
             try:
                 try:
-                    yield "let go\n" if await changing(measuring.let_go, loan) else "not measured\n"
+                    yield "let go\n" if await changing(measuring.lend_node, loan) else "not measured\n"
                 except TedsProvisionError as error:
                     yield f"refused: {error.message}\n"
                     return
@@ -233,7 +233,7 @@ class Resources:
                     await asyncio.sleep(_LENT_LOOK)
                     yield ".\n"
             finally:  # nothing can be awaited here: the client may have gone
-                asyncio.get_running_loop().run_in_executor(None, measuring.give_back, loan)
+                asyncio.get_running_loop().run_in_executor(None, measuring.return_node, loan)
 
         return StreamingResponse(had(), media_type="text/plain")
 
@@ -261,7 +261,7 @@ class Resources:
         points = _integer(request, "points", 600, MOST_POINTS)
         since, until = (_unix(request, name) for name in ("from", "until"))
         past = self._daemon.live.past
-        return JSONResponse(await asyncio.to_thread(past.of, uuid, channel, since, until, points))
+        return JSONResponse(await asyncio.to_thread(past.channel_history, uuid, channel, since, until, points))
 
     async def teds(self, request: Request) -> Response:
         """GET, PUT /nodes/UUID/teds."""
@@ -287,7 +287,7 @@ class Resources:
         uuid = word if word == "next" else await self._uuid_of_a_label(word)
         runs = self._daemon.provisioning
         if body is None:
-            return _shown(request, await asyncio.to_thread(runs.of, uuid))
+            return _shown(request, await asyncio.to_thread(runs.run_of, uuid))
         if body.cancel:
             return JSONResponse(await changing(runs.cancel, uuid))
 
@@ -316,7 +316,7 @@ class Resources:
         body = await body_of(request, bodies.SetPoint)
         uuid, number = await self._node_of(request), request.path_params["number"]
         if body.value is None or body.hold == 0:
-            return JSONResponse(await moving(self._daemon.holding.let_go, uuid, number))
+            return JSONResponse(await moving(self._daemon.holding.release_actuator, uuid, number))
         return JSONResponse(await moving(self._daemon.holding.put, uuid, number, body.value, body.unit, body.hold))
 
     # -- groups and measurements -------------------------------------------------------------------------------------

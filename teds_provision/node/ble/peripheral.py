@@ -223,7 +223,7 @@ class Peripheral:
     def _written(self, connection: Any, value: bytes) -> None:
         """A station wrote a piece of a command."""
         line = self._line_of(connection)
-        received = line.assembly.take(bytes(value)) if line is not None else None
+        received = line.assembly.add_frame(bytes(value)) if line is not None else None
         if line is None or received is None or line.waiting >= _MOST_WAITING:
             return
         line.waiting += 1
@@ -249,7 +249,7 @@ class Peripheral:
             sent = asyncio.run_coroutine_threadsafe(self._reply(line, received.transaction, reply), loop)
             with suppress(Exception):  # the connection is gone
                 sent.result()
-            line.repetition.left(time.monotonic())
+            line.repetition.reply_sent(time.monotonic())
             self._node.reply_left(line.name)
 
         return job

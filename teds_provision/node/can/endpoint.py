@@ -68,7 +68,7 @@ class StationState:
     def reply_left(self) -> None:
         """The reply is through, or was given up: from now on it is kept for who asks again."""
         self.replying = None
-        self._repetition.left(time.monotonic())
+        self._repetition.reply_sent(time.monotonic())
 
     def answer(self, request: EndpointRequest) -> bytes:
         """Run a request and return transaction ‖ reply; raises what the node raises."""

@@ -105,7 +105,7 @@ class EndpointTable:
 
     def _contested(self, seat: CanEndpoint, announce: Announce) -> None:
         now, before, told = time.monotonic(), seat.address, seat.claim.conflict
-        address = seat.claim.take(announce, before, now, pinned=seat.handler.actuator_claimed())
+        address = seat.claim.handle_announce(announce, before, now, pinned=seat.handler.actuator_claimed())
         if (due := seat.claim.move_due) is not None and due != self._moves_due.get(seat):
             self._moves_due[seat] = due
             self._at_time(due, functools.partial(self._give_up_address, seat, due))
@@ -353,7 +353,7 @@ class CanServer:
             # A reply that is still leaving from the address before 128.10 needs its flow control.
             for seat, pair in list(self._active):
                 if pair.own == own and pair.peer == station and seat.address != own and pair.sending:
-                    pair.take(frame)
+                    pair.handle_frame(frame)
                     self._note(seat, pair)
 
     def _request(self, seat: CanEndpoint, line: StationState, pair: Pair, frame: Frame) -> None:
@@ -362,7 +362,7 @@ class CanServer:
             said = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
             self._out(seat, Frame(physical_id(pair.peer, pair.own), said, frame.fd))
             return
-        pair.take(frame)
+        pair.handle_frame(frame)
         while (body := pair.received()) is not None:
             if pair.waits_for_flow:
                 pair.stop_sending()  # whoever asks again has not taken that answer up

@@ -209,7 +209,7 @@ class TnepTag:
         reply = self._repetition.answer(
             transaction, frame, lambda whole: self._handler.request(LINE, whole, tapped=True), now=time.monotonic()
         )
-        self._repetition.left(time.monotonic())
+        self._repetition.reply_sent(time.monotonic())
         return reply
 
     def _renew(self) -> None:

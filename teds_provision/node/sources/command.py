@@ -64,7 +64,7 @@ class CommandSource(LineSource):
         assert self._process is not None
         assert self._process.stdout is not None
         descriptor = self._process.stdout.fileno()
-        feed(lambda: os.read(descriptor, 65536), self.take)
+        feed(lambda: os.read(descriptor, 65536), self.feed_line)
         code = self._process.wait()
         if not self._stopped:
             self._tell(f"The program {self._words[0]} ended with {code}: from now on all values are invalid.")

@@ -53,7 +53,7 @@ class LineSource:
         if self._needs_time:
             drive.own_clock()
 
-    def take(self, line: bytes) -> None:
+    def feed_line(self, line: bytes) -> None:
         """Take one line."""
         problem = self._taken(line)
         if problem:
@@ -165,7 +165,7 @@ class StandardInput(LineSource):
 
     def _run(self) -> None:
         descriptor = self._stream.fileno()
-        feed(lambda: b"" if self._stop.is_set() else os.read(descriptor, 65536), self.take)
+        feed(lambda: b"" if self._stop.is_set() else os.read(descriptor, 65536), self.feed_line)
         if not self._stop.is_set():
             self._tell("Standard input has ended: from now on all values are invalid.")
             self.end()
@@ -235,7 +235,7 @@ class UnixSocket(LineSource):
             with self._listening.accept()[0] as peer:
                 self._peer = peer
                 self.begin(drive)
-                feed(lambda: self._receive(peer), self.take)
+                feed(lambda: self._receive(peer), self.feed_line)
                 self._peer = None
             if not self._stop.is_set():
                 self._tell("The simulation disconnected: until the next one connects, all values are invalid.")

@@ -177,7 +177,7 @@ def _text(text: str | None) -> str:
 def from_json(octets: bytearray) -> Bundle:
     """Read what was signed; ``octets`` is emptied on the way. Raises BadDataError, NotAuthenticError, PolicyError."""
     read = _NodeReader()
-    members = Members(load_long(octets, "The bundle", "nodes", read.each), "The bundle")
+    members = Members(load_long(octets, "The bundle", "nodes", read.read_node), "The bundle")
     if members.get("format") != FORMAT:
         raise BadDataError(f"The bundle's format is not {FORMAT}.", hint="A newer teds-provision may read it.")
     mode = members.get("mode")
@@ -209,7 +209,7 @@ class _NodeReader:
         self._number = 0
         self._complaint: BadDataError | NotAuthenticError | None = None
 
-    def each(self, node: object) -> BundledNode | None:
+    def read_node(self, node: object) -> BundledNode | None:
         """Read the next node, None from the first on that cannot be read."""
         self._number += 1
         if self._complaint is None:

@@ -165,7 +165,7 @@ def read_envelope(file: BinaryIO, max_octets: int) -> Envelope:
     file.seek(0)
     outline = _Outline()
     while outline.octets < size and (piece := file.read(min(size - outline.octets, PIECE))):
-        outline.take(piece)
+        outline.feed(piece)
     document, first, last = parse_document(bytes(outline.text)), outline.first, outline.last
     before, found, after = _cut(document.pop("ciphertext", None), outline.mark.decode())
     if last and not found:  # the run is another member's: then all of it is read
@@ -184,7 +184,7 @@ class _Outline:
         self.octets = self.first = self.last = 0
         self._separators = 0
 
-    def take(self, piece: bytes) -> None:
+    def feed(self, piece: bytes) -> None:
         """Read on; raises BadDataError for more separators than a JWE has."""
         here, self.octets = self.octets, self.octets + len(piece)
         self.digest.update(piece)

@@ -52,7 +52,7 @@ class BleAssembly:
         self._transaction = self._total = 0
         self._held: bytearray | None = None
 
-    def take(self, frame: bytes) -> ReceivedMessage | None:
+    def add_frame(self, frame: bytes) -> ReceivedMessage | None:
         """Take one frame; the message where it was the last one."""
         if len(frame) < _HEAD.size:
             self._held = None

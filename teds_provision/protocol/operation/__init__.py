@@ -9,7 +9,7 @@ Where things are
 ``commands``      payloads of claims and values: ``Operate`` ``idle`` ``Operation`` ``read_data_set`` ``write_data_set``
                   ``sample`` ``Sampled`` ``set_values`` ``run_self_test`` ``Power``
 ``stream_commands``  payloads of streams and time: ``Subscribe`` ``Subscribed`` ``stop`` ``drive`` ``Driven`` ``CLOCK``
-                  ``Clock`` ``Arm``; builders give a ``Command`` for ``Conversation.send``
+                  ``Clock`` ``Arm``; builders give a ``Command`` for ``Conversation.request``
 ``datagram``      data and Drive messages: run keys, ``Sealer``, ``Layout``, the test pattern
 ``can_frames``    identifiers and cutting on CAN and BLE: ``cut`` ``Assembly`` ``data_address`` ``trigger_station``
 ``budget``        the node's budget in ppm, the load of a CAN bus

@@ -124,8 +124,8 @@ class StreamAssembly:
         self._held: bytearray | None = None
         self._next = 0
 
-    def take(self, segment: int, data: bytes) -> bytes | None:
-        """Take one frame (Drive: :meth:`take_drive`); the whole message where it was the last one."""
+    def add_segment(self, segment: int, data: bytes) -> bytes | None:
+        """Take one frame (Drive: :meth:`add_drive_segment`); the whole message where it was the last one."""
         if segment == 0:
             if self._held is not None:
                 self.broken += 1
@@ -148,9 +148,9 @@ class StreamAssembly:
         message, self._held = bytes(self._held), None
         return message
 
-    def take_drive(self, data: bytes) -> bytes | None:
+    def add_drive_segment(self, data: bytes) -> bytes | None:
         """Take one Drive frame, whose first octet is the segment."""
-        return self.take(data[0], data[1:]) if data and data[0] <= _SEGMENTS else None
+        return self.add_segment(data[0], data[1:]) if data and data[0] <= _SEGMENTS else None
 
     def forget(self) -> None:
         """Drop what was begun."""

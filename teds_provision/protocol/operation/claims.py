@@ -42,7 +42,7 @@ class Claims:
 
     # -- questions -------------------------------------------------------------------------------------------------
 
-    def of(self, session: NodeSession) -> frozenset[int]:
+    def channels_of(self, session: NodeSession) -> frozenset[int]:
         """Channels that a session claims."""
         sensors = {channel for channel, sessions in self._sensors.items() if session in sessions}
         acting = {channel for channel, held in self.actuators.items() if held.session is session}
@@ -86,7 +86,7 @@ class Claims:
 
     def release(self, session: NodeSession, channels: Iterable[int] | None = None, *, stopped: bool = False) -> None:
         """End a session's claims of these channels, None: all; its actuators go safe first."""
-        going = self.of(session) if channels is None else self.of(session) & frozenset(channels)
+        going = self.channels_of(session) if channels is None else self.channels_of(session) & frozenset(channels)
         for channel in going:
             if channel in self.actuators:
                 del self.actuators[channel]
@@ -95,7 +95,7 @@ class Claims:
                     self.stopped.add(channel)
             else:
                 self._sensors[channel].discard(session)
-        if not self.of(session):
+        if not self.channels_of(session):
             self._leases.pop(session, None)
         if going:
             self._ended(session, going)
@@ -115,7 +115,7 @@ class Claims:
     def yield_sensors(self, session: NodeSession) -> None:
         """End the claims of all other sessions on sensors."""
         for other in self.sessions() - {session}:
-            self.release(other, [channel for channel in self.of(other) if channel not in self.actuators])
+            self.release(other, [channel for channel in self.channels_of(other) if channel not in self.actuators])
 
     # -- time ------------------------------------------------------------------------------------------------------
 

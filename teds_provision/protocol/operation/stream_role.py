@@ -217,13 +217,15 @@ class StreamRole:
                         if stream.session is session and stream.start is None:
                             stream.start = tick + START_AFTER_MARK
                 elif action == Action.STOP:
-                    acting = [channel for channel in self._claims.of(session) if channel in self._claims.actuators]
+                    acting = [
+                        channel for channel in self._claims.channels_of(session) if channel in self._claims.actuators
+                    ]
                     self._claims.release(session, acting, stopped=True)
 
     def drive_frame(self, session: NodeSession, data: bytes) -> None:
         """One CAN frame of a Drive message."""
         drive = self._measuring_of(session).drive
-        message = drive.assembly.take_drive(data) if drive is not None else None
+        message = drive.assembly.add_drive_segment(data) if drive is not None else None
         if message is not None:
             self.drive_message(session, message)
 
@@ -270,7 +272,7 @@ class StreamRole:
         own = self._measuring_of(session)
         if own.drive is not None and channels.intersection(own.drive.layout.channels):
             own.drive = None
-        if not self._claims.of(session):
+        if not self._claims.channels_of(session):
             own.armed.clear()
 
     def session_ended(self, session: NodeSession) -> None:

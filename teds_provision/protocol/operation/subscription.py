@@ -55,7 +55,7 @@ class StreamPlan:
     layout: Layout
 
     @classmethod
-    def of(
+    def for_channels(
         cls,
         stream: int,
         channels: tuple[tuple[int, int], ...],
@@ -201,12 +201,12 @@ class Receiver:
         self._pattern = TEST_PATTERN if plan.subscribe.test_pattern else 0
         self._held: deque[tuple[StreamMessage, TickBounds]] = deque()
 
-    def take(self, octets: bytes, now: TickBounds) -> StreamMessage | None:
+    def open_message(self, octets: bytes, now: TickBounds) -> StreamMessage | None:
         """Open one message; None where it is dropped (see ``counts``) or held until :meth:`begin`."""
-        found = self.take_all(((octets, 0),), now)
+        found = self.open_messages(((octets, 0),), now)
         return found[0] if found else None
 
-    def take_all(self, came: Iterable[tuple[bytes, int]], ahead: TickBounds) -> list[StreamMessage]:
+    def open_messages(self, came: Iterable[tuple[bytes, int]], ahead: TickBounds) -> list[StreamMessage]:
         """Open messages in the order in which they came, each with its time of arrival by the host's clock (ns).
 
         ``ahead`` bounds what the node's tick is ahead of that clock. Gives the good ones that are not held.

@@ -40,7 +40,7 @@ class Claim:
     name: tuple[str, str] | None = None
     groups: dict[str, tuple[bool, str]] = field(default_factory=dict)
 
-    def take(self, event: Event) -> None:
+    def apply_event(self, event: Event) -> None:
         """Add the next event of the station's chain about this node.
 
         Signed and vouched digests, statements and liftings are sets of the whole plant, kept beside the claims.
@@ -86,7 +86,7 @@ class Claim:
         """The greatest key that it agreed or took."""
         return max((key for key in (self.agreed and self.agreed[:2], self.took) if key), default=None)
 
-    def left(self) -> set[tuple[str, str, int, str, str]]:
+    def given_keys(self) -> set[tuple[str, str, int, str, str]]:
         """What it gave and did not undo."""
         return {gave for gave in self.gave if gave[0] not in self.undone}
 

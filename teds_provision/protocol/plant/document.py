@@ -168,7 +168,7 @@ class Fields:
         self.members: dict[str, Any] = members
         self._where = where
 
-    def of(self, form: str, name: str) -> str:
+    def text_of_form(self, form: str, name: str) -> str:
         """A text of one of the forms of :func:`is_form`."""
         value = self.members.get(name)
         if not is_form(form, value):
@@ -191,7 +191,7 @@ class Fields:
 
     def point(self, name: str) -> bytes:
         """A public key, 65 octets, on the curve."""
-        point = bytes.fromhex(self.of("point", name))
+        point = bytes.fromhex(self.text_of_form("point", name))
         if not is_point(point):
             raise self.bad(name, "is no point of the curve P-256")
         return point
@@ -206,7 +206,7 @@ class Fields:
 
     def time(self, name: str) -> datetime:
         """A moment, in UTC."""
-        text = self.of("time", name)
+        text = self.text_of_form("time", name)
         try:
             return datetime.strptime(text, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
         except ValueError as error:

@@ -79,7 +79,7 @@ class MergedClaims:
     own_groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-def view(
+def merge_claims(
     roster: Roster,
     claims: Mapping[str, Claim],
     own: LocalState,
@@ -117,7 +117,7 @@ def view(
         gave=frozenset(
             (station, epoch, key_id, peer, mode, bundle)
             for station, claim in counted.items()
-            for bundle, peer, epoch, key_id, mode in claim.left()
+            for bundle, peer, epoch, key_id, mode in claim.given_keys()
         ),
         resets=resets,
         bans=tuple(one for one in sorted(statements, key=lambda one: (one.said.created, one.hash))
@@ -167,7 +167,7 @@ def _holdings(roster: Roster, claims: Mapping[str, Claim], reset_to: int) -> _Ho
             if agreed:
                 found.left[station] = key
             continue
-        given_away = any((epoch, key_id) == key and mode == "move" for _, _, epoch, key_id, mode in claim.left())
+        given_away = any((epoch, key_id) == key and mode == "move" for _, _, epoch, key_id, mode in claim.given_keys())
         if key[0] > max(claim.forgot, reset_to) and not given_away:
             found.held[station] = key
             if agreed:

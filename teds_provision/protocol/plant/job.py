@@ -158,11 +158,11 @@ def open_job(octets: bytes, find_key: Callable[[str], bytes | None]) -> Job:
     count, boards = _nodes(fields)
     name = fields.members.get("name")
     job = Job(
-        fields.of("random_id", "id"),
-        fields.of("random_id", "registry"),
+        fields.text_of_form("random_id", "id"),
+        fields.text_of_form("random_id", "registry"),
         fields.name("title"),
         fields.name("profile"),
-        fields.of("sha256", "profile_sha256"),
+        fields.text_of_form("sha256", "profile_sha256"),
         _calibration(fields),
         count,
         boards,
@@ -195,7 +195,7 @@ def _nodes(fields: Fields) -> tuple[int | None, dict[bytes, str]]:
     listed = nodes.list_of("list", MOST_BOARDS)
     for one in listed:
         board = Fields(one, "A board of the job")
-        boards[bytes.fromhex(board.of("uuid", "uuid"))] = board.of("sha256", "fingerprint")
+        boards[bytes.fromhex(board.text_of_form("uuid", "uuid"))] = board.text_of_form("sha256", "fingerprint")
     if len(boards) != len(listed) or not boards:
         raise fields.bad("nodes", "lists no board, or one twice")
     return None, boards
@@ -205,7 +205,7 @@ def _calibration(fields: Fields) -> CalibrationRule:
     told = Fields(fields.members.get("calibration"), "The calibration of the job")
     rule = told.one_of("rule", ("none", "one", "list", "any"))
     if rule == "one":
-        return CalibrationRule("one", told.of("sha256", "sha256"))
+        return CalibrationRule("one", told.text_of_form("sha256", "sha256"))
     if rule == "any":
         return CalibrationRule("any", max_age_days=told.number("max_age_days", 1))
     if rule == "list":
@@ -229,7 +229,7 @@ def _stations(fields: Fields) -> dict[str, int]:
 
 def _sign(fields: Fields) -> str:
     told = fields.members.get("sign")
-    return BY_STATION if told == BY_STATION else fields.of("sha256", "sign")
+    return BY_STATION if told == BY_STATION else fields.text_of_form("sha256", "sign")
 
 
 def _block(fields: Fields, value: object) -> tuple[int, int]:

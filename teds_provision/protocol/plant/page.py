@@ -57,9 +57,9 @@ def open_page(octets: bytes, registry: str, find_key: Callable[[str], bytes | No
     """
     document = open_document(octets, find_key, PAGE)
     fields = Fields(document.members, "The page")
-    if fields.of("random_id", "registry") != registry:
+    if fields.text_of_form("random_id", "registry") != registry:
         raise BadDataError("The page is of another registry.")
-    if fields.of("sha256", "station") != document.signer:
+    if fields.text_of_form("sha256", "station") != document.signer:
         raise BadDataError("The page names another station than the one that signed it.")
     n = fields.number("n", 1)
     previous = fields.members.get("previous")

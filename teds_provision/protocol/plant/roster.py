@@ -205,9 +205,9 @@ def read_roster(members: object, ca: bytes, hash: str = "", octets: bytes = b"")
     version = fields.number("version", 1)
     previous = fields.members.get("previous")
     if version > 1 or previous != "":
-        previous = fields.of("sha256", "previous")
+        previous = fields.text_of_form("sha256", "previous")
     roster = Roster(
-        fields.of("random_id", "registry"),
+        fields.text_of_form("random_id", "registry"),
         fields.name("name"),
         version,
         previous,

@@ -126,7 +126,7 @@ def open_request(octets: bytes, find_key: Callable[[str], bytes | None]) -> Sign
     document = open_document(octets.strip(), find_key, SIGN_REQUEST)
     fields = Fields(document.members, "The sign request")
     node = Fields(document.members.get("node"), "The node of the sign request")
-    name, uuid = document.members.get("name"), bytes.fromhex(fields.of("uuid", "uuid"))
+    name, uuid = document.members.get("name"), bytes.fromhex(fields.text_of_form("uuid", "uuid"))
     blocks: dict[BlockId, bytes] = {}
     listed = fields.list_of("image", MOST_BLOCKS)
     for one in listed:
@@ -136,10 +136,10 @@ def open_request(octets: bytes, find_key: Callable[[str], bytes | None]) -> Sign
         raise fields.bad("image", "is empty, names a TEDS twice, or holds the Security TEDS")
     calibration = document.members.get("calibration")
     return SignRequest(
-        fields.of("random_id", "id"),
-        fields.of("sha256", "to"),
+        fields.text_of_form("random_id", "id"),
+        fields.text_of_form("sha256", "to"),
         fields.time("created"),
-        fields.of("random_id", "job"),
+        fields.text_of_form("random_id", "job"),
         Image(uuid, blocks),
         fields.number("epoch"),
         fields.number("sequence"),
@@ -182,7 +182,7 @@ def seal_answer(answer: Answer, office: PrivateKey) -> bytes:
 def open_answer(octets: bytes, find_key: Callable[[str], bytes | None]) -> Answer:
     """Read an answer under the office's signature; raises NotAuthenticError, BadDataError."""
     fields = Fields(open_document(octets.strip(), find_key, SIGNED).members, "The office's answer")
-    of = fields.of("sha256", "of")
+    of = fields.text_of_form("sha256", "of")
     if "refused" in fields.members:
         why = fields.members.get("why")
         return Answer(of, refused=fields.one_of("refused", REFUSALS), why=str(why) if is_text(why) else "")

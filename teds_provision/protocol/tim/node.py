@@ -83,7 +83,7 @@ class Tim:
             self.random,
             self.one_time,
             room=self.sessions,
-            claims=lambda session: self._role is not None and bool(self._role.claims.of(session)),
+            claims=lambda session: self._role is not None and bool(self._role.claims.channels_of(session)),
             ended=self._session_ended,
         )
         self._role: OperationRole | None = None
@@ -306,7 +306,7 @@ class Tim:
     # -- sessions --------------------------------------------------------------------------------------------------
 
     def _sealed(self, payload: bytes, origin: Origin) -> bytes:
-        taken = self._sessions.take(payload, origin.link)
+        taken = self._sessions.open_frame(payload, origin.link)
         if not taken.room:
             return taken.session.seal(taken.counter, refusal(Reason.NO_ROOM).encode())
         sealed_from = replace(origin, session=taken.session)

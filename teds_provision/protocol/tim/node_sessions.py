@@ -107,7 +107,7 @@ class Sessions:
         held = self._links.get(link)
         return held.session if held is not None else None
 
-    def take(self, payload: bytes, link: str) -> OpenedFrame:
+    def open_frame(self, payload: bytes, link: str) -> OpenedFrame:
         """A Sealed frame: tried under the session, then under the half-open Open.
 
         Raises CommandRefusedError; changes nothing then.

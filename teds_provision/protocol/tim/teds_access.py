@@ -40,7 +40,7 @@ class Staging:
     _images: dict[BlockId, bytes] = field(default_factory=dict)
     _touched_at: float = 0.0
 
-    def of(self, session: NodeSession) -> Mapping[BlockId, bytes]:
+    def staged_by(self, session: NodeSession) -> Mapping[BlockId, bytes]:
         """What this session has staged."""
         return self._images if session is self._owner else {}
 
@@ -106,13 +106,15 @@ class TedsAccess:
         block = _block(command, len(command.payload))
         if block in flash.read_only:
             raise CommandRefusedError(Reason.NOT_PERMITTED)
-        staged = staging.of(session).get(block, b"")
+        staged = staging.staged_by(session).get(block, b"")
         offset = int.from_bytes(command.payload[1:5], "big")
         if offset > len(staged):
             raise CommandRefusedError(Reason.BAD_FORM)
         staging.require(session, untouched=now)
         image = staged[:offset] + command.payload[5:]
-        if len(image) > self.max_teds or not self._can_list({*flash.blocks, *staging.of(session), block, SECURITY}):
+        if len(image) > self.max_teds or not self._can_list(
+            {*flash.blocks, *staging.staged_by(session), block, SECURITY}
+        ):
             raise CommandRefusedError(Reason.TOO_LARGE)
         staging.put(session, block, image, now)
         return Reply(True)
@@ -123,7 +125,7 @@ class TedsAccess:
         """Update TEDS (1.4): the reply, and the state to commit where it is that of access code 128."""
         block = _block(command, 1)
         staging.require(session)
-        staged = staging.of(session)
+        staged = staging.staged_by(session)
         staging.touch(session, now)
         if block not in staged:
             if block == SECURITY and staged:

@@ -55,20 +55,20 @@ class FactTables:
 
     # -- marks on nodes --------------------------------------------------------------------------------------------
 
-    def marks(self, uuid: bytes) -> KeyFlags:
+    def key_flags(self, uuid: bytes) -> KeyFlags:
         """Return the marks on a node; none of them is set on one without."""
         return self._database.read_one(KeyFlags, f"SELECT {_MARKS} FROM marks WHERE uuid = ?", (uuid,)) or KeyFlags()
 
-    def marks_of(self, uuids: Sequence[bytes]) -> dict[bytes, KeyFlags]:
+    def key_flags_of(self, uuids: Sequence[bytes]) -> dict[bytes, KeyFlags]:
         """Return the marks on those of these nodes (a page of them) that have one."""
         statement = f"SELECT uuid, {_MARKS} FROM marks WHERE uuid IN ({places(uuids)})"
         return dict(self._database.read(_marked, statement, uuids))
 
-    def all_marks(self) -> dict[bytes, KeyFlags]:
+    def all_key_flags(self) -> dict[bytes, KeyFlags]:
         """Return the marks on every node that has one."""
         return dict(self._database.read(_marked, f"SELECT uuid, {_MARKS} FROM marks"))
 
-    def put_marks(self, marks: Mapping[bytes, KeyFlags]) -> None:
+    def put_key_flags(self, marks: Mapping[bytes, KeyFlags]) -> None:
         """Keep the marks on nodes, in place of those that are there; a node without any has no row."""
         columns = ("uuid", *fields(KeyFlags))
         rows = ((uuid, *_values(mark)) for uuid, mark in marks.items() if mark != _NONE)

@@ -88,7 +88,7 @@ class KeyTables:
         """Give every key of every node, in the order they came, a page at a time."""
         return self._database.stream(_key, f"SELECT {_COLUMNS} FROM keys WHERE seq > ? ORDER BY seq LIMIT ?")
 
-    def each_key_name(self) -> Iterator[tuple[bytes, str, int, str]]:
+    def all_key_names(self) -> Iterator[tuple[bytes, str, int, str]]:
         """Give UUID, key id, epoch and state of every key, in the order they came, a page at a time."""
         statement = "SELECT seq, uuid, key_id, epoch, state FROM keys WHERE seq > ? ORDER BY seq LIMIT ?"
         return self._database.stream(_key_name, statement)

@@ -49,7 +49,7 @@ class NodeTables:
         """Return all entries, by UUID."""
         return self._database.read(WhitelistEntry, "SELECT * FROM whitelist ORDER BY uuid")
 
-    def each_whitelisted(self) -> Iterator[WhitelistEntry]:
+    def all_whitelisted(self) -> Iterator[WhitelistEntry]:
         """Give all entries, by UUID, a page at a time; holds no lock between pages."""
         after = b""
         while page := self._database.read(
@@ -83,7 +83,7 @@ class NodeTables:
         """Return all nodes, by UUID."""
         return self._database.read(NodeRecord, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
-    def each_shown(self) -> Iterator[ExportEligibility]:
+    def all_shown_keys(self) -> Iterator[ExportEligibility]:
         """Give identity key and retirement of all nodes, by UUID, a page at a time."""
         after = b""
         statement = "SELECT uuid, point, point_mac, retired FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
@@ -96,7 +96,7 @@ class NodeTables:
         statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
         return {record.uuid: record for record in self._database.read(NodeRecord, statement, uuids)}
 
-    def handed_of(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
+    def exported_nodes_of(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
         """Return what a bundle says of these nodes (a page of them), by UUID."""
         statement = f"SELECT {_HANDED_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
         return {handed.uuid: handed for handed in self._database.read(_handed, statement, uuids)}
@@ -254,7 +254,7 @@ _KEYS = (
 _SLOTS = "INSERT INTO key_slots VALUES(?, ?) ON CONFLICT(uuid) DO UPDATE SET last = max(last, excluded.last)"
 
 
-def pages(values: Iterable[Value], length: int = PAGE) -> Iterator[list[Value]]:
+def chunks(values: Iterable[Value], length: int = PAGE) -> Iterator[list[Value]]:
     """Divide many values into pages, as many as one statement looks up at once."""
     rest = iter(values)
     while page := list(islice(rest, length)):
@@ -273,10 +273,7 @@ class BulkRows:
     groups: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
     """Nodes to add to measurement groups, by the group's name; a group that does not exist is created."""
     marks: Mapping[bytes, Mapping[str, Any]] = field(default_factory=dict)
-    """Changes of marks (names, values of :class:`records.KeyFlags`), by UUID.
-
-    The caller of ``put_batch`` makes them.
-    """
+    """Changes of marks (names, values of :class:`records.KeyFlags`), by UUID; the caller of ``put_bulk`` makes them."""
 
 
 class BulkTables:
@@ -289,7 +286,7 @@ class BulkTables:
         rows = self._database.execute(f"SELECT uuid, last FROM key_slots WHERE uuid IN ({places(uuids)})", uuids)
         return {bytes(uuid): int(last) for uuid, last in rows}
 
-    def put_batch(
+    def put_bulk(
         self,
         batch: BulkRows,
         seal_node: Callable[[NodeRecord], bytes | None] = lambda node: node.point_mac,

@@ -32,7 +32,7 @@ of 8. Then a message is looked up, and its curves are not computed."""
 
 
 class ManyChannels:
-    """Channels side by side; make one with :meth:`of`. Values are in SI units, NaN where not valid."""
+    """Channels side by side; make one with :meth:`side_by_side`. Values are in SI units, NaN where not valid."""
 
     def __init__(self, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> None:
         self._lay_curves([one.channel.calibration for one in channels])
@@ -108,7 +108,7 @@ class ManyChannels:
         self._own_scale[row], self._own_offset[row] = curve.unit.scale, curve.unit.offset
 
     @classmethod
-    def of(cls, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> ManyChannels | None:
+    def side_by_side(cls, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> ManyChannels | None:
         """Side by side, or None where they are not of one form; those that are not ``usable`` give no values."""
         widths = {one.octets for one in channels}
         if len(widths) != 1 or max(widths) > WORD:

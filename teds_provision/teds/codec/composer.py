@@ -266,7 +266,9 @@ def convert(decoded: DecodedTeds, edition: Edition, *, uuid: bytes | None = None
         return decoded.octets, []
     conversion = _Conversion(decoded, table(decoded.access_code), edition, uuid)
     if decoded.access_code == AccessCode.SECURITY:
-        conversion.say("note", "one-form", "The Security TEDS of the profile has one form in both editions.", None)
+        conversion.add_finding(
+            "note", "one-form", "The Security TEDS of the profile has one form in both editions.", None
+        )
         return decoded.octets, conversion.findings
     return conversion.octets(), conversion.findings
 
@@ -279,14 +281,14 @@ class _Conversion:
     uuid: bytes | None
     findings: list[Finding] = dataclass_field(default_factory=list)
 
-    def say(self, severity: Severity, code: str, message: str, part: Field | None, asked: str = "") -> None:
+    def add_finding(self, severity: Severity, code: str, message: str, part: Field | None, asked: str = "") -> None:
         offset, name = (part.offset, part.name) if part is not None else (None, "")
         found = part.raw[:32].hex() if part is not None else ""
         self.findings.append(Finding(severity, code, message, offset, name, asked, found))
 
     def octets(self) -> bytes:
         if self.table.access_code in ONLY_2024 and self.edition == 2007:
-            self.say("error", "class", f"The 2007 edition has no {self.table.name}.", None)
+            self.add_finding("error", "class", f"The 2007 edition has no {self.table.name}.", None)
         composer = Composer(self.table, self.edition, tuple_width(self.decoded))
         if self.table.access_code in TEXT_BASED:
             return self.text(composer)
@@ -301,9 +303,9 @@ class _Conversion:
         family, access_code, version = part.raw[0], part.raw[-3], part.raw[-2]
         new = _VERSIONS.get((self.decoded.edition or 0, version), version)
         if new == version:
-            self.say("note", "version", f"The TEDSID keeps its version {version}, which has no equal.", part)
+            self.add_finding("note", "version", f"The TEDSID keeps its version {version}, which has no equal.", part)
         if self.edition == 2007 and part.raw[1] != NO_SUBFAMILY:
-            self.say("error", "lost", f"The 2007 edition cannot say the sub-family {part.raw[1]}.", part)
+            self.add_finding("error", "lost", f"The 2007 edition cannot say the sub-family {part.raw[1]}.", part)
         middle = [NO_SUBFAMILY] if self.edition == 2024 else []
         return raw_tuple(TEDSID, bytes([family, *middle, access_code, new, width]))
 
@@ -326,7 +328,9 @@ class _Conversion:
 
     def unknown(self, part: Field, composer: Composer) -> bytes:
         if part.type >= 128 or self.table.verified:
-            self.say("note", "kept", f"The field {part.type} is unknown; its octets are kept as they are.", part)
+            self.add_finding(
+                "note", "kept", f"The field {part.type} is unknown; its octets are kept as they are.", part
+            )
         return composer.tuple(part.type, part.raw)
 
     def identifier(self, part: Field, composer: Composer) -> bytes:
@@ -336,7 +340,7 @@ class _Conversion:
                 raise BadDataError(f"The UUID has {wanted} octets in the {self.edition} edition, not {len(self.uuid)}.")
             return composer.tuple(part.type, self.uuid)
         message = f"A UUID of {len(part.raw)} octets cannot be said in {wanted}; it is left out."
-        self.say("error", "lost", message, part, f"{wanted} octets")
+        self.add_finding("error", "lost", message, part, f"{wanted} octets")
         return b""
 
     def units(self, part: Field, spec: FieldSpec, composer: Composer) -> bytes:
@@ -344,7 +348,9 @@ class _Conversion:
             return part.raw
         strange = [child.type for child in part.children if child.type not in spec.by_type]
         if strange:
-            self.say("error", "lost", f"Packed units have no place for the fields {strange} of {part.name}.", part)
+            self.add_finding(
+                "error", "lost", f"Packed units have no place for the fields {strange} of {part.name}.", part
+            )
         return composer.value(spec, part.value)
 
     def instant(self, part: Field, spec: FieldSpec, composer: Composer) -> bytes:
@@ -352,7 +358,7 @@ class _Conversion:
             try:
                 return composer.tuple(part.type, composer.value(spec, part.value))
             except BadDataError as error:
-                self.say("error", "lost", f"{error.message} It is left out.", part)
+                self.add_finding("error", "lost", f"{error.message} It is left out.", part)
                 return b""
         return composer.tuple(part.type, part.raw)
 
@@ -369,7 +375,9 @@ class _Conversion:
         first = self.decoded.fields[0]
         if first.name != "TEDSID":
             raise BadDataError("A text-based TEDS whose TEDSID is not first cannot be converted.")
-        self.say("warning", "kept", "The directory does not describe the texts; it is kept, Offset and all.", None)
+        self.add_finding(
+            "warning", "kept", "The directory does not describe the texts; it is kept, Offset and all.", None
+        )
         old = recompose(self.decoded)
         block = old[4:-2] if self.decoded.framed else old
         return self.framed(self.tedsid(first, composer.width) + block[2 + len(first.raw) :])

@@ -206,7 +206,7 @@ class _Walk(Head):
             name,
             fields,
             findings,
-            Conformity.of(self.framed, findings),
+            Conformity.from_findings(self.framed, findings),
             self.text,
         )
 

@@ -74,7 +74,7 @@ class Conformity(StrEnum):
     MESSAGE = "message"
 
     @classmethod
-    def of(cls, framed: bool, findings: Iterable[Finding]) -> Conformity:
+    def from_findings(cls, framed: bool, findings: Iterable[Finding]) -> Conformity:
         """Verdict from the errors found; warnings and notes do not count."""
         frame = content = False
         for finding in findings:

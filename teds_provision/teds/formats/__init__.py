@@ -219,7 +219,7 @@ def placed(octets: bytes, kind: Kind | None = None, *, path: Path | None = None)
 
 def stated_uuid(blocks: Mapping[BlockId, bytes]) -> bytes | None:
     """The UUID that the Meta-TEDS states, 10 octets; None where it states none, or zeros."""
-    stated = Sheet.of_blocks(blocks).meta.uuid
+    stated = Sheet.from_blocks(blocks).meta.uuid
     return stated if stated and len(stated) == UUID_OCTETS and any(stated) else None
 
 

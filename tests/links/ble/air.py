@@ -119,7 +119,7 @@ class Everything:
 
     async def add(self, number: int, folder: Path) -> None:
         def board(file: Any) -> Board | None:
-            return Board(Sheet.of(Image(file.load().uuid, file.hardware))) if file.hardware else None
+            return Board(Sheet.from_image(Image(file.load().uuid, file.hardware))) if file.hardware else None
 
         node = VirtualNode(folder, exclusive=True, board=board, pulse=self.pulse)
         address = StaticAddress(folder, factory=node.in_factory_state())

@@ -106,7 +106,9 @@ class LossyBus(can.BusABC):
         self._ready += self._in.due()
         if not self._ready:
             message = self._under.recv(timeout)
-            if message is not None and not self._echoes.take(Frame(message.arbitration_id, bytes(message.data))):
+            if message is not None and not self._echoes.discard_echo(
+                Frame(message.arbitration_id, bytes(message.data))
+            ):
                 self._ready += self._in.meet(message)
         return (self._ready.popleft() if self._ready else None), False
 

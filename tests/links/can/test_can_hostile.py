@@ -41,7 +41,7 @@ def test_flow_controls_that_nobody_waits_for_do_not_pile_up(hub: Hub) -> None:
                 hub.send(TO_US, bytes([0x30 + number % 3]) + WAIT[1:])
             hub.send(ANNOUNCE, bytes(8))
             assert ear.get(60) is not None, "all frames before it were read"
-        assert port.bus().line(0x21).flows.empty()
+        assert port.bus().address_pair(0x21).flows.empty()
     finally:
         port.close()
 

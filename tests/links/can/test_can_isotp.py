@@ -52,7 +52,7 @@ class Wire:
         while time.monotonic() < until and (self.frames or self.station.sending or self.node.sending):
             if self.frames:
                 frame = self.frames.popleft()
-                assert self.station.take(frame) or self.node.take(frame)
+                assert self.station.handle_frame(frame) or self.node.handle_frame(frame)
             self.station.run()
             self.node.run()
 
@@ -102,18 +102,18 @@ def test_the_node_answers_in_the_form_in_which_it_was_asked() -> None:
     assert wire.station.received() == bytes(200)
     assert all(frame.fd for frame in wire.log)
     wire.log.clear()
-    wire.node.take(Frame(physical_id(NODE, STATION), single(b"abc")))
+    wire.node.handle_frame(Frame(physical_id(NODE, STATION), single(b"abc")))
     wire.node.send(bytes(20))
     assert not wire.log[0].fd
 
 
 def test_more_than_4095_octets_are_answered_with_overflow() -> None:
     wire = Wire()
-    wire.node.take(Frame(physical_id(NODE, STATION), bytes.fromhex("1000000010000000")))
+    wire.node.handle_frame(Frame(physical_id(NODE, STATION), bytes.fromhex("1000000010000000")))
     overflow = wire.log[-1]
     assert overflow.data[:1] == b"\x32"
     wire.station.send(bytes(100))
-    wire.station.take(overflow)
+    wire.station.handle_frame(overflow)
     assert wire.station.overflow
 
 
@@ -122,7 +122,7 @@ def test_more_than_4095_octets_are_answered_with_overflow() -> None:
 def test_a_length_in_32_bits_that_12_bits_hold_is_nobodys(length: int, fd: bool) -> None:
     data = (b"\x10\x00" + length.to_bytes(4, "big")).ljust(64 if fd else 8, b"A")
     wire = Wire()
-    wire.node.take(Frame(physical_id(NODE, STATION), data, fd))
+    wire.node.handle_frame(Frame(physical_id(NODE, STATION), data, fd))
     assert wire.node.receiving is False
     assert (Reassembly.begin(STATION, Frame(0, data, fd)) is None) == (length <= 4095)
 
@@ -136,7 +136,7 @@ def test_a_consecutive_frame_as_long_as_none_can_be_is_ignored(first: int, octet
     pair = Pair(NODE, STATION, sent.append)
 
     def take(data: bytes) -> None:
-        pair.take(Frame(physical_id(NODE, STATION), data, fd))
+        pair.handle_frame(Frame(physical_id(NODE, STATION), data, fd))
 
     take(b"\x10" + bytes([len(body)]) + body[: first - 2])
     at, number = first - 2, 1
@@ -162,7 +162,7 @@ def test_a_consecutive_frame_as_long_as_none_can_be_is_ignored(first: int, octet
 def test_a_single_frame_has_its_length_where_the_standard_wants_it(octets: int, data: str) -> None:
     frame = Frame(physical_id(NODE, STATION), bytes.fromhex(data)[:octets].ljust(octets, b"\xcc"), octets > 8)
     wire = Wire()
-    wire.node.take(frame)
+    wire.node.handle_frame(frame)
     assert wire.node.received() is None
     assert read_single(frame.data) is None
 
@@ -173,7 +173,7 @@ def test_a_first_frame_of_what_fits_one_frame_is_ignored(octets: int, least: int
     for length in (1, 7, 8, least - 1, least):
         data = (b"\x10" + bytes([length])).ljust(octets, b"A")
         wire = Wire(fd=octets > 8)
-        wire.node.take(Frame(physical_id(NODE, STATION), data, octets > 8))
+        wire.node.handle_frame(Frame(physical_id(NODE, STATION), data, octets > 8))
         assert wire.node.receiving is (length >= least), length
         assert (Reassembly.begin(STATION, Frame(0, data, octets > 8)) is not None) is (length >= least)
 
@@ -185,7 +185,7 @@ def test_a_message_that_comes_by_and_by_is_dropped_as_a_whole() -> None:
     pair = Pair(NODE, STATION, sent.append, clock=lambda: now)
 
     def take(data: bytes) -> None:
-        pair.take(Frame(physical_id(NODE, STATION), data))
+        pair.handle_frame(Frame(physical_id(NODE, STATION), data))
 
     take(b"\x10\x64" + bytes(6))
     for number in range(1, 9):
@@ -204,7 +204,7 @@ def test_a_gap_of_hundreds_of_microseconds_is_kept(octet: int) -> None:
     sent: list[Frame] = []
     station = Pair(STATION, NODE, sent.append)
     station.send(bytes(30))
-    station.take(Frame(physical_id(STATION, NODE), bytes([0x30, 0, octet])))
+    station.handle_frame(Frame(physical_id(STATION, NODE), bytes([0x30, 0, octet])))
     gap = (octet - 0xF0) / 10_000
     assert 0 <= station.due_in(1.0) <= gap
     began = time.monotonic()
@@ -219,19 +219,19 @@ def test_a_gap_of_hundreds_of_microseconds_is_kept(octet: int) -> None:
 def test_a_frame_out_of_sequence_tears_a_message_and_the_one_before_does_not() -> None:
     partial = Reassembly.begin(NODE, Frame(0, b"\x10\x30" + bytes(6)))
     assert partial is not None
-    assert partial.take(b"\x21" + bytes(7)) == "more"
-    assert partial.take(b"\x21" + bytes(7)) == "again"
-    assert partial.take(b"\x21" + b"another") == "torn"
-    assert partial.take(b"\x23" + bytes(7)) == "torn"
-    assert partial.take(b"\x20" + bytes(7)) == "torn"
-    assert partial.take(b"\x22" + bytes(7)) == "more"
+    assert partial.add_frame(b"\x21" + bytes(7)) == "more"
+    assert partial.add_frame(b"\x21" + bytes(7)) == "again"
+    assert partial.add_frame(b"\x21" + b"another") == "torn"
+    assert partial.add_frame(b"\x23" + bytes(7)) == "torn"
+    assert partial.add_frame(b"\x20" + bytes(7)) == "torn"
+    assert partial.add_frame(b"\x22" + bytes(7)) == "more"
 
 
 def test_a_second_first_frame_begins_again() -> None:
     wire = Wire()
     head = Frame(physical_id(NODE, STATION), bytes.fromhex("100a010203040506"))
     for data in ("100a090909090909", "100a010203040506", "210708090a"):
-        wire.node.take(Frame(head.identifier, bytes.fromhex(data)))
+        wire.node.handle_frame(Frame(head.identifier, bytes.fromhex(data)))
     assert wire.node.received() == bytes(range(1, 11))
     assert wire.node.received() is None
 
@@ -242,7 +242,7 @@ def test_wait_frames_and_a_reserved_gap_are_borne() -> None:
     flow = physical_id(STATION, NODE)
     station.send(bytes(20))
     for data in ("310000", "310000", "3000fa"):
-        station.take(Frame(flow, bytes.fromhex(data)))
+        station.handle_frame(Frame(flow, bytes.fromhex(data)))
     until = time.monotonic() + PATIENCE
     while station.sending and time.monotonic() < until:
         time.sleep(station.due_in(0.05))
@@ -256,7 +256,7 @@ def test_any_frames_at_all_do_not_break_a_pair(datas: list[bytes], fd: bool) -> 
     wire = Wire(fd=fd)
     wire.station.send(bytes(30))
     for data in datas:
-        wire.station.take(Frame(physical_id(STATION, NODE), data, fd))
+        wire.station.handle_frame(Frame(physical_id(STATION, NODE), data, fd))
     wire.station.abandon()
     wire.station.speak(fd=False)
     wire.log.clear()
@@ -270,14 +270,14 @@ def frames_of(node: int, body: bytes) -> list[Frame]:
     frames: list[Frame] = []
     pair = Pair(node, STATION, frames.append)
     pair.send(body)
-    pair.take(Frame(physical_id(node, STATION), b"\x30\x00\x00"))
+    pair.handle_frame(Frame(physical_id(node, STATION), b"\x30\x00\x00"))
     return frames
 
 
 def test_answers_of_many_nodes_come_apart() -> None:
     gathering = BroadcastReplies(STATION, 7)
     sequences = [frames_of(node, b"\x07" + bytes([node]) * 26) for node in range(1, 21)]
-    flows = [gathering.take(frame) for frames in zip(*sequences, strict=True) for frame in frames]
+    flows = [gathering.add_frame(frame) for frames in zip(*sequences, strict=True) for frame in frames]
     assert gathering.answers == {node: bytes([node]) * 26 for node in range(1, 21)}
     assert not gathering.conflicts
     assert not gathering.busy
@@ -287,11 +287,11 @@ def test_answers_of_many_nodes_come_apart() -> None:
 def test_an_answer_to_an_earlier_identify_is_sent_away() -> None:
     gathering = BroadcastReplies(STATION, 7)
     first = frames_of(NODE, b"\x06" + bytes(26))[0]
-    flow = gathering.take(first)
+    flow = gathering.add_frame(first)
     assert flow is not None
     assert flow.data[0] == 0x32
     for frame in frames_of(NODE, b"\x07" + bytes(26)):
-        gathering.take(frame)
+        gathering.add_frame(frame)
     assert gathering.answers == {NODE: bytes(26)}
     assert not gathering.conflicts
 
@@ -301,7 +301,7 @@ def test_two_first_frames_or_a_broken_sequence_are_a_conflict(order: tuple[int, 
     frames = frames_of(NODE, b"\x07" + bytes(26))
     gathering = BroadcastReplies(STATION, 7)
     for number in order:
-        gathering.take(frames[number])
+        gathering.add_frame(frames[number])
     assert gathering.conflicts == {NODE}
 
 
@@ -309,7 +309,7 @@ def test_two_first_frames_or_a_broken_sequence_are_a_conflict(order: tuple[int, 
 def test_any_frames_at_all_do_not_break_a_gathering(frames: list[tuple[int, bytes]]) -> None:
     gathering = BroadcastReplies(STATION, 7)
     for identifier, data in frames:
-        flow = gathering.take(Frame(identifier, data))
+        flow = gathering.add_frame(Frame(identifier, data))
         assert flow is None or len(flow.data) == 8
 
 
@@ -433,7 +433,7 @@ def test_a_single_frame_is_read_as_the_library_reads_it(data: bytes, fd: bool) -
     bodies = []
     for made in (Pair, ByTheLibrary):
         pair = made(NODE, STATION, lambda _: None, fd=fd)
-        assert pair.take(frame)
+        assert pair.handle_frame(frame)
         bodies.append(pair.received())
         assert pair.received() is None
     assert bodies[0] == bodies[1]
@@ -451,7 +451,7 @@ def test_a_single_frame_is_written_as_the_library_writes_it(body: bytes, fd: boo
 
 def test_a_single_frame_in_the_middle_of_a_message_ends_it_and_comes_first() -> None:
     wire = Wire()
-    wire.node.take(Frame(physical_id(NODE, STATION), bytes.fromhex("100a010203040506")))
-    wire.node.take(Frame(physical_id(NODE, STATION), single(b"abc")))
-    wire.node.take(Frame(physical_id(NODE, STATION), single(b"def")))
+    wire.node.handle_frame(Frame(physical_id(NODE, STATION), bytes.fromhex("100a010203040506")))
+    wire.node.handle_frame(Frame(physical_id(NODE, STATION), single(b"abc")))
+    wire.node.handle_frame(Frame(physical_id(NODE, STATION), single(b"def")))
     assert [wire.node.received() for _ in range(3)] == [b"abc", b"def", None]

@@ -122,7 +122,7 @@ def test_an_exchange_is_given_up_when_nobody_hopes_for_its_reply(hub: Hub) -> No
 
         def ask() -> None:
             try:
-                link.ask(write(b"x"), tries=3, seconds=5 * PATIENCE)
+                link.exchange_limited(write(b"x"), tries=3, seconds=5 * PATIENCE)
             except LinkError as failure:
                 ended.append(type(failure))
 
@@ -181,7 +181,7 @@ def test_two_stations_of_one_address_are_noticed_and_named(hub: Hub, nodes: Star
     ours.everyone(seconds=2, notice=told.append)
     assert any(notice.kind == "conflict" and "0xF1" in notice.text and "source=0xF2" in notice.text for notice in told)
     with pytest.raises(LinkError, match="Another base station") as failure:
-        ours.link(0x55).ask(write(b"nobody"), tries=1, seconds=0.2)
+        ours.link(0x55).exchange_limited(write(b"nobody"), tries=1, seconds=0.2)
     assert "source=0xF2" in failure.value.hint
     for port in (ours, theirs, other):
         port.close()

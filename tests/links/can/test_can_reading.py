@@ -96,7 +96,7 @@ def test_waiting_ends_with_its_time_and_with_the_bus(group: str) -> None:
     with pytest.raises(Empty):
         bus.next_of(queue, 0.2)
     assert 0.2 <= time.monotonic() - began < 25
-    line = bus.line(0x21)
+    line = bus.address_pair(0x21)
     threading.Timer(0.1, bus.close).start()
     assert bus.next_of(line.events, 120.0).kind == "failed"
     with pytest.raises(LinkError, match="closed"):

@@ -152,7 +152,7 @@ def test_a_single_frame_in_place_of_a_flow_control_ends_what_can_isotp_would_go_
     pair = Pair(0xF1, 0x21, sent.append)
     pair.send(bytes(100))
     assert pair.waits_for_flow
-    assert pair.take(Frame(physical_id(0xF1, 0x21), single(b"\x42" + BUSY)))
+    assert pair.handle_frame(Frame(physical_id(0xF1, 0x21), single(b"\x42" + BUSY)))
     assert not pair.sending
     assert pair.received() == b"\x42" + BUSY
     pair.send(bytes(100))

@@ -72,7 +72,7 @@ def main() -> None:
     )
     spoil(server, options)
     done = IdleStop(None)
-    signal.signal(signal.SIGTERM, lambda *_: done.ask())
+    signal.signal(signal.SIGTERM, lambda *_: done.request_stop())
     server.start()
     print("ready", flush=True)
     done.wait()

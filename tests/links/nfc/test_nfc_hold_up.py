@@ -59,8 +59,8 @@ def test_a_slow_node_has_the_time_that_it_needs() -> None:
 def test_no_reply_is_longer_than_the_longest_frame() -> None:
     requester = Requester(1, bytes(10), 100)
     with pytest.raises(GarbledError, match="at most 4094 are allowed"):
-        requester.take(Piece(1, LONGEST_FRAME + 1, 0, bytes(8), answer=True))
-    assert requester.take(Piece(1, LONGEST_FRAME, 0, bytes(8), answer=True))
+        requester.handle_piece(Piece(1, LONGEST_FRAME + 1, 0, bytes(8), answer=True))
+    assert requester.handle_piece(Piece(1, LONGEST_FRAME, 0, bytes(8), answer=True))
 
 
 class Stubborn:

@@ -132,7 +132,7 @@ def test_a_piece_fills_its_message_and_never_more(max_ndef: int, others: int) ->
 def run(requester: Requester, responder: Responder, node_room: int) -> bytes:
     for _ in range(requester.steps_allowed + 70_000):
         asked = Piece.decode(requester.next().encode())
-        assert requester.take(Piece.decode(responder.answer(asked, node_room).encode()))
+        assert requester.handle_piece(Piece.decode(responder.answer(asked, node_room).encode()))
         if requester.reply is not None:
             return requester.reply
     raise AssertionError("no end")
@@ -160,7 +160,7 @@ def test_pieces_that_are_asked_twice_do_no_harm(frame: bytes, size: int, twice: 
     for again in [*twice, *[False] * 200]:
         asked = requester.next()
         answers = [responder.answer(asked, size) for _ in range(2 if again else 1)]
-        assert requester.take(answers[-1])
+        assert requester.handle_piece(answers[-1])
         if requester.reply is not None:
             break
     assert requester.reply == frame[::-1]
@@ -168,26 +168,26 @@ def test_pieces_that_are_asked_twice_do_no_harm(frame: bytes, size: int, twice: 
 
 def test_a_node_that_lost_the_first_pieces_gets_them_again() -> None:
     responder, requester = Responder(lambda transaction, whole: whole), Requester(5, bytes(range(90)), 30)
-    requester.take(responder.answer(requester.next(), 50))
+    requester.handle_piece(responder.answer(requester.next(), 50))
     responder.forget()
     assert requester.next().offset == 30
-    requester.take(responder.answer(requester.next(), 50))
+    requester.handle_piece(responder.answer(requester.next(), 50))
     assert requester.next().offset == 0
     assert run(requester, responder, 50) == bytes(range(90))
 
 
 def test_a_reply_of_another_transaction_is_dropped() -> None:
     requester = Requester(5, b"abcd", 30)
-    assert not requester.take(Piece(6, 2, 0, b"xy", answer=True))
-    assert not requester.take(Piece(5, 4, 0, b"abcd"))  # our own request, read back
+    assert not requester.handle_piece(Piece(6, 2, 0, b"xy", answer=True))
+    assert not requester.handle_piece(Piece(5, 4, 0, b"abcd"))  # our own request, read back
     assert requester.reply is None
-    assert requester.take(Piece(5, 2, 0, b"ok", answer=True))
+    assert requester.handle_piece(Piece(5, 2, 0, b"ok", answer=True))
     assert requester.reply == b"ok"
 
 
 def test_a_request_for_more_repeats_transaction_and_offset_with_an_empty_body() -> None:
     requester = Requester(5, b"abcd", 30)
-    requester.take(Piece(5, 5, 0, b"xyz", answer=True, more=True))
+    requester.handle_piece(Piece(5, 5, 0, b"xyz", answer=True, more=True))
     assert requester.next() == Piece(5, 5, 3, b"")
 
 
@@ -207,14 +207,14 @@ def test_the_answer_to_a_piece_of_a_request_says_what_is_held() -> None:
 )
 def test_pieces_that_do_not_fit_are_garbled(piece: Piece) -> None:
     with pytest.raises(GarbledError):
-        Requester(5, b"abcd", 30).take(piece)
+        Requester(5, b"abcd", 30).handle_piece(piece)
 
 
 def test_a_reply_that_changes_its_length_is_garbled() -> None:
     requester = Requester(5, b"abcd", 30)
-    requester.take(Piece(5, 9, 0, b"x", answer=True, more=True))
+    requester.handle_piece(Piece(5, 9, 0, b"x", answer=True, more=True))
     with pytest.raises(GarbledError):
-        requester.take(Piece(5, 8, 1, b"y", answer=True))
+        requester.handle_piece(Piece(5, 8, 1, b"y", answer=True))
 
 
 pieces = st.builds(
@@ -232,7 +232,7 @@ pieces = st.builds(
 def test_no_sequence_of_pieces_upsets_either_side(sequence: list[Piece]) -> None:
     requester, responder = Requester(1, bytes(25), 10), Responder(lambda transaction, whole: whole)
     for piece in sequence:
-        for take in (lambda p=piece: responder.answer(p, 10), lambda p=piece: requester.take(p)):
+        for take in (lambda p=piece: responder.answer(p, 10), lambda p=piece: requester.handle_piece(p)):
             with contextlib.suppress(GarbledError):
                 take()
         assert requester.next().total <= 0xFFFF

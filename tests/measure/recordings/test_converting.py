@@ -70,7 +70,7 @@ def convert_to(folder: Path, suffix: str, target: Path) -> None:
 def told(path: Path) -> dict[str, Any]:
     recording, summary = open_recording(path), RecordingSummary()
     for entry in recording.entries():
-        summary.take(entry)
+        summary.add_entry(entry)
     return summary.to_json(recording)
 
 

@@ -152,7 +152,7 @@ class Bench:
             self.ports[link] = port
             self.buses.add(port.bus)
         session = StationSession(K, UUID)
-        opened = self.plain(session.open(self.plain(session.ask(), link).payload), link)
+        opened = self.plain(session.open(self.plain(session.request_counter(), link).payload), link)
         assert opened.ok, opened.reason
         session.accept(opened.payload)
         self.sessions[link] = session

@@ -23,7 +23,7 @@ class Consumer:
                  left: bool = True, **more: object) -> None:  # fmt: skip
         asked = {"n": 2, "period": 10 * MS} | more
         self.bench, self.link = bench, link
-        self.plan = StreamPlan.of(stream, tuple((channel, WIDTHS[channel]) for channel in channels), **asked)  # type: ignore[arg-type]
+        self.plan = StreamPlan.for_channels(stream, tuple((channel, WIDTHS[channel]) for channel in channels), **asked)  # type: ignore[arg-type]
         reply = bench.send(self.plan.command(), link, left=left)
         assert reply.ok, reply.reason
         self.reply = self.plan.accept(reply.payload, TickBounds(bench.hardware.tick, bench.hardware.tick))
@@ -41,8 +41,8 @@ class Consumer:
                 self.plan.subscribe.stream,
             ):
                 continue
-            whole = self.assembly.take(address.segment, frame.data)
-            message = self.receiver.take(whole, TickBounds(tick, tick)) if whole is not None else None
+            whole = self.assembly.add_segment(address.segment, frame.data)
+            message = self.receiver.open_message(whole, TickBounds(tick, tick)) if whole is not None else None
             if message is not None:
                 found.append(message)
         self.taken = len(self.bench.frames)

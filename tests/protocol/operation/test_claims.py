@@ -260,7 +260,7 @@ def test_but_not_where_an_actuator_is_claimed() -> None:
 
 def long_open(bench: Bench) -> int | None:
     session = StationSession(K, UUID)
-    counter = bench.plain(session.ask(), "can:f5")
+    counter = bench.plain(session.request_counter(), "can:f5")
     assert counter.ok, "the short form costs nothing"
     reply = bench.plain(session.open(counter.payload), "can:f5")
     return None if reply.ok else reply.reason

@@ -80,7 +80,9 @@ def test_messages_are_cut_and_put_together(message: bytes, fd: bool, drive: bool
     assert len(pieces) == frames_of(len(message), fd=fd, drive=drive)
     assert [piece.segment for piece in pieces[:9]] == [0, 1, 2, 3, 4, 5, 6, 7, 1][: len(pieces)]
     assembly = StreamAssembly(len(message), fd=fd, drive=drive)
-    take: Callable[[int, bytes], bytes | None] = (lambda _, data: assembly.take_drive(data)) if drive else assembly.take
+    take: Callable[[int, bytes], bytes | None] = (
+        (lambda _, data: assembly.add_drive_segment(data)) if drive else assembly.add_segment
+    )
     assert [take(*piece) for piece in pieces] == [None] * (len(pieces) - 1) + [message]
     assert assembly.broken == 0
     assert all(len(piece.data) <= (64 if fd else 8) for piece in pieces)
@@ -104,7 +106,7 @@ def test_a_missing_doubled_or_swapped_frame_drops_its_message_and_no_other(data:
         other = (at + 1) % len(hurt)
         hurt[at], hurt[other] = hurt[other], hurt[at]
     assembly = StreamAssembly(length, fd=False)
-    whole = [assembly.take(*piece) for piece in (*pieces[0], *hurt, *pieces[2])]
+    whole = [assembly.add_segment(*piece) for piece in (*pieces[0], *hurt, *pieces[2])]
     found = [message for message in whole if message is not None]
     harmless = fault == "doubled" and at in (0, len(pieces[1]) - 1)  # segment 0 begins anew; after the last is nothing
     assert found == (messages if harmless else [messages[0], messages[2]])
@@ -115,7 +117,7 @@ def test_a_missing_doubled_or_swapped_frame_drops_its_message_and_no_other(data:
 def test_junk_frames_make_no_message_of_another_length(frames: list[tuple[int, bytes]], length: int, fd: bool) -> None:
     assembly = StreamAssembly(length, fd=fd)
     for frame in frames:
-        message = assembly.take(*frame)
+        message = assembly.add_segment(*frame)
         assert message is None or len(message) == length
 
 

@@ -58,7 +58,7 @@ def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
     session = StationSession(K, UUID, one_time=SoftwareKey(int(told["Es"]["d"], 16)))
     opened = bench.tim.handle(bytes.fromhex(told["open_frame"]), link="can:f1", tapped=False)
     assert opened.hex() == told["open_reply"]
-    assert session.ask().encode().hex() == told["c_frame"]
+    assert session.request_counter().encode().hex() == told["c_frame"]
 
     events = iter(range(0, 2000 * MS, 50 * MS))
     upcoming = next(events)

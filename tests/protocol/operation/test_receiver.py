@@ -39,7 +39,7 @@ LATER = TickBounds(START + 100 * MS, START + 100 * MS)
 
 def plan(**changes: object) -> StreamPlan:
     asked: dict[str, object] = {"n": 2, "period": 10 * MS} | changes
-    return StreamPlan.of(0, ((1, 2),), **asked)  # type: ignore[arg-type]
+    return StreamPlan.for_channels(0, ((1, 2),), **asked)  # type: ignore[arg-type]
 
 
 def receiver(run: int = 1, *, start: int = START, previous: Receiver | None = None, **changes: object) -> Receiver:
@@ -57,8 +57,8 @@ def counted(taker: Receiver, **counts: int) -> None:
 
 def test_good_messages_carry_index_and_tick() -> None:
     taker = receiver()
-    assert taker.take(sealed(0, body=b"abcd"), LATER) == StreamMessage(0, 0, START, 0, b"abcd")
-    found = taker.take(sealed(3), LATER)
+    assert taker.open_message(sealed(0, body=b"abcd"), LATER) == StreamMessage(0, 0, START, 0, b"abcd")
+    found = taker.open_message(sealed(3), LATER)
     assert found is not None
     assert (found.index, found.tick) == (6, START + 60 * MS)
     counted(taker, good=2, lost=2)
@@ -67,19 +67,19 @@ def test_good_messages_carry_index_and_tick() -> None:
 def test_each_cause_is_counted_apart_and_each_message_once() -> None:
     taker = receiver()
     first = sealed(5)
-    assert taker.take(first, LATER) is not None
+    assert taker.open_message(first, LATER) is not None
     counted(taker, good=1, lost=5)
-    assert taker.take(first, LATER) is None
-    assert taker.take(sealed(4), LATER) is None
+    assert taker.open_message(first, LATER) is None
+    assert taker.open_message(sealed(4), LATER) is None
     counted(taker, good=1, lost=5, late=2)
-    assert taker.take(sealed(6)[:-1], LATER) is None
+    assert taker.open_message(sealed(6)[:-1], LATER) is None
     counted(taker, good=1, lost=5, late=2, junk=1)
     bent = bytearray(sealed(9))
     bent[-1] ^= 1
-    assert taker.take(bytes(bent), LATER) is None
+    assert taker.open_message(bytes(bent), LATER) is None
     assert taker.last == 5, "only a good tag changes anything"
     counted(taker, good=1, lost=5, late=2, junk=1, bad=1)
-    assert taker.take(sealed(6, flags=TEST_PATTERN), LATER) is None
+    assert taker.open_message(sealed(6, flags=TEST_PATTERN), LATER) is None
     counted(taker, good=1, lost=5, late=2, junk=1, bad=1, unasked=1)
     taker.finish(9)
     counted(taker, good=1, lost=7, late=2, junk=1, bad=1, unasked=1)
@@ -87,16 +87,16 @@ def test_each_cause_is_counted_apart_and_each_message_once() -> None:
 
 def test_a_measurement_in_place_of_a_test_pattern_is_unasked_too() -> None:
     taker = receiver(test_pattern=True)
-    assert taker.take(sealed(0), LATER) is None
+    assert taker.open_message(sealed(0), LATER) is None
     counted(taker, unasked=1)
 
 
 def test_messages_of_an_earlier_run_are_dropped_and_not_counted() -> None:
     before = receiver(1)
     taker = receiver(2, previous=before)
-    assert taker.take(sealed(7, 1), LATER) is None
+    assert taker.open_message(sealed(7, 1), LATER) is None
     counted(taker)
-    assert taker.take(sealed(7, 3), LATER) is None
+    assert taker.open_message(sealed(7, 3), LATER) is None
     counted(taker, bad=1)
 
 
@@ -110,36 +110,36 @@ def test_a_message_from_the_future_or_held_back_is_dropped() -> None:
         (TickBounds(START + 250 * MS + 1, START + 900 * MS), "stale"),
     ]:
         taker = receiver()
-        assert (taker.take(first, now) is not None) is (cause == "good")
+        assert (taker.open_message(first, now) is not None) is (cause == "good")
         counted(taker, **{cause: 1})
 
 
 def test_the_consumer_may_set_another_age() -> None:
     made = plan()
     taker = Receiver(made, SubscribeReply(1, made.length, START), K_M, oldest=5 * MS)
-    assert taker.take(sealed(0), TickBounds(START + 16 * MS, START + 16 * MS)) is None
+    assert taker.open_message(sealed(0), TickBounds(START + 16 * MS, START + 16 * MS)) is None
     counted(taker, stale=1)
 
 
 def test_messages_are_held_until_the_mark_is_read() -> None:
     taker = receiver(start=WAITS)
     for counter in range(MOST_HELD + 2):
-        assert taker.take(sealed(counter), LATER) is None
+        assert taker.open_message(sealed(counter), LATER) is None
     early, *rest = taker.begin(START + 100 * MS - 40 * MS)
     assert (early.counter, early.tick) == (2, START + 100 * MS)
     assert rest == [], "the others came before their first tick: from the future"
     assert taker.counts.overflow == 2
     assert taker.counts.future == MOST_HELD - 1
     late = TickBounds(START + 3000 * MS, START + 3000 * MS)
-    assert taker.take(sealed(140), late) is not None, "from now on they are handed on at once"
+    assert taker.open_message(sealed(140), late) is not None, "from now on they are handed on at once"
 
 
 def test_events_and_free_streams_carry_their_tick() -> None:
     taker = receiver(kind=StreamKind.EVENT, n=1)
-    found = taker.take(sealed(4, body=START.to_bytes(8, "big") + b"ab"), LATER)
+    found = taker.open_message(sealed(4, body=START.to_bytes(8, "big") + b"ab"), LATER)
     assert found == StreamMessage(4, 4, START, 0, b"ab")
     waiting = receiver(start=WAITS, kind=StreamKind.FREE)
-    assert waiting.take(sealed(0, body=START.to_bytes(8, "big") + b"abcd"), LATER) is not None
+    assert waiting.open_message(sealed(0, body=START.to_bytes(8, "big") + b"abcd"), LATER) is not None
 
 
 @pytest.mark.parametrize("kind", [StreamKind.EVENT, StreamKind.FREE])
@@ -148,7 +148,7 @@ def test_ticks_of_messages_that_do_not_go_forward_are_counted_and_not_believed(k
     taker = receiver(kind=kind, n=1)
     ticks = (0, 10, 10, 3, 20)
     messages = [sealed(k, body=(START + at * MS).to_bytes(8, "big") + b"ab") for k, at in enumerate(ticks)]
-    found = [one.tick - START if (one := taker.take(octets, LATER)) else None for octets in messages]
+    found = [one.tick - START if (one := taker.open_message(octets, LATER)) else None for octets in messages]
     assert found == [0, 10 * MS, None, None, 20 * MS]
     counted(taker, good=3, back=2)
 
@@ -158,7 +158,7 @@ def test_a_tick_that_jumps_is_no_time_of_a_sample(jump: int) -> None:
     taker = receiver(kind=StreamKind.FREE, n=1)
     lie = ((START + jump) % 2**64).to_bytes(8, "big")
     for counter, tick in enumerate((START.to_bytes(8, "big"), lie, (START + 10 * MS).to_bytes(8, "big"))):
-        taker.take(sealed(counter, body=tick + b"ab"), LATER)
+        taker.open_message(sealed(counter, body=tick + b"ab"), LATER)
     counted(taker, good=2, **{"future" if jump > 0 else "stale": 1})
 
 
@@ -221,7 +221,7 @@ def test_how_many_instants_fit() -> None:
     assert plan(n=113).fits
     assert not plan(n=114).fits
     assert plan(n=113).length == MOST_OCTETS - 1
-    exactly = StreamPlan.of(0, ((1, 1),), n=227, period=MS)
+    exactly = StreamPlan.for_channels(0, ((1, 1),), n=227, period=MS)
     assert (exactly.length, exactly.fits) == (MOST_OCTETS, True)
 
 
@@ -293,7 +293,7 @@ def test_what_stop_takes_back_after_the_end_of_the_measurement_is_not_lost(
     """The node had begun 9 messages when Stop came; 0 to 5 are there."""
     taker = receiver()
     for counter in range(6):
-        assert taker.take(sealed(counter), LATER)
+        assert taker.open_message(sealed(counter), LATER)
     taker.finish(9, wanted)
     counted(taker, good=6, lost=lost, cut=cut)
 

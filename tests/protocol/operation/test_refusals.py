@@ -89,7 +89,7 @@ def test_operate_in_the_order_of_section_1() -> None:
         "can:f2",
     )
     assert bench.tim._role is not None
-    claimed = bench.tim._role.claims.of(bench.tim._sessions.on("can:f2"))  # type: ignore[arg-type]
+    claimed = bench.tim._role.claims.channels_of(bench.tim._sessions.on("can:f2"))  # type: ignore[arg-type]
     assert claimed == {3, 5}
 
 

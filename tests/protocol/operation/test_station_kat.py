@@ -65,7 +65,7 @@ COMMANDS = {entry["counter"]: entry for entry in KAT["commands"]}
 def plan_of(stream: dict) -> StreamPlan:
     channels = tuple((channel, WIDTHS[channel]) for channel in stream["channels"])
     start = stream["start"] if stream["start"] == WAITS else 0
-    return StreamPlan.of(
+    return StreamPlan.for_channels(
         stream["stream"],
         channels,
         n=stream["n"],
@@ -84,7 +84,7 @@ def test_messages_are_opened_as_published(stream: dict) -> None:
     assert plan.accept(reply.encode(), TickBounds(stream["start"], stream["start"])) == reply
     receiver = Receiver(plan, reply, MESSAGE_KEY, oldest=1 << 62)
     for entry in stream["messages"]:
-        found = receiver.take(bytes.fromhex(entry["message"]), ANY)
+        found = receiver.open_message(bytes.fromhex(entry["message"]), ANY)
         if stream["start"] == WAITS:
             assert found is None
             (found,) = receiver.begin(KAT["trigger"]["start"])
@@ -123,7 +123,7 @@ def test_messages_are_cut_and_put_together_as_published(stream: dict) -> None:
                 assert address is not None
                 assert address[:2] == (STATION, stream["stream"])
                 assert whole is None
-                whole = assembly.take(address.segment, data)
+                whole = assembly.add_segment(address.segment, data)
             assert whole == message
         assert ble_frame(stream["stream"], message).hex() == entry["ble"]
         assert read_ble_frame(bytes.fromhex(entry["ble"])) == (stream["stream"], message)
@@ -150,7 +150,7 @@ def test_drive_messages_are_sealed_as_published() -> None:
             assert [piece.data for piece in cut(message, fd=fd, drive=True)] == [data for _, data in frames]
             assert {drive_address(identifier) for identifier, _ in frames} == {DriveAddress(NODE, STATION)}
             assembly = StreamAssembly(len(message), fd=fd, drive=True)
-            assert [assembly.take_drive(data) for _, data in frames][-1] == message
+            assert [assembly.add_drive_segment(data) for _, data in frames][-1] == message
         assert ble_frame(0, message).hex() == entry["ble"]
 
 

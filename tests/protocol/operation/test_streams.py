@@ -100,7 +100,7 @@ def test_a_half_open_open_ends_nothing() -> None:
 def test_a_new_subscribe_ends_the_run_before_and_a_refused_one_does_not() -> None:
     bench = Bench().open().operate(1)
     first = Consumer(bench, start=100 * MS)
-    assert bench.reason(StreamPlan.of(0, ((2, 2),), n=1, period=10 * MS).command()) == Reason.WRONG_STATE
+    assert bench.reason(StreamPlan.for_channels(0, ((2, 2),), n=1, period=10 * MS).command()) == Reason.WRONG_STATE
     bench.until(130 * MS)
     assert first.messages()
     second = Consumer(bench, start=200 * MS)
@@ -164,13 +164,13 @@ def test_the_last_counter_is_sent_and_ends_the_stream() -> None:
 
 def test_ble_streams_are_whole_notifications_of_their_connection() -> None:
     bench = Bench().open("ble:2", SessionPort("ble", "ble", 2, mtu=247)).operate(1, link="ble:2")
-    plan = StreamPlan.of(3, ((1, 2),), n=2, period=10 * MS, start=100 * MS)
+    plan = StreamPlan.for_channels(3, ((1, 2),), n=2, period=10 * MS, start=100 * MS)
     reply = plan.accept(bench.send(plan.command(), "ble:2").payload, TickBounds(0, 0))
     bench.until(150 * MS)
     _, frame = bench.frames[0]
     assert (frame.link_source, frame.identifier, frame.data[0]) == (2, 0, 3)
     receiver = Receiver(plan, reply, bench.sessions["ble:2"].message_key)
-    message = receiver.take(frame.data[1:], TickBounds(150 * MS, 150 * MS))
+    message = receiver.open_message(frame.data[1:], TickBounds(150 * MS, 150 * MS))
     assert message is not None
     assert values(message) == [100, 110]
 

@@ -112,7 +112,7 @@ class McapSink(FileSink):
         self.part.flush()
         self._count(octets=len(octets))
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):
             self._block(item)
         elif isinstance(item, NodeReport):

@@ -230,7 +230,7 @@ class _Scan:
             if head is not None and head[0] == DATA_END:
                 self.ended = finished
                 break
-            after = self._take(at, *head) if head is not None else None
+            after = self._keep_record(at, *head) if head is not None else None
             if after is None:
                 after = self._next_chunk(at + 1)
                 self._damage("record" if head is None else "chunk" if head[0] == CHUNK else "record", at, after)
@@ -268,7 +268,7 @@ class _Scan:
             return None if code != DATA_END or length != 4 or at != self._limit else (code, length)
         return code, length
 
-    def _take(self, at: int, code: int, length: int) -> int | None:
+    def _keep_record(self, at: int, code: int, length: int) -> int | None:
         """Keep a record; where the next one begins, or None where it is damaged."""
         after = at + HEAD.size + length
         content = self.octets[at + HEAD.size : after]

@@ -101,7 +101,7 @@ class ChildSink(TopicSink):
         os.set_blocking(self._child.stdin.fileno(), False)
         for hear in (self._hear, self._hear_complaints):
             threading.Thread(target=hear, args=(self._child,), name=f"{self.name} child", daemon=True).start()
-        self._say("waiting", f"{self._library} is starting")
+        self._set_state("waiting", f"{self._library} is starting")
 
     def _hear(self, child: subprocess.Popen[bytes]) -> None:
         """The child's lines, on a thread of their own."""
@@ -128,9 +128,9 @@ class ChildSink(TopicSink):
             self._complaint = line.decode(errors="replace").strip()[:COMPLAINT] or self._complaint
         child.stderr.close()
 
-    def _take(self, item: Item) -> None:
+    def _process_item(self, item: Item) -> None:
         if self._up():
-            super()._take(item)
+            super()._process_item(item)
         elif isinstance(item, Block | GroupRows):
             self._count(dropped=int(item.value.size))
         else:
@@ -147,11 +147,11 @@ class ChildSink(TopicSink):
         if child is not None and child.poll() is None:
             if not self._ready.is_set():
                 if self._heard:
-                    self._say("waiting", self._heard)
+                    self._set_state("waiting", self._heard)
                 return False
             if not self._announced:
                 self._announced = True
-                self._say("running")
+                self._set_state("running")
                 self._pause = BACK_OFF[0]
                 self._announce(tuple(self._facts.values()))
             return self._child is not None
@@ -173,7 +173,7 @@ class ChildSink(TopicSink):
     def _lost(self, why: str) -> None:
         self._stop(0.0)
         self._again = time.monotonic() + self._pause
-        self._say("waiting", f"{why}; tried again in {self._pause:.0f} s")
+        self._set_state("waiting", f"{why}; tried again in {self._pause:.0f} s")
         self._pause = min(2 * self._pause, BACK_OFF[1])
 
     def _send(self, **words: object) -> None:
