@@ -118,11 +118,11 @@ def rest(south: Station, empty: Station, count: int) -> tuple[float, float]:
     def take_in() -> None:
         for _ in range(count):
             cipher.encrypt(os.urandom(12), key, context)
-        seals(sum(_TABLES[table] * len(each) for table, each in rows.items()))
+        seals(sum(_TABLES[table] * len(row) for table, row in rows.items()))
         with empty.transaction():
-            for table, each in rows.items():
-                marks = ", ".join("?" * len(each[0])) if each else "NULL"
-                empty._store._database.execute_many(f"INSERT OR REPLACE INTO {table} VALUES({marks})", each)
+            for table, row in rows.items():
+                marks = ", ".join("?" * len(row[0])) if row else "NULL"
+                empty._store._database.execute_many(f"INSERT OR REPLACE INTO {table} VALUES({marks})", row)
 
     return min(timed(export)[0] for _ in range(ROUNDS)), min(timed(take_in)[0] for _ in range(1))
 

@@ -87,7 +87,7 @@ def floor(messages: list[bytes], together: int, compute: Callable[[np.ndarray], 
     began = time.thread_time()
     for at in range(0, len(messages), together):
         plain = [sealer.open(message) for message in messages[at : at + together]]
-        bodies = [one[1:] for one in plain if one is not None]
+        bodies = [item[1:] for item in plain if item is not None]
         compute(np.frombuffer(b"".join(bodies), ">u2").astype(np.float64))
     return time.thread_time() - began
 

@@ -168,7 +168,7 @@ class Load:
             f"tick to sink p50 {p50 * 1e3:.1f}, p99 {p99 * 1e3:.1f} ms "
             f"(aim {LATE * 1e3:.0f}: {_verdict(p99 <= LATE)}); {self.rows} rows of the group; of the CPU "
             f"{', '.join(f'{name} {used / sum(self.threads.values()):.0%}' for name, used in self.threads.items())}; "
-            f"the nodes' process was {self.feeder}{''.join('; ' + one for one in self.errors)}"
+            f"the nodes' process was {self.feeder}{''.join('; ' + error for error in self.errors)}"
         )
 
 
@@ -197,7 +197,8 @@ class Machine:
             for stream in range(len(HALVES)):
                 self.heard[node, stream] = self._stream(sheet, stream, clock)
             facts += [
-                facts_of(sheet, one, name="", fingerprint="00" * 32, period=PERIOD / SECOND) for one in sheet.channels
+                facts_of(sheet, channel, name="", fingerprint="00" * 32, period=PERIOD / SECOND)
+                for channel in sheet.channels
             ]
         self.grid = Grid("all", facts, patience=N / RATE + 2 * BEAT)
         for sink in sinks:
@@ -278,9 +279,9 @@ def _watch(machine: Machine, feeder: subprocess.Popen[str], began: int) -> None:
 
 def _add_up(load: Load, machine: Machine, sinks: list[Sink], messages: int) -> None:
     """What the receivers and the sinks counted."""
-    receivers = [one.receiver for one in machine.heard.values()]
-    load.lost = sum(one.counts.lost + messages - 1 - one.last for one in receivers)
-    load.late = sum(one.counts.late + one.counts.stale for one in receivers)
+    receivers = [stream.receiver for stream in machine.heard.values()]
+    load.lost = sum(receiver.counts.lost + messages - 1 - receiver.last for receiver in receivers)
+    load.late = sum(receiver.counts.late + receiver.counts.stale for receiver in receivers)
     load.dropped = sum(sink.stats.dropped for sink in sinks)
     load.errors = [why for why in (_wrong(sink, load.values) for sink in sinks) if why]
 
@@ -301,7 +302,7 @@ def _by_thread() -> dict[str, float]:
     """CPU seconds of each kind of thread since it began."""
     kinds = {"can ": "receiving", "hearing": "opening and calibrating", "sink": "sinks", "MainThread": "rows"}
     found = dict.fromkeys([*kinds.values(), "DDS's own"], 0.0)
-    names = {one.native_id: one.name for one in threading.enumerate()}
+    names = {thread.native_id: thread.name for thread in threading.enumerate()}
     for task in Path("/proc/self/task").iterdir():
         name = names.get(int(task.name), "")
         kind = next((kind for begin, kind in kinds.items() if name.startswith(begin)), "DDS's own")

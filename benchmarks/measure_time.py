@@ -195,12 +195,12 @@ def main() -> None:
     print(f"{RATE:.0f} Hz, n = {N}, CAN FD on loopback, one CPU-bound process beside it; milliseconds")
     aims = f"stamps p50, p99 (aim 1) | tick to sink p50, p99 (aim {due * 1e3:.0f}) | start to first row (aim 1000)"
     print(f"nodes | {aims} | begun apart")
-    for one in found:
-        stamps, lags = np.percentile(one.stamps, (50, 99)), np.percentile(one.lags, (50, 99))
+    for current in found:
+        stamps, lags = np.percentile(current.stamps, (50, 99)), np.percentile(current.lags, (50, 99))
         print(
-            f"{one.nodes:5} | {stamps[0] * 1e3:6.3f} {stamps[1] * 1e3:7.3f} {_verdict(stamps[1] <= STAMPS):7}"
+            f"{current.nodes:5} | {stamps[0] * 1e3:6.3f} {stamps[1] * 1e3:7.3f} {_verdict(stamps[1] <= STAMPS):7}"
             f" | {lags[0] * 1e3:6.1f} {lags[1] * 1e3:7.1f} {_verdict(lags[1] <= due):7}"
-            f" | {one.first * 1e3:6.0f} {_verdict(one.first <= FIRST):7} | {one.apart * 1e3:.3f}"
+            f" | {current.first * 1e3:6.0f} {_verdict(current.first <= FIRST):7} | {current.apart * 1e3:.3f}"
         )
 
 

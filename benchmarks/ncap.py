@@ -101,14 +101,14 @@ def listen(url: str, token: str, stack: ExitStack, count: int, stop: threading.E
         )
         sockets.append(stack.enter_context(opened))
 
-    def read(one: Any) -> None:
-        for text in one:
+    def read(item: Any) -> None:
+        for text in item:
             heard[0] += len(text)
             if stop.is_set():
                 return
 
-    for one in sockets:
-        threading.Thread(target=read, args=(one,), daemon=True).start()
+    for client_connection in sockets:
+        threading.Thread(target=read, args=(client_connection,), daemon=True).start()
     return heard
 
 

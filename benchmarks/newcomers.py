@@ -298,8 +298,8 @@ class Scene:
         """Messages of these that were lost, late or bad, and those that their own process left out."""
         time.sleep(1.5)  # reports come once a second
         mine = {self.uuids[name].hex() for name in names}
-        nodes = [one for one in self.here.measurements()[0]["nodes"] if one["uuid"] in mine]
-        lost = sum(one["lost"] + one["late"] + one["bad"] for one in nodes)
+        nodes = [report for report in self.here.measurements()[0]["nodes"] if report["uuid"] in mine]
+        lost = sum(report["lost"] + report["late"] + report["bad"] for report in nodes)
         return lost, sum(map(int, self.power("missed", *names)))
 
 
@@ -317,10 +317,10 @@ def scene(rows: Rows, folder: Path, count: int, rate: float, *, fd: bool) -> Ite
     (folder / "broker.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
     with ExitStack() as stack:
 
-        def process(one: subprocess.Popen[str]) -> subprocess.Popen[str]:
-            stack.callback(one.wait, 30)
-            stack.callback(one.terminate)
-            return one
+        def process(process: subprocess.Popen[str]) -> subprocess.Popen[str]:
+            stack.callback(process.wait, 30)
+            stack.callback(process.terminate)
+            return process
 
         process(subprocess.Popen([MOSQUITTO, "-c", str(folder / "broker.conf")], stderr=subprocess.DEVNULL, text=True))
         command = [sys.executable, "-m", "benchmarks.newcomers", "serve", link, str(folder)]
@@ -392,7 +392,7 @@ def many(on: Scene, count: int, seconds: float, kind: str) -> None:
     on.rows.tell("  of it the wire was taken by commands and replies", 100 * talk / took, "%")
     on.rows.tell("  and by data of those that were in", 100 * data / took, "%")
     time.sleep(5.0)  # that it runs is told after its first values, where all begin at once
-    states = [one["state"] for one in on.here.measurements()[0]["nodes"]]
+    states = [report["state"] for report in on.here.measurements()[0]["nodes"]]
     on.rows.tell(f"  measured of {count}", states.count("running"), "", aim=count, least=True)
 
     def read_whole(uuid: bytes) -> bool:

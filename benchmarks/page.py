@@ -92,11 +92,11 @@ def live(browser: Browser, lab: Lab, channels: int, seconds: float) -> None:
             station.request("POST", "/virtual", {"profile": FINGER, "name": f"finger {number}"})
         until = time.monotonic() + 120
         while time.monotonic() < until:
-            good = [one for one in station.nodes() if one["verdict"] and one["verdict"]["verdict"] == "authentic"]
+            good = [node for node in station.nodes() if node["verdict"] and node["verdict"]["verdict"] == "authentic"]
             if len(good) * OF_A_FINGER >= channels:
                 break
             time.sleep(1)
-        station.request("POST", "/measurements", {"uuids": [one["uuid"] for one in good], "rate": 20})
+        station.request("POST", "/measurements", {"uuids": [node["uuid"] for node in good], "rate": 20})
     with opened(browser, lab, route="measure") as page:
         time.sleep(10)
         print(f"{len(good) * OF_A_FINGER} live channels, {seconds:g} s: {frames(page, seconds)}", flush=True)
@@ -117,7 +117,7 @@ def main() -> None:
         try:
             lab.run()
             paints = many_nodes(browser, lab, 1000)
-            print(f"first paint, 1,000 nodes: best {min(paints):.0f} ms of {', '.join(f'{one:.0f}' for one in paints)}")
+            print(f"first paint, 1,000 nodes: best {min(paints):.0f} ms of {', '.join(f'{ms:.0f}' for ms in paints)}")
             live(browser, lab, 200, seconds)
         finally:
             lab.desk.clear()

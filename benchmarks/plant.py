@@ -133,7 +133,7 @@ def _local(boards: int) -> None:
                     provision(stations[place], node, orders[place], accept=lambda who: None, reporter=SilentReporter())
                 spent.append((time.perf_counter() - wall, time.process_time() - used, place))
         for column, what in enumerate(("by the clock", "of the processor")):
-            without, beside = ([each[column] for each in spent if each[2] == place] for place in (0, 1))
+            without, beside = ([spent_row[column] for spent_row in spent if spent_row[2] == place] for place in (0, 1))
             ratio = statistics.median(b / a for a, b in zip(without[10:], beside[10:], strict=True))
             print(f"a board: {1000 * statistics.median(without):.1f} ms {what}, beside a registry {ratio:.2f} ×")
         for station in stations:
@@ -148,7 +148,7 @@ def _history(nodes: int) -> None:
         stick, key, place = FolderTransport(made.stick), west.vault.identity(), (0, "")
         made.sync(made.north)
         for _ in range(0, nodes, 250):
-            told = [one for _ in range(250) for one in _told_of(os.urandom(10))]
+            told = [entry for _ in range(250) for entry in _told_of(os.urandom(10))]
             draft = PageDraft(
                 made.roster.registry, place[0] + 1, place[1], "0" * 16, datetime.now(UTC), {}, (1, "0" * 64)
             )
@@ -188,7 +188,9 @@ def _take_in(folder: Path) -> None:
 
 def _peak() -> float:
     """MB that this process took at most; getrusage would count its parent's before the exec."""
-    (line,) = [one for one in Path("/proc/self/status").read_text().splitlines() if one.startswith("VmHWM")]
+    (line,) = [
+        splitline for splitline in Path("/proc/self/status").read_text().splitlines() if splitline.startswith("VmHWM")
+    ]
     return int(line.split()[1]) / 1024
 
 

@@ -127,7 +127,7 @@ def _size(folder: Path, samples: int, tries: int) -> None:
                 (folder / f"to{end}").unlink(missing_ok=True)
                 ways.append(run(CONVERT, folder / f"run{begin}", folder / f"to{end}"))
             best = min(ways, key=_cpu)
-            ratio = best[1] / max(copies[one][1] for one in (begin, end) if one in copies)
+            ratio = best[1] / max(copies[name][1] for name in (begin, end) if name in copies)
             met = "met" if ratio <= AIM else "MISSED"
             way = f"{begin[1:]} to {end[1:]}"
             print(f"{samples:>10,} {way:17s} {_told(best)} {ratio:6.2f} ×   aim ≤ {AIM:g}: {met}", flush=True)

@@ -208,8 +208,8 @@ def main(sizes: tuple[int, ...]) -> None:
                 rows[row.name] = row
                 with node(Path(name)) if row.name.startswith("provision") else nullcontext():
                     runs = [run(home, row.words) for _ in range(1 if row.once or size >= 100_000 else 3)]
-                median = statistics.median(one.seconds for one in runs)
-                cpu, most = statistics.median(one.cpu for one in runs), max(one.megabytes for one in runs)
+                median = statistics.median(taken.seconds for taken in runs)
+                cpu, most = statistics.median(taken.cpu for taken in runs), max(taken.megabytes for taken in runs)
                 taken.setdefault(row.name, {})[size] = Taken(median, most, cpu)
     print_table(sizes, rows, taken)
 
@@ -218,19 +218,19 @@ def print_table(sizes: tuple[int, ...], rows: dict[str, Row], taken: dict[str, d
     """One line a command: seconds at each size, memory at the largest, the exponent, and the verdict on its aim."""
     print("command".ljust(18) + "".join(f"{size:>10}" for size in sizes) + "       CPU        MB  exponent  aim")
     nothing = taken["--version"]
-    for name, each in taken.items():
-        cells = "".join(f"{each[size].seconds:>8.2f} s" for size in sizes)
-        most, least = each[sizes[-1]], nothing[sizes[-1]]
-        exponent, aim = _exponent(sizes, each, nothing), _aim(rows[name], most, least)
+    for name, entry in taken.items():
+        cells = "".join(f"{entry[size].seconds:>8.2f} s" for size in sizes)
+        most, least = entry[sizes[-1]], nothing[sizes[-1]]
+        exponent, aim = _exponent(sizes, entry, nothing), _aim(rows[name], most, least)
         print(f"{name:<18}{cells}{most.cpu:>8.2f} s{most.megabytes:>10.0f}{exponent:>10}  {aim}")
     table, listed = taken["nodes (table)"][sizes[-1]], taken["nodes --json"][sizes[-1]]
     print(f"table / JSON: {table.seconds / listed.seconds:.2f} (aim 2)")
 
 
-def _exponent(sizes: tuple[int, ...], each: dict[int, Taken], nothing: dict[int, Taken]) -> str:
+def _exponent(sizes: tuple[int, ...], taken: dict[int, Taken], nothing: dict[int, Taken]) -> str:
     if len(sizes) < 2:
         return "-"
-    small, large = (max(0.005, each[size].seconds - nothing[size].seconds) for size in sizes[-2:])
+    small, large = (max(0.005, taken[size].seconds - nothing[size].seconds) for size in sizes[-2:])
     return f"{math.log(large / small) / math.log(sizes[-1] / sizes[-2]):.2f}"
 
 

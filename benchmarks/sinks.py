@@ -210,7 +210,7 @@ def topics(name: str, sink: Sink, reader: subprocess.Popen[str], seconds: float,
     _line(reader.stdout, "ready")
     known = facts(nodes)
     sink.open(known, STATION)
-    keys = tuple(one.key for one in known)
+    keys = tuple(facts.key for facts in known)
     ready = time.monotonic() + 30
     while sink.stats.written < len(known) and time.monotonic() < ready:
         for block in tick(0, time.time(), nodes=nodes):

@@ -145,16 +145,16 @@ def speed() -> dict[str, float]:
     blocks = example_set()
     assert all(teds.decode(block).verdict == "clean" for block in blocks)
     decoded = [teds.decode(block) for block in blocks]
-    assert [teds.recompose(each) for each in decoded] == blocks
+    assert [teds.recompose(teds_read) for teds_read in decoded] == blocks
     octets = sum(map(len, blocks))
     floor = seconds_per_set(lambda: [struct_only(block) for block in blocks])
     decode = seconds_per_set(lambda: [teds.decode(block) for block in blocks])
-    encode = seconds_per_set(lambda: [teds.recompose(each) for each in decoded])
+    encode = seconds_per_set(lambda: [teds.recompose(teds_read) for teds_read in decoded])
     result = {"octets per set": octets, "decode / floor": decode / floor, "encode / floor": encode / floor}
-    for name, each in (("floor", floor), ("decode", decode), ("encode", encode)):
-        result[f"{name} us per set"] = each * 1e6
-        result[f"{name} sets/s"] = 1 / each
-        result[f"{name} MB/s"] = octets / each / 1e6
+    for name, value in (("floor", floor), ("decode", decode), ("encode", encode)):
+        result[f"{name} us per set"] = value * 1e6
+        result[f"{name} sets/s"] = 1 / value
+        result[f"{name} MB/s"] = octets / value / 1e6
     return result
 
 
@@ -170,8 +170,8 @@ def each_kind() -> dict[str, str]:
         least = math.inf
         for _ in range(12):
             began = time.process_time()
-            for each in sets:
-                work(each[place])
+            for set_of_blocks in sets:
+                work(set_of_blocks[place])
             least = min(least, time.process_time() - began)
         return least
 

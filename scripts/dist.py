@@ -127,7 +127,7 @@ def main(folder: Path) -> int:
     run(sys.executable, "-m", "twine", "check", "--strict", *map(str, archives))
     run(
         str(Path(sys.executable).parent / "check-wheel-contents"),
-        *(str(each) for each in archives if each.suffix == ".whl"),
+        *(str(path) for path in archives if path.suffix == ".whl"),
     )
     for bill in (bill_of_tool(folder), bill_of_firmware(folder)):
         check_bill(bill)

@@ -118,9 +118,9 @@ def complex_functions(found: dict[str, Module]) -> list[str]:
     result = []
     for module in found.values():
         for block in cc_visit_ast(module.tree):
-            for one in [block, *getattr(block, "methods", [])]:
-                if type(one).__name__ == "Function" and one.complexity > 10:
-                    result.append(f"{one.complexity:3} {module.path.relative_to(PACKAGE)}:{one.lineno} {one.name}")
+            for item in [block, *getattr(block, "methods", [])]:
+                if type(item).__name__ == "Function" and item.complexity > 10:
+                    result.append(f"{item.complexity:3} {module.path.relative_to(PACKAGE)}:{item.lineno} {item.name}")
     return sorted(set(result), reverse=True)
 
 
@@ -153,11 +153,13 @@ def used_once(found: dict[str, Module]) -> list[str]:
         for node in ast.walk(module.tree):
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
-            first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
+            first = min([node.lineno, *(expression.lineno for expression in node.decorator_list)])
             private = node.name.startswith("_") and not node.name.startswith("__")
             if private and node.end_lineno is not None and node.end_lineno - first < 6 and called[node.name] == 1:
                 named = len(re.findall(rf"\b{node.name}\b", text))
-                if named == 2 and "abstractmethod" not in {ast.unparse(one) for one in node.decorator_list}:
+                if named == 2 and "abstractmethod" not in {
+                    ast.unparse(expression) for expression in node.decorator_list
+                }:
                     result.append(f"{module.path.relative_to(PACKAGE)}:{first} {node.name}")
     return sorted(result)
 
@@ -216,13 +218,13 @@ def report() -> Iterator[str]:
     yield from (f"    {place}" for place in late[:12])
     yield f"functions of complexity C or worse      {len(knots):6}"
     yield from (f"    {knot}" for knot in knots[:25])
-    once, count, folders = used_once(found), functions(found), len({one.path.parent for one in found.values()})
+    once, count, folders = used_once(found), functions(found), len({module.path.parent for module in found.values()})
     yield f"modules                                 {len(found):6}   in {folders} folders"
     yield f"functions                               {count:6}"
     yield f"of these private, short, called once    {len(once):6}   {len(once) / count:.1%}"
     shared = shared_names(found)
     yield f"names of classes in several rooms       {len(shared):6}"
-    yield from (f"    {one}" for one in shared)
+    yield from (f"    {shared_name}" for shared_name in shared)
     yield f"files in the fullest folder             {drawers()[0][0]:6}   aim 15 at most"
     yield from (f"    {number:3} {folder}" for number, folder in drawers() if number > 15)
     yield f"provision of a factory node             {entered()}"

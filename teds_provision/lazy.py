@@ -108,11 +108,14 @@ def _uv_tool(receipt: pathlib.Path, requirements: tuple[str, ...]) -> str:
     """``uv tool install`` with what its receipt has, and these."""
     try:
         said = tomllib.loads(receipt.read_text(encoding="utf-8"))["tool"]
-        listed = {one["name"]: one for one in said["requirements"]}
+        listed = {requirement["name"]: requirement for requirement in said["requirements"]}
     except (OSError, ValueError, KeyError, TypeError):
         said, listed = {}, {}
     ours = listed.pop(_TOOL, {})
-    extras = {*ours.get("extras", []), *(each[len(_TOOL) + 1 : -1] for each in requirements if each.startswith(_TOOL))}
+    extras = {
+        *ours.get("extras", []),
+        *(requirement[len(_TOOL) + 1 : -1] for requirement in requirements if requirement.startswith(_TOOL)),
+    }
     named = f"{_TOOL}[{','.join(sorted(extras))}]" if extras else _TOOL
     words = ["uv", "tool", "install"]
     if "python" in said:
@@ -127,11 +130,13 @@ def _uv_tool(receipt: pathlib.Path, requirements: tuple[str, ...]) -> str:
         )
     else:
         words.append(named + ours.get("specifier", ""))
-    for name, one in listed.items():
+    for name, requirement in listed.items():
         words += [
             "--with",
-            name + (f"[{','.join(one['extras'])}]" if one.get("extras") else "") + one.get("specifier", ""),
+            name
+            + (f"[{','.join(requirement['extras'])}]" if requirement.get("extras") else "")
+            + requirement.get("specifier", ""),
         ]
-    for each in requirements:
-        words += ["--with", each] if not each.startswith(_TOOL) else []
+    for needed in requirements:
+        words += ["--with", needed] if not needed.startswith(_TOOL) else []
     return shlex.join(words)

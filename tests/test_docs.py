@@ -84,7 +84,7 @@ def test_commands_that_are_shown_can_be_typed(page: Path, tmp_path: Path, monkey
     refused = []
     for line in shown(page):
         why = wrong(line)
-        if why and not any(one in why for one in ("There is no file", "There is no folder")):
+        if why and not any(item in why for item in ("There is no file", "There is no folder")):
             refused.append(f"{line}: {why}")
     assert refused == []
 

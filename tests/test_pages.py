@@ -31,7 +31,7 @@ def named(text: str) -> list[tuple[str, str]]:
 
 def has_section(page: str, section: str) -> bool:
     sections = headings(PAGES[page])
-    return section in sections or (section.endswith(". ") and any(one.startswith(section) for one in sections))
+    return section in sections or (section.endswith(". ") and any(name.startswith(section) for name in sections))
 
 
 def test_pages_and_sections_that_the_code_names_exist() -> None:
@@ -92,7 +92,7 @@ def test_the_ways_through_the_code_are_as_the_page_says() -> None:
     section = page.partition("## Seven ways through the code")[2].partition("\n## ")[0]
     ways = re.split(r"\n[1-9]\. ", section)[1:]
     assert len(ways) == 7
-    wrong = [one for way in ways for one in missing_on_the_way(way)]
+    wrong = [name for way in ways for name in missing_on_the_way(way)]
     assert wrong == []
     assert missing_on_the_way("`steps/verify.py` `judge`, `jugde` → `steps/verifi.py` `judge`") == [
         "steps/verify.py jugde",
@@ -133,7 +133,7 @@ def unknown_roles(path: Path, text: str, every: set[str]) -> list[str]:
         if role == "mod":
             whole = PACKAGE.parent.joinpath(*target.split("."))
             near = path.parent.joinpath(*target.lstrip(".").split("."))
-            there = any(one.with_suffix(".py").is_file() or one.is_dir() for one in (whole, near))
+            there = any(path.with_suffix(".py").is_file() or path.is_dir() for path in (whole, near))
         else:
             head, _, last = target.rpartition(".")
             there = last in (every if head else known)
@@ -145,6 +145,8 @@ def unknown_roles(path: Path, text: str, every: set[str]) -> list[str]:
 def test_what_docstrings_refer_to_exists() -> None:
     files = sorted(PACKAGE.rglob("*.py"))
     every = set().union(*map(defined, files))
-    assert [one for path in files for one in unknown_roles(path, path.read_text(encoding="utf-8"), every)] == []
+    assert [
+        unknown_role for path in files for unknown_role in unknown_roles(path, path.read_text(encoding="utf-8"), every)
+    ] == []
     here = PACKAGE / "limits.py"
     assert len(unknown_roles(here, "x = 1  # :func:`gone` :mod:`.gone` :func:`x`", every)) == 2

@@ -284,8 +284,8 @@ def _serve(control: socket.socket) -> _Request | None:
                 pid = os.fork()
                 if not pid:
                     return _Request(**json.loads(octets), files=tuple(files))
-                for each in files[1:]:
-                    os.close(each)
+                for descriptor in files[1:]:
+                    os.close(descriptor)
                 os.write(files[0], f"{pid}".encode().ljust(16))
                 pidfd = os.pidfd_open(pid)
                 children[pidfd] = pid, files[0]
@@ -302,10 +302,10 @@ def _tell_end(pidfd: int, pid: int, pipe: int) -> None:
 
 def _become(request: _Request) -> None:
     """In the child: take on files and environment of the request, and run its module."""
-    high = [fcntl.fcntl(each, fcntl.F_DUPFD, 512) for each in request.files[1:]]
+    high = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, 512) for descriptor in request.files[1:]]
     os.closerange(0, 512)
-    for number, each in enumerate(high):
-        os.dup2(each, number)
+    for number, descriptor in enumerate(high):
+        os.dup2(descriptor, number)
     os.closerange(512, max(high) + 1)
     under_faults = os.environ.get("LD_PRELOAD")
     os.environ.clear()

@@ -132,8 +132,8 @@ def document() -> dict[str, Any]:
     """The whole description."""
     named: dict[str, Schema] = {}
     paths: dict[str, dict[str, Any]] = {}
-    for one in OPERATIONS:
-        paths.setdefault(one.path, {})[one.method.lower()] = _operation(one, named)
+    for operation in OPERATIONS:
+        paths.setdefault(operation.path, {})[operation.method.lower()] = _operation(operation, named)
     error = schema_of(answers.Error, named)
     return {
         "openapi": "3.1.0",
@@ -159,31 +159,34 @@ def document() -> dict[str, Any]:
     }
 
 
-def _operation(one: Operation, named: dict[str, Schema]) -> dict[str, Any]:
-    names = [part[1:-1] for part in one.path.split("/") if part.startswith("{")]
+def _operation(operation: Operation, named: dict[str, Schema]) -> dict[str, Any]:
+    names = [part[1:-1] for part in operation.path.split("/") if part.startswith("{")]
     path = [
         {"name": name, "in": "path", "required": True, "schema": {"type": "integer"} if name == "number" else _TEXT}
         for name in names
     ]
-    if isinstance(one.answer, tuple):
-        schema: Schema = {"anyOf": [schema_of(kind, named) for kind in one.answer]}
+    if isinstance(operation.answer, tuple):
+        schema: Schema = {"anyOf": [schema_of(kind, named) for kind in operation.answer]}
     else:
-        schema = {"type": "object"} if one.answer is None else schema_of(one.answer, named)
+        schema = {"type": "object"} if operation.answer is None else schema_of(operation.answer, named)
     content: dict[str, Any] = {"application/json": {"schema": schema}}
-    if one.document:
+    if operation.document:
         content |= {"application/xml": {"schema": _TEXT}, "text/plain": {"schema": _TEXT}}
-    responses: dict[str, Any] = {str(one.status): {"description": one.does, "content": content}}
-    if one.status == 202:
+    responses: dict[str, Any] = {str(operation.status): {"description": operation.does, "content": content}}
+    if operation.status == 202:
         responses["200"] = responses["202"]  # a waiting that was cancelled
     responses |= {key: {"$ref": f"#/components/responses/{key}"} for key in REFUSALS}
-    words = "".join(part.strip("{}").title().replace("-", "") for part in one.path.split("/"))
+    words = "".join(part.strip("{}").title().replace("-", "") for part in operation.path.split("/"))
     found: dict[str, Any] = {
-        "operationId": f"{one.method.lower()}{words}",
-        "summary": one.does,
-        "parameters": [*path, *({"name": name, "in": "query", "schema": kind} for name, kind in one.query.items())],
+        "operationId": f"{operation.method.lower()}{words}",
+        "summary": operation.does,
+        "parameters": [
+            *path,
+            *({"name": name, "in": "query", "schema": kind} for name, kind in operation.query.items()),
+        ],
         "responses": responses,
     }
-    if one.body is not None:
-        schema = schema_of(one.body, named)
+    if operation.body is not None:
+        schema = schema_of(operation.body, named)
         found["requestBody"] = {"required": "required" in schema, "content": {"application/json": {"schema": schema}}}
     return found

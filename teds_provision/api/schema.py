@@ -63,10 +63,12 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
         return {"$ref": f"#/components/schemas/{shape.__name__}"}
     if is_dataclass(shape):
         hints = get_type_hints(shape, include_extras=True)
-        required = [one.name for one in fields(shape) if one.default is MISSING and one.default_factory is MISSING]
+        required = [
+            field.name for field in fields(shape) if field.default is MISSING and field.default_factory is MISSING
+        ]
         found: Schema = {
             "type": "object",
-            "properties": {one.name: schema_of(hints[one.name], named) for one in fields(shape)},
+            "properties": {field.name: schema_of(hints[field.name], named) for field in fields(shape)},
             "additionalProperties": False,
         }
         rule: Meta = getattr(shape, "RULE", Meta())
@@ -80,7 +82,7 @@ def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
     if origin is Literal:
         return {"type": "string", "enum": list(inner)}
     if origin in (Union, types.UnionType):
-        [kind] = [one for one in inner if one is not type(None)]
+        [kind] = [option for option in inner if option is not type(None)]
         found = schema_of(kind, named)
         if "type" not in found:
             return {"anyOf": [found, {"type": "null"}]}
@@ -134,14 +136,14 @@ def fit(schema: Schema, value: Any, where: str = "") -> Any:
     kinds = schema.get("type", [])
     kind = _kind_of(value, kinds if isinstance(kinds, list) else [kinds])
     if "enum" in schema and value not in schema["enum"]:
-        known = ", ".join(str(one) for one in schema["enum"] if one is not None)
+        known = ", ".join(str(allowed) for allowed in schema["enum"] if allowed is not None)
         raise BadRequestError(f"{where!r} must be one of {known}, not {_shown(value)}.")
     if kind == "object":
         return _object(schema, value, where)
     if kind == "array":
         if len(value) < schema.get("minItems", 0):
             raise BadRequestError(f"{where!r} must have at least {schema['minItems']} items.")
-        return [fit(schema.get("items", {}), one, f"{where}[{number}]") for number, one in enumerate(value)]
+        return [fit(schema.get("items", {}), element, f"{where}[{number}]") for number, element in enumerate(value)]
     if kind in ("integer", "number"):
         least, most = schema.get("minimum", -math.inf), schema.get("maximum", math.inf)
         if not least <= value <= most:
@@ -184,7 +186,7 @@ def _object(schema: Schema, value: dict[str, Any], where: str) -> dict[str, Any]
             raise BadRequestError(f"Member {name!r} is missing.")
     found = {name: fit(properties.get(name, {}), member, name) for name, member in value.items()}
     for choice in ("anyOf", "oneOf"):
-        fitting = sum(_fits(one, value) for one in schema.get(choice, ()))
+        fitting = sum(_fits(option, value) for option in schema.get(choice, ()))
         if choice in schema and (not fitting or (choice == "oneOf" and fitting > 1)):
             raise BadRequestError(schema["description"])
     return found

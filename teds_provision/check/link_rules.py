@@ -32,13 +32,13 @@ def _of_the_node(probe: Probe) -> tuple[HeardFrame, list[HeardFrame]]:
     probe.plain(_LONG)
     probe.teds(SECURITY)
     frames = probe.heard.frames[began:]
-    asked = next(one for one in frames if one.direction == "out")
-    return asked, [one for one in frames if _is_from(one, probe.contact.address)]
+    asked = next(frame for frame in frames if frame.direction == "out")
+    return asked, [frame for frame in frames if _is_from(frame, probe.contact.address)]
 
 
-def _is_from(one: HeardFrame, node: int) -> bool:
-    ends = addresses(one.identifier) if one.identifier is not None else None
-    return one.direction == "in" and bool(one.octets) and ends is not None and ends[1] == node
+def _is_from(frame: HeardFrame, node: int) -> bool:
+    ends = addresses(frame.identifier) if frame.identifier is not None else None
+    return frame.direction == "in" and bool(frame.octets) and ends is not None and ends[1] == node
 
 
 def _used(frames: list[HeardFrame]) -> Iterator[tuple[HeardFrame, int]]:
@@ -47,18 +47,18 @@ def _used(frames: list[HeardFrame]) -> Iterator[tuple[HeardFrame, int]]:
     What stands behind a frame that was lost, or heard twice, is left out until the next message.
     """
     left = number = 0
-    for one in frames:
-        data = one.octets
+    for frame in frames:
+        data = frame.octets
         kind, low = data[0] >> 4, data[0] & 0xF
         if kind == _SINGLE:
-            yield one, 1 + low if low else 2 + data[1]
+            yield frame, 1 + low if low else 2 + data[1]
         elif kind == _FIRST:
             left, number = (low << 8 | data[1]) - (len(data) - 2), 0
-            yield one, len(data)
+            yield frame, len(data)
         elif kind == _FLOW:
-            yield one, 3
+            yield frame, 3
         elif left > 0 and low == (number + 1) % 16:
-            yield one, 1 + min(left, len(data) - 1)
+            yield frame, 1 + min(left, len(data) - 1)
             left, number = left - (len(data) - 1), low
         else:
             left = 0
@@ -71,12 +71,16 @@ def can_flow_control(probe: Probe) -> str:
     A reserved STmin counts as 127 ms (ISO 15765-2, table of STmin).
     """
     _, frames = _of_the_node(probe)
-    controls = {one.octets for one in frames if one.octets[0] >> 4 == _FLOW}
-    wrong = " ".join(sorted(one.hex() for one in controls if len(one) < 3 or one[0] & 0xF > _OVERFLOW))
+    controls = {frame.octets for frame in frames if frame.octets[0] >> 4 == _FLOW}
+    wrong = " ".join(sorted(control.hex() for control in controls if len(control) < 3 or control[0] & 0xF > _OVERFLOW))
     holds(not wrong, f"Flow control {wrong}: 30 to 32, block size and STmin are due.")
-    asked = {f"block size {one[1]}, STmin {gap_seconds(one[2]) * 1000:g} ms" for one in controls if one[0] & 0xF == 0}
-    padding = {octet for one, used in _used(frames) for octet in one.octets[used:]}
-    return f"{', '.join(sorted(asked))}; padding {' '.join(f'{one:02X}' for one in sorted(padding)) or 'none'}"
+    asked = {
+        f"block size {control[1]}, STmin {gap_seconds(control[2]) * 1000:g} ms"
+        for control in controls
+        if control[0] & 0xF == 0
+    }
+    padding = {octet for frame, used in _used(frames) for octet in frame.octets[used:]}
+    return f"{', '.join(sorted(asked))}; padding {' '.join(f'{octet:02X}' for octet in sorted(padding)) or 'none'}"
 
 
 @rule("can-busy", "CAN", Stage.PLAIN)
@@ -106,7 +110,7 @@ def can_form(probe: Probe) -> str:
     """The node answers in the form, classic or FD, in which it was asked."""
     asked, frames = _of_the_node(probe)
     form = {True: "CAN FD", False: "classic CAN"}
-    same = all(one.fd == asked.fd for one in frames)
+    same = all(frame.fd == asked.fd for frame in frames)
     holds(same, f"Asked in {form[asked.fd]} it answered in {form[not asked.fd]}.")
     return f"asked and answered in {form[asked.fd]}"
 
@@ -125,7 +129,9 @@ def nfc_wait_time(probe: Probe) -> str:
 @rule("nfc-wtx", "NFC", Stage.PLAIN)
 def nfc_wtx(probe: Probe) -> str:
     """An S(WTX) asks for 1 to 59 times the frame waiting time (ISO/IEC 14443-4, clause 7.3)."""
-    blocks = [one.octets for one in probe.heard.frames if one.direction == "in"] if probe.heard is not None else []
+    blocks = (
+        [frame.octets for frame in probe.heard.frames if frame.direction == "in"] if probe.heard is not None else []
+    )
     asked = {block[1] & 0x3F for block in blocks if len(block) == 2 and block[0] == _WTX}
     if probe.contact.address is not None or not asked:
         raise NotApplicableError("No S(WTX) was heard.")

@@ -193,8 +193,10 @@ class Probe:
         """The same node as another base station has it, ``number`` 1 or 2: its own line, and so its own session."""
         bus = self.bus
         frames = self.heard.frames if self.heard is not None else []
-        out = [one.identifier & 0xFF for one in frames if one.identifier is not None and one.direction == "out"]
-        taken = {one.identifier & 0xFF for one in frames if one.identifier is not None and one.direction == "in"}
+        out = [frame.identifier & 0xFF for frame in frames if frame.identifier is not None and frame.direction == "out"]
+        taken = {
+            frame.identifier & 0xFF for frame in frames if frame.identifier is not None and frame.direction == "in"
+        }
         free = [source for source in _STATIONS if source not in taken | set(out[:1])]
         if number > len(free):
             raise NotApplicableError("All addresses of base stations are in use on this bus.")

@@ -118,8 +118,8 @@ class _Run:
             held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
             self._skip(stage, _NEEDS_KEY if held else _NEEDS_FACTORY)
         stages = list(Stage)
-        ordered = sorted(RULES, key=lambda each: stages.index(each.stage))
-        checks = tuple(self._checks[each.name] for each in ordered)
+        ordered = sorted(RULES, key=lambda rule: stages.index(rule.stage))
+        checks = tuple(self._checks[rule.name] for rule in ordered)
         return CheckReport(self._node.uuid, checks, self._lost, self._explained)
 
     def _explain(self) -> None:
@@ -145,46 +145,46 @@ class _Run:
     # -- stages ----------------------------------------------------------------------------------------------------
 
     def _stage(self, stage: Stage) -> None:
-        for each in RULES:
-            if each.stage == stage:
-                self._checks[each.name] = self._try(each)
+        for rule in RULES:
+            if rule.stage == stage:
+                self._checks[rule.name] = self._try(rule)
 
     def _skip(self, stage: Stage, why: str) -> None:
-        for each in RULES:
-            if each.stage == stage and each.name not in self._checks:
-                self._checks[each.name] = RuleResult(each.name, each.clause, "skipped", why)
+        for rule in RULES:
+            if rule.stage == stage and rule.name not in self._checks:
+                self._checks[rule.name] = RuleResult(rule.name, rule.clause, "skipped", why)
 
-    def _try(self, each: Rule) -> RuleResult:
+    def _try(self, rule: Rule) -> RuleResult:
         for left in reversed(range(_TORN_TRIES)):
             try:
-                return self._tried(each)
+                return self._tried(rule)
             except GarbledError as torn:  # of the link, after its own repetitions
                 why, self._probe.session = torn.message, None
                 if left:
                     self._probe.listen()  # a node that answers nothing else either is lost, not wrong in this
         also = " Identify was answered meanwhile: it is the node, or a very bad bus." if self._probe.noisy else ""
         text = f"{self._probe.asked}: no reply that can be read, {_TORN_TRIES} times.{also} {why}"
-        return RuleResult(each.name, each.clause, "failed", text)
+        return RuleResult(rule.name, rule.clause, "failed", text)
 
-    def _tried(self, each: Rule) -> RuleResult:
+    def _tried(self, rule: Rule) -> RuleResult:
         slip = None
         try:
-            return RuleResult(each.name, each.clause, "passed", each.run(self._probe))
+            return RuleResult(rule.name, rule.clause, "passed", rule.run(self._probe))
         except NotApplicableError as skip:
             self._probe.session = None
-            return RuleResult(each.name, each.clause, "skipped", str(skip))
+            return RuleResult(rule.name, rule.clause, "skipped", str(skip))
         except RuleBrokenError as broken:
             detail, slip = str(broken), broken.slip
         except GarbledError:
             raise
         except LinkError as lost:
             detail = f"{self._probe.asked}: {lost.message}"
-            self._checks[each.name] = RuleResult(each.name, each.clause, "skipped", detail)
-            raise type(lost)(f"The node fell silent in the rule {each.name}: {detail}", hint=lost.hint) from lost
+            self._checks[rule.name] = RuleResult(rule.name, rule.clause, "skipped", detail)
+            raise type(lost)(f"The node fell silent in the rule {rule.name}: {detail}", hint=lost.hint) from lost
         except (BadDataError, NotAuthenticError, PolicyError) as wrong:
             detail = wrong.message
         self._probe.session = None
-        return RuleResult(each.name, each.clause, "failed", detail, slip.name if slip is not None else None)
+        return RuleResult(rule.name, rule.clause, "failed", detail, slip.name if slip is not None else None)
 
     # -- keys ------------------------------------------------------------------------------------------------------
 
@@ -217,7 +217,7 @@ class _Run:
         try:
             reset_node(self._station, self._node, examine(self._station, self._node))
         except (BadDataError, NotAuthenticError, PolicyError) as no:
-            (rule,) = [each for each in RULES if each.name == "reset"]
+            (rule,) = [rule for rule in RULES if rule.name == "reset"]
             self._checks["reset"] = RuleResult("reset", rule.clause, "failed", no.message)
             return f"The node could not be reset. {no.message}"
         self._probe.key = self._probe.session = None

@@ -60,14 +60,14 @@ def _ways(right: bytes, **wrong: tuple[bytes, str]) -> list[Way]:
 
 
 def _together(found: Iterable[Slip | None]) -> Slip | None:
-    slips = [each for each in found if each is not None]
+    slips = [candidate for candidate in found if candidate is not None]
     if not slips:
         return None
-    return Slip("+".join(each.name for each in slips), ", and ".join(each.words for each in slips))
+    return Slip("+".join(slip.name for slip in slips), ", and ".join(slip.words for slip in slips))
 
 
 def _count(*slips: Slip | None) -> int:
-    return sum(each is not None for each in slips)
+    return sum(slip is not None for slip in slips)
 
 
 def _hmac(key: bytes, message: bytes) -> bytes:
@@ -278,14 +278,14 @@ class Agreement:
         """What would explain a wrong tagN: one slip, or two."""
         # Of about 70,000 ways together 2,000 have two slips at most: 0.1 s instead of seconds.
         for most in (1, 2):
-            for (one, script), (two, shared) in product(self.transcripts(), self.secrets()):
-                if _count(one, two) > most:
+            for (candidate, script), (two, shared) in product(self.transcripts(), self.secrets()):
+                if _count(candidate, two) > most:
                     continue
                 for three, okm in self.material(shared, script):
-                    if _count(one, two, three) > most:
+                    if _count(candidate, two, three) > most:
                         continue
                     for four, tag in self.tags(okm, script):
-                        slips = (one, two, three, four)
+                        slips = (candidate, two, three, four)
                         if _count(*slips) <= most and hmac.compare_digest(tag, self.tag):
                             return _together(slips)
         return None
@@ -527,7 +527,7 @@ def of_session(key: bytes, uuid: bytes, one_time: PrivateKey, reply: bytes) -> S
         return None
     z, label, both = one_time.ecdh(node), b"TEDS1 session\0", station + node
     identifier, found = key_id(key), list[tuple[int, Slip | None]]()
-    for one, shared in _ways(z, z_little_endian=(z[::-1], "Z is little-endian")):
+    for way, shared in _ways(z, z_little_endian=(z[::-1], "Z is little-endian")):
         materials = _ways(
             _hkdf(shared, key, label + uuid + both, 96),
             salt_and_ikm_swapped=(_hkdf(key, shared, label + uuid + both, 96), "salt and ikm of HKDF are swapped"),
@@ -572,9 +572,9 @@ def of_session(key: bytes, uuid: bytes, one_time: PrivateKey, reply: bytes) -> S
                     ),
                 ):
                     if hmac.compare_digest(tag, got):
-                        slips = [each for each in (one, two, three, four) if each is not None]
+                        slips = [item for item in (way, two, three, four) if item is not None]
                         found.append((len(slips), _together(slips)))
-    return min(found, key=lambda each: each[0])[1] if found else None
+    return min(found, key=lambda pair: pair[0])[1] if found else None
 
 
 Seal = Callable[[SessionKeys, int, bytes], bytes]

@@ -372,7 +372,7 @@ def commit_uuid(probe: Probe) -> str:
     meta = (0, 1)
     if TedsStatus.decode(probe.good(query_teds(*meta))).attributes & Attribute.READ_ONLY:
         raise NotApplicableError("The Meta-TEDS of this node is read-only.")
-    other = bytes(each ^ 0x55 for each in probe.uuid)
+    other = bytes(octet ^ 0x55 for octet in probe.uuid)
     octets = frame(bytes([3, 4, 0, 1, 1, 1, 4, 10]) + other)
     _write(probe, meta, octets)
     listed = _stored(probe) | {meta: octets}
@@ -400,8 +400,8 @@ def commit(probe: Probe) -> str:
     block, stored, before = absent(probe), _stored(probe), probe.identity()
     for blocks in (stored | {block: _example(block)}, stored):
         octets = _signed(probe, _sheet(probe, blocks))
-        for each in set(blocks) - set(stored):
-            _write(probe, each, blocks[each])
+        for block_id in set(blocks) - set(stored):
+            _write(probe, block_id, blocks[block_id])
         _write(probe, SECURITY, octets)
         reply = probe.sealed(update_teds(*SECURITY))
         if not reply.ok:
@@ -440,8 +440,8 @@ def _slip_of_commit(probe: Probe, reason: int | None, blocks: dict[BlockId, byte
             tries.append((Slip(name, words + "; they are from Length to Checksum"), _signed(probe, sheet)))
     stored = _stored(probe)
     for slip, octets in tries:
-        for each in set(blocks) - set(stored):
-            _write(probe, each, blocks[each])
+        for block_id in set(blocks) - set(stored):
+            _write(probe, block_id, blocks[block_id])
         _write(probe, SECURITY, octets)
         taken = probe.sealed(update_teds(*SECURITY)).ok
         probe.close()

@@ -363,12 +363,12 @@ def draft() -> None:
 def list_(app: App) -> None:
     """List every draft: node, stage and profile."""
     drafts = [
-        {"uuid": one.uuid.hex(), "profile": one.profile, "stage": one.stage, "created": one.created}
-        for one in app.station().nodes.drafts()
+        {"uuid": draft.uuid.hex(), "profile": draft.profile, "stage": draft.stage, "created": draft.created}
+        for draft in app.station().nodes.drafts()
     ]
     lines = [
-        f"{one['uuid']}  {one['stage']:<6}  {local_time(str(one['created']))}  {one['profile'] or ''}".rstrip()
-        for one in drafts
+        f"{draft['uuid']}  {draft['stage']:<6}  {local_time(str(draft['created']))}  {draft['profile'] or ''}".rstrip()
+        for draft in drafts
     ]
     app.emit({"drafts": drafts}, "\n".join(lines) or "There are no drafts.")
 
@@ -412,8 +412,8 @@ def history(app: App, uuid: str) -> None:
         for record in records
     ]
     lines = [
-        f"{one.sequence:>6}  epoch {one.epoch}  {local_time(one.signed or 'not signed'):<25}  {one.profile or ''}"
-        for one in records
+        f"{row.sequence:>6}  epoch {row.epoch}  {local_time(row.signed or 'not signed'):<25}  {row.profile or ''}"
+        for row in records
     ]
     app.emit(
         {"uuid": node.hex(), "history": told},

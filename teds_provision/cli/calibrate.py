@@ -121,7 +121,7 @@ def _zero_json(done: ZeroResult, *, dry_run: bool) -> dict[str, Any]:
         "dry_run": dry_run,
         "changes": list(done.changes),
         "warnings": list(done.warnings),
-        "steps": [{"name": one.name, "result": one.result, "seconds": one.seconds} for one in done.steps],
+        "steps": [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps],
     }
 
 
@@ -190,7 +190,7 @@ def capture(
         "name": own.name,
         "file": str(file),
         "added": {**added, "spread": point.spread, "count": point.count},
-        "points": [dict(one) for one in done.points],
+        "points": [dict(point) for point in done.points],
     }
     count = len(done.points)
     app.emit(
@@ -227,23 +227,23 @@ def fit(app: App, file: Path, method: str | None, degree: int | None, profile: s
         fitted, warnings = dict(prepared.calibrations or {}), prepared.warnings
     else:
         fitted = teds.calibration.fit_points(text, str(file), method=method, degree=degree)
-    told = [_fit_json(one) for _, one in sorted(fitted.items())]
+    told = [_fit_json(calibration) for _, calibration in sorted(fitted.items())]
     for warning in warnings:
         app.warn(warning)
     result = {"file": str(file), **told[0], "channels": told, "warnings": list(warnings)}
-    app.emit(result, lambda console: _fits(console, [one for _, one in sorted(fitted.items())], told))
+    app.emit(result, lambda console: _fits(console, [calibration for _, calibration in sorted(fitted.items())], told))
 
 
-def _fit_json(one: Calibration) -> dict[str, Any]:
-    found, without = teds.calibration.residuals(one), teds.calibration.left_out(one)
+def _fit_json(calibration: Calibration) -> dict[str, Any]:
+    found, without = teds.calibration.residuals(calibration), teds.calibration.left_out(calibration)
     if found is None:
         raise UsageError("There are no points to fit.", hint="calibrate fit takes a CSV of points: raw, value.")
     rows = zip(found.inputs, found.references, found.curve, found.differences, strict=True)
     return {
-        "channel": one.channel,
-        "method": one.method,
-        "kind": teds.calibration.kind_of(one),
-        "unit": one.unit.text,
+        "channel": calibration.channel,
+        "method": calibration.method,
+        "kind": teds.calibration.kind_of(calibration),
+        "unit": calibration.unit.text,
         "residuals": [
             {"raw": raw, "value": value, "fit": curve, "residual": residual} for raw, value, curve, residual in rows
         ],
@@ -260,13 +260,13 @@ def _rms(values: Sequence[float]) -> float:
 def _fits(console: Console, fitted: Sequence[Calibration], told: Sequence[dict[str, Any]]) -> None:
     from rich.table import Table
 
-    for one, said in zip(fitted, told, strict=True):
-        unit = one.unit.text
+    for calibration, said in zip(fitted, told, strict=True):
+        unit = calibration.unit.text
         table = Table("raw", f"value [{unit}]", "fit", "residual", box=None, pad_edge=False)
         for row in said["residuals"]:
             table.add_row(*(f"{row[name]:.6g}" for name in ("raw", "value", "fit")), f"{row['residual']:+.3g}")
         print_table(console, table)
-        console.print(teds.calibration.sentence(one), markup=False)
+        console.print(teds.calibration.sentence(calibration), markup=False)
         if said["left_out"] is not None:
             worst, rms = said["left_out"]["maximum"], said["left_out"]["rms"]
             console.print(

@@ -63,16 +63,16 @@ def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, link
     counts = {result: report.count(result) for result in ("passed", "failed", "skipped")}
     checks = [
         {
-            "rule": each.rule,
-            "clause": each.clause,
-            "result": each.result,
-            "detail": each.detail,
-            "slip": each.slip,
+            "rule": result.rule,
+            "clause": result.clause,
+            "result": result.result,
+            "detail": result.detail,
+            "slip": result.slip,
         }
-        for each in report.checks
+        for result in report.checks
     ]
     explained = {"explain": _explained(report.explained)} if report.explained is not None else {}
-    broken = [each.rule for each in report.checks if each.result == "failed"]
+    broken = [result.rule for result in report.checks if result.result == "failed"]
     error: TedsProvisionError | None = report.lost
     if broken:
         count = "a rule" if len(broken) == 1 else f"{len(broken)} rules"
@@ -132,8 +132,13 @@ def _table(console: Console, report: CheckReport) -> None:
 
     style = {"passed": "green", "failed": "bold red", "skipped": "dim"}
     table = Table("rule", "result", "clause", "seen", box=None, pad_edge=False)
-    for each in report.checks:
-        table.add_row(each.rule, f"[{style[each.result]}]{each.result}[/]", each.clause, escape(each.detail))
+    for rule_result in report.checks:
+        table.add_row(
+            rule_result.rule,
+            f"[{style[rule_result.result]}]{rule_result.result}[/]",
+            rule_result.clause,
+            escape(rule_result.detail),
+        )
     print_table(console, table)
     counts = ", ".join(f"{report.count(result)} {result}" for result in style)
     console.print(f"{report.uuid.hex()}: {counts}")

@@ -126,7 +126,7 @@ def _parameter(root: click.Context, name: str) -> tuple[str, click.Command, clic
     for path, options in OPTIONS.items():
         if option in options and path.split()[: len(words)] == words:
             command, wanted = _command(root, path), parameter_of(path, option)
-            return next(((path, command, each) for each in command.params if each.name == wanted), None)
+            return next(((path, command, parameter) for parameter in command.params if parameter.name == wanted), None)
     return None
 
 

@@ -98,7 +98,7 @@ def anchored(values: dict[str, Any], folder: Path, above: str = "") -> dict[str,
 def _anchored_value(name: str, value: Any, folder: Path, above: str) -> Any:
     plain = name.replace("_", "-")
     if isinstance(value, list):
-        return [_anchored_value(name, each, folder, above) for each in value]
+        return [_anchored_value(name, element, folder, above) for element in value]
     if not isinstance(value, str) or not value:
         return value
     if above == "brokers":

@@ -67,9 +67,11 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None, report: 
     )
     found = list(doctor_room.checks.examine(system))
     findings = [finding for _, finding in found]
-    checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
+    checks = [
+        {"name": finding.name, "result": finding.result, "why": finding.why, "fix": finding.fix} for finding in findings
+    ]
     code = doctor_room.checks.exit_code(found)
-    counts = {word: sum(one.result == word for one in findings) for word in _STYLES}
+    counts = {word: sum(finding.result == word for finding in findings) for word in _STYLES}
     if report is None:
         app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
     else:
@@ -117,13 +119,15 @@ def _print(console: Console, findings: list[Finding]) -> None:
     from rich.padding import Padding
     from rich.text import Text
 
-    width = max(len(one.name) for one in findings)
-    for one in findings:
-        line = Text(f"{one.result:<8}", style=_STYLES[one.result])
-        line.append(f" {one.name:<{width}}  {one.why}", style="not bold default")
+    width = max(len(finding.name) for finding in findings)
+    for finding in findings:
+        line = Text(f"{finding.result:<8}", style=_STYLES[finding.result])
+        line.append(f" {finding.name:<{width}}  {finding.why}", style="not bold default")
         console.print(line)
-        if one.fix and one.result != "ok":
-            console.print(Padding(Text(f"→ {one.fix}"), (0, 0, 0, 9)) if console.is_terminal else f"  → {one.fix}")
+        if finding.fix and finding.result != "ok":
+            console.print(
+                Padding(Text(f"→ {finding.fix}"), (0, 0, 0, 9)) if console.is_terminal else f"  → {finding.fix}"
+            )
 
 
 # Which keys config.toml may have: the options of every command, by the names that the command line gives them.

@@ -24,9 +24,9 @@ def group() -> None:
 
 
 def _print_groups(app: App, groups: Sequence[Group]) -> None:
-    lines = [f"{one.name}: {', '.join(uuid.hex() for uuid in one.uuids) or 'no nodes yet'}" for one in groups]
+    lines = [f"{group.name}: {', '.join(uuid.hex() for uuid in group.uuids) or 'no nodes yet'}" for group in groups]
     app.emit(
-        {"groups": [{"name": one.name, "uuids": [uuid.hex() for uuid in one.uuids]} for one in groups]},
+        {"groups": [{"name": group.name, "uuids": [uuid.hex() for uuid in group.uuids]} for group in groups]},
         "\n".join(lines) or "There are no groups yet. To create one: teds-provision group create NAME UUID …",
     )
 
@@ -105,5 +105,5 @@ def delete(app: App, name: str, *, dry_run: bool) -> None:
     _print_groups(app, station.groups.all())
 
 
-for one in (create, add, remove, delete):
-    group.add_command(one)
+for subcommand in (create, add, remove, delete):
+    group.add_command(subcommand)

@@ -143,10 +143,10 @@ def export_keys(
 def _tell_export(
     app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], told: dict[str, Any], done: Sequence[ExportResult]
 ) -> None:
-    for bundle, one in zip(told["bundles"], done, strict=True):
-        bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
-    fresh = any(one.fresh for one in done)
-    told |= {"sha256": done[0].sha256, "octets": sum(one.octets for one in done), "fresh": fresh}
+    for bundle, exported in zip(told["bundles"], done, strict=True):
+        bundle |= {"sha256": exported.sha256, "octets": exported.octets, "fresh": exported.fresh}
+    fresh = any(exported.fresh for exported in done)
+    told |= {"sha256": done[0].sha256, "octets": sum(exported.octets for exported in done), "fresh": fresh}
     again = "" if fresh else " (nothing to do: it already exists)"
     moved = plans[0].mode == "move"
     next_step = "\nTo complete the move with its receipt: teds-provision handover receipt FILE.receipt" if moved else ""
@@ -165,21 +165,21 @@ def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Sta
         "from": station.fingerprint,
         "to": [{"name": record.name, "fingerprint": record.fingerprint} for record in plan.receivers],
         "mode": plan.mode,
-        "count": sum(len(one.nodes) for one in plans),
+        "count": sum(len(plan.nodes) for plan in plans),
         "id": plan.id,
         "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "nodes": [node.uuid.hex() for one in plans for node in one.nodes],
+        "nodes": [node.uuid.hex() for plan in plans for node in plan.nodes],
         "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
-        "also_held_by": sorted({digits for one in plans for digits in one.also_held_by}),
+        "also_held_by": sorted({digits for plan in plans for digits in plan.also_held_by}),
         "bundles": [
-            {"bundle": None if output is None else str(output), "id": one.id, "count": len(one.nodes)}
-            for one, output in zip_longest(plans, outputs)
+            {"bundle": None if output is None else str(output), "id": pair.id, "count": len(pair.nodes)}
+            for pair, output in zip_longest(plans, outputs)
         ],
     }
 
 
 def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
-    plan, chosen = plans[0], [one for part in plans for one in part.nodes]
+    plan, chosen = plans[0], [leaving for part in plans for leaving in part.nodes]
     lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {local_time(plan.expires.isoformat())}"]
     lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
     lines += first_lines(_node_lines(chosen[:_LEAVING_SHOWN], station), _LEAVING_SHOWN, len(chosen))
@@ -352,11 +352,11 @@ def _import_plan(plan: ImportPlan | ImportResult) -> dict[str, Any]:
     if isinstance(plan, handover_room.incoming.ImportResult):
         return _taken_before(plan)
     bundle = plan.opened.bundle
-    nodes = ((one.node.uuid.hex(), one.decision, one.why) for one in plan.nodes)
-    denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
+    nodes = ((planned.node.uuid.hex(), planned.decision, planned.why) for planned in plan.nodes)
+    denied = [{"uuid": revocation.uuid.hex(), "why": revocation.why} for revocation in plan.denied]
     told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
-    notes = {one.node.uuid.hex(): list(one.notes) for one in plan.nodes if one.notes}
-    passed_over = [{"uuid": one.uuid.hex(), "why": why} for one, why in plan.passed_over]
+    notes = {planned.node.uuid.hex(): list(planned.notes) for planned in plan.nodes if planned.notes}
+    passed_over = [{"uuid": revocation.uuid.hex(), "why": why} for revocation, why in plan.passed_over]
     return told | {"notes": notes, "revocations_passed_over": passed_over}
 
 
@@ -375,12 +375,15 @@ def _import_text(station: Station, plan: ImportPlan | ImportResult) -> str:
     lines = [
         f"A {bundle.mode} of {count_of(len(nodes))} from {handover_room.pending.peer_name(station, bundle.sender)}"
     ]
-    shown = [f"  {one.decision:<8} {one.node.uuid.hex()}  {one.why}".rstrip() for one in nodes[:_COMING_SHOWN]]
+    shown = [
+        f"  {planned.decision:<8} {planned.node.uuid.hex()}  {planned.why}".rstrip()
+        for planned in nodes[:_COMING_SHOWN]
+    ]
     lines += first_lines(shown, _COMING_SHOWN, len(nodes))
-    noted = islice((one for one in nodes if one.notes), _COMING_SHOWN)
-    lines += [f"  {one.node.uuid.hex()}: {note}" for one in noted for note in one.notes]
-    lines += [f"  revoked  {one.uuid.hex()}  {one.why}" for one in plan.denied]
-    lines += [f"  its ban of {one.uuid.hex()} is ignored: {why}" for one, why in plan.passed_over]
+    noted = islice((planned for planned in nodes if planned.notes), _COMING_SHOWN)
+    lines += [f"  {planned.node.uuid.hex()}: {note}" for planned in noted for note in planned.notes]
+    lines += [f"  revoked  {revocation.uuid.hex()}  {revocation.why}" for revocation in plan.denied]
+    lines += [f"  its ban of {revocation.uuid.hex()} is ignored: {why}" for revocation, why in plan.passed_over]
     own, sender = handover_room.trust.spoken(station.fingerprint), handover_room.trust.spoken(bundle.sender)
     lines += [f"Compare by voice:\n  from {sender}\n  to   {own}"]
     if not plan.ca_is_known:
@@ -420,10 +423,10 @@ def _prove(app: App, station: Station, done: ImportResult, links: LinkSettings) 
         handover_room.incoming.prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
     )
     return [
-        {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
-        if isinstance(one, handover_room.incoming.NodeProof)
-        else {"uuid": one.uuid.hex(), "rotated": False, "why": one.why}
-        for one in outcomes
+        {"uuid": outcome.uuid.hex(), "rotated": outcome.rotated, "why": ""}
+        if isinstance(outcome, handover_room.incoming.NodeProof)
+        else {"uuid": outcome.uuid.hex(), "rotated": False, "why": outcome.why}
+        for outcome in outcomes
     ]
 
 
@@ -434,9 +437,9 @@ def _tell_import(
     known = handover_room.incoming.proven_of(station, map(bytes.fromhex, imported))
     proven = [uuid for uuid in imported if bytes.fromhex(uuid) in known] if known else []
     pending = [uuid for uuid in imported if bytes.fromhex(uuid) not in known] if known else imported
-    not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
+    not_met = {outcome["uuid"]: outcome["why"] for outcome in outcomes if outcome["why"]}
     told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
-    app.emit(told, _summary(done, receipt, not_met, pending, sum(bool(one["rotated"]) for one in outcomes)))
+    app.emit(told, _summary(done, receipt, not_met, pending, sum(bool(outcome["rotated"]) for outcome in outcomes)))
 
 
 def _summary(done: ImportResult, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
@@ -473,18 +476,18 @@ def list_(app: App) -> None:
     listed = handover_room.pending.list_handovers(app.station(), datetime.now(UTC))
     rows = [
         {
-            "id": one.row.id,
-            "direction": one.row.direction,
-            "mode": one.row.mode,
-            "state": one.row.state,
-            "peers": list(one.row.peers),
-            "names": list(one.peers),
-            "count": one.count,
-            "created": one.row.created,
-            "expires": one.expires,
-            "expired": one.expired,
+            "id": handover.row.id,
+            "direction": handover.row.direction,
+            "mode": handover.row.mode,
+            "state": handover.row.state,
+            "peers": list(handover.row.peers),
+            "names": list(handover.peers),
+            "count": handover.count,
+            "created": handover.row.created,
+            "expires": handover.expires,
+            "expired": handover.expired,
         }
-        for one in listed
+        for handover in listed
     ]
     lines = [
         f"{row['id']}  {row['direction']:<3} {row['mode']}  {row['state']:<8} {row['count']:>5}"
@@ -512,8 +515,8 @@ def receipt(app: App, file: Path) -> None:
         raise NotFoundError(f"There is no receipt (*.receipt) in {file}.")
     with station.lock("handover receipt", app.note):
         closed, failed = _close_all(app, station, files, go_on=file.is_dir())
-    told = [_closed(one) for one in closed]
-    text = "\n".join(_closed_text(station, one) for one in closed)
+    told = [_closed(result) for result in closed]
+    text = "\n".join(_closed_text(station, result) for result in closed)
     app.conclude({**told[0], "receipts": told} if told else {"receipts": []}, text or None, failed)
 
 
@@ -544,7 +547,7 @@ def _closed(done: CloseResult) -> dict[str, Any]:
         "mode": done.row.mode,
         "state": done.row.state,
         "imported": [uuid.hex() for uuid in done.receipt.imported],
-        "refused": [{"uuid": one.uuid.hex(), "why": one.why} for one in done.receipt.refused],
+        "refused": [{"uuid": refused.uuid.hex(), "why": refused.why} for refused in done.receipt.refused],
         "fresh": done.fresh,
     }
 
@@ -555,7 +558,7 @@ def _closed_text(station: Station, done: CloseResult) -> str:
     text += (
         ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (already known)."
     )
-    lines = [f"  refused {one.uuid.hex()}: {one.why}" for one in refused]
+    lines = [f"  refused {node.uuid.hex()}: {node.why}" for node in refused]
     if refused and done.row.mode == "move":
         lines.append("The refused nodes belong to this station again; their keys are rotated at the next contact.")
     return "\n".join([text, *lines])

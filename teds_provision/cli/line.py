@@ -159,10 +159,10 @@ def _time(text: str) -> datetime:
 def _boards(path: Path) -> dict[bytes, str]:
     """The boards of a whitelist file, each with its whole fingerprint."""
     listed = steps.whitelist.read_whitelist(path)
-    for one in listed:
-        if one.fingerprint is None or len(one.fingerprint) != 64:
-            raise BadDataError(f"{path}:{one.line}: a job needs the full fingerprint (64 digits) of each board.")
-    return {one.uuid: one.fingerprint or "" for one in listed}
+    for node in listed:
+        if node.fingerprint is None or len(node.fingerprint) != 64:
+            raise BadDataError(f"{path}:{node.line}: a job needs the full fingerprint (64 digits) of each board.")
+    return {node.uuid: node.fingerprint or "" for node in listed}
 
 
 def _rule(told: dict[str, Any], boards: dict[bytes, str]) -> CalibrationRule:
@@ -250,16 +250,16 @@ def list_jobs(app: App) -> None:
     plant.jobs.take_received(station)
     rows = station.plant.line.jobs()
     found = [plant.jobs.kept_job(station, row) for row in rows]
-    told = [_to_json(station, one) for one in found]
+    told = [_to_json(station, job) for job in found]
 
     def table(console: Console) -> None:
         from rich.table import Table
 
         shown = Table("id", "title", "profile", "boards", "passed here", "until", "state", box=None, pad_edge=False)
-        for one, said in zip(found, told, strict=True):
-            until = local_time(one.ends.isoformat())
-            counted = f"{said['passed']} of {one.total}"
-            shown.add_row(one.id[:8], one.title, one.profile, str(one.total), counted, until, said["state"])
+        for job, said in zip(found, told, strict=True):
+            until = local_time(job.ends.isoformat())
+            counted = f"{said['passed']} of {job.total}"
+            shown.add_row(job.id[:8], job.title, job.profile, str(job.total), counted, until, said["state"])
         print_table(console, shown)
 
     app.emit(
@@ -318,7 +318,7 @@ def send(app: App, which: str, files: Path | None, dry_run: bool) -> None:
         post = plant.sign_requests.transport_for(station, files)
         app.closing(post.close)
         plant.sign_requests.send_job(station, post, found)
-    names = [roster.name_of(one) for one in to]
+    names = [roster.name_of(receiver) for receiver in to]
     sent = f"{'Would send' if dry_run else 'Sent'} {found.id[:8]} to {', '.join(names)}."
     app.emit({"id": found.id, "to": to}, sent if to else f"{found.id[:8]} is for this station alone: nothing to send.")
 
@@ -395,8 +395,8 @@ def _table(console: Console, found: Job, parts: list[StationYield], here: str) -
         console.print(f"{silent}: nothing received yet, neither pages nor evidence. {hint}", markup=False)
 
 
-for one in (new, list_jobs, show, send, close, status):
-    job.add_command(one)
+for subcommand in (new, list_jobs, show, send, close, status):
+    job.add_command(subcommand)
 
 
 # -- signer ------------------------------------------------------------------------------------------------------------
@@ -447,8 +447,8 @@ def run(app: App, jobs: Sequence[str], files: Path | None, seconds: float | None
     app.note(f"Signing for {len(ids)} job{'' if len(ids) == 1 else 's'}; Ctrl-C ends it.")
     while True:
         station.unlock()  # ends with vault-locked if another command changed passphrase and master key
-        for one in plant.office.answer_all(station, post, inbox, ids, stop=stop.is_set):
-            _print_answer(app, station, one)
+        for answered in plant.office.answer_all(station, post, inbox, ids, stop=stop.is_set):
+            _print_answer(app, station, answered)
         if stop.is_set():
             return
         inbox.wait(_MOST_WAIT_SECONDS, _LOOK_SECONDS)
@@ -493,8 +493,8 @@ def once(app: App, file: Path, output: Path, jump: bool) -> None:
     _print_answer(app, station, plant.office.AnsweredRequest(request, answered), end=True)
 
 
-def _print_answer(app: App, station: Station, one: AnsweredRequest, *, end: bool = False) -> None:
-    request, answered = one.request, one.answer
+def _print_answer(app: App, station: Station, signed_request: AnsweredRequest, *, end: bool = False) -> None:
+    request, answered = signed_request.request, signed_request.answer
     told: dict[str, Any] = {"uuid": request.uuid.hex(), "job": request.job, "from": request.signer}
     roster = station.plant.roster
     name = roster.name_of(request.signer) if roster is not None else request.signer[:16]
@@ -507,8 +507,8 @@ def _print_answer(app: App, station: Station, one: AnsweredRequest, *, end: bool
     app.emit(refused, f"refused  {request.uuid.hex()}  {answered.refused}  {name}: {answered.why}")
 
 
-for one in (run, once):
-    signer.add_command(one)
+for subcommand in (run, once):
+    signer.add_command(subcommand)
 
 
 # -- evidence ----------------------------------------------------------------------------------------------------------
@@ -636,5 +636,5 @@ def _rows(station: Station, uuids: tuple[str, ...], job: str | None) -> Iterator
         yield from station.plant.line.evidence(uuid=uuid, job=id)
 
 
-for one in (verify, list_evidence, export):
-    evidence.add_command(one)
+for subcommand in (verify, list_evidence, export):
+    evidence.add_command(subcommand)

@@ -238,7 +238,7 @@ def _tell_end(app: App, ended: MeasurementEnd, require: Requirements | None) -> 
 def _end_lines(ended: MeasurementEnd, require: Requirements | None) -> list[str]:
     lines = [_stream_line(node["uuid"], stream) for node in ended.nodes for stream in node["streams"]]
     lines += [f"Written: {name}" for name in ended.files]
-    lines += [f"{one['sink']}: {one['dropped']} values dropped" for one in ended.sinks if one["dropped"]]
+    lines += [f"{sink['sink']}: {sink['dropped']} values dropped" for sink in ended.sinks if sink["dropped"]]
     if require is not None and ended.error is not None:
         lines += [str(fit["why"]) for fit in require.fits if fit["result"] != "passed"]
     return lines
@@ -247,7 +247,7 @@ def _end_lines(ended: MeasurementEnd, require: Requirements | None) -> list[str]
 def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
     lost = f"lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}, invalid {stream['invalid']}"
     blocks = measure_room.blocks
-    why = blocks.why_invalid([blocks.InvalidValues(**one) for one in stream["invalid_why"]])
+    why = blocks.why_invalid([blocks.InvalidValues(**invalid) for invalid in stream["invalid_why"]])
     return f"{uuid}: {stream['samples']} values in {stream['messages']} messages, {lost}{f' ({why})' if why else ''}"
 
 
@@ -260,7 +260,7 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
         "recovered": {"messages": done.messages, "until": until},
         "file": files[0],
         "cut": done.cut,
-        "damaged": [asdict(one) for one in done.damaged],
+        "damaged": [asdict(damage) for damage in done.damaged],
     }
     told = "is intact" if done.was_whole else f"repaired ({done.cut} octets of a torn end cut off)"
     if done.output is not None:
@@ -272,7 +272,7 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
 
 
 def _damage(file: str, done: RecoveryResult) -> BadDataError:
-    named = [f"{one.what} at octet {one.offset} ({one.octets} octets)" for one in done.damaged[:MOST_NAMED]]
+    named = [f"{damage.what} at octet {damage.offset} ({damage.octets} octets)" for damage in done.damaged[:MOST_NAMED]]
     more = len(done.damaged) - len(named)
     return BadDataError(
         f"{file} is damaged inside: {', '.join(named)}{f' and {more} more' if more else ''}.",

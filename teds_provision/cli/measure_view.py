@@ -87,7 +87,7 @@ class StdoutEvents(ThreadedSink):
         elif isinstance(item, NodeReport):
             self._put_out(as_line(status_line(item)))
         elif isinstance(item, tuple):
-            self._facts.update((one.key, one) for one in item)
+            self._facts.update((facts.key, facts) for facts in item)
         self._idle(time.monotonic())
 
     def _idle(self, now: float) -> None:
@@ -151,7 +151,7 @@ class LiveTable:
     def facts(self, facts: Sequence[ChannelFacts]) -> None:
         """Names and units."""
         with self._guard:
-            self._facts.update((one.key, one) for one in facts)
+            self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
 
     def report(self, report: NodeReport) -> None:
         """State of a node."""
@@ -203,7 +203,7 @@ class LiveTable:
                 f"{rate:.4g} Hz",
             )
         table.caption = "\n".join(
-            [*(_line(one) for one in reports.values()), *(_sink_line(one) for one in self._sinks)]
+            [*(_line(report) for report in reports.values()), *(_sink_line(sink) for sink in self._sinks)]
         )
         table.caption_justify = "left"
         return table

@@ -62,7 +62,7 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
     _require_channel(station, uuid, channel)
     if uuid != STATION:
         topics = measure.sinks.names.Topics(measure.running.measurement_job.station_facts(station))
-        topics.learn(one for _, _, one in _channels(station))
+        topics.learn(facts for _, _, facts in _channels(station))
         topics.require_free(uuid.hex(), channel, chosen)
     if not dry_run:
         _change(app, station, uuid, channel, chosen)
@@ -144,9 +144,11 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
         sheet, judged = teds.sheet.Sheet.from_image(image), steps.readings.verdict_of(station, record.uuid)
         unsigned = judged is not None and judged.verified.verdict == "unsigned"  # it is called what it calls itself
         name = sheet.meta.name if unsigned else record.name or ""
-        for one in sheet.channels:
-            facts = measure.blocks.ChannelFacts(record.uuid.hex(), name, one.number, one.name, unverified=unsigned)
-            found.append((record.uuid, one.number, facts))
+        for channel in sheet.channels:
+            facts = measure.blocks.ChannelFacts(
+                record.uuid.hex(), name, channel.number, channel.name, unverified=unsigned
+            )
+            found.append((record.uuid, channel.number, facts))
     return found
 
 
@@ -155,7 +157,7 @@ def _print_names(app: App, station: Station) -> None:
     facts = measure.running.measurement_job.station_facts(station)
     topics = measure.sinks.names.Topics(facts)
     channels = _channels(station)
-    topics.learn(one for _, _, one in channels)
+    topics.learn(facts for _, _, facts in channels)
     frames = station.measurements.frames
     told: list[dict[str, Any]] = [
         {
@@ -168,9 +170,9 @@ def _print_names(app: App, station: Station) -> None:
         for uuid, number, _ in channels
     ]
     lines = [
-        f"{one['uuid']} {one['channel']}: {one['topic']}{' (chosen)' if one['chosen'] else ''}"
-        + (f", frame {one['frame']}" if one["frame"] else "")
-        for one in told
+        f"{row['uuid']} {row['channel']}: {row['topic']}{' (chosen)' if row['chosen'] else ''}"
+        + (f", frame {row['frame']}" if row["frame"] else "")
+        for row in told
     ]
     app.emit({"station": topics.station, "names": told}, "\n".join(lines) or "No datasheets are known yet.")
 
@@ -181,5 +183,5 @@ def _frame(station: Station, chosen: Mapping[tuple[bytes, int], str], topics: To
     return frame.replace("{node}", topics.node(uuid.hex()))
 
 
-for one in (set_name, reset_name, set_frame):
-    names.add_command(one)
+for subcommand in (set_name, reset_name, set_frame):
+    names.add_command(subcommand)

@@ -135,7 +135,7 @@ def run(
     wished["unverified"] = wished["unverified"] and wished["adopt"]
     if wished["measure"] is None and not wished["unverified"] and (wished["rate"] is not None or wished["frozen"]):
         raise UsageError("--rate and --frozen require --measure.", hint="Add --measure all.")
-    places = [f"{link}:{one}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for one in named]
+    places = [f"{link}:{place}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for place in named]
     sinks = [name for name, asked in (("ros1", ros1), ("ros2", ros2), (mqtt or "", mqtt)) if asked]
     wanted = settings.Settings(
         places=tuple(dict.fromkeys(places)),
@@ -218,14 +218,17 @@ class DaemonLog:
 def _dated(told: Any) -> Any:
     """What the API tells, its moments as everywhere on the command line: ISO 8601 in place of unix seconds."""
     if isinstance(told, list):
-        return [_dated(one) for one in told]
+        return [_dated(element) for element in told]
     if not isinstance(told, dict):
         return told
-    return {key: _moment(one) if key in _MOMENTS and _is_number(one) else _dated(one) for key, one in told.items()}
+    return {
+        key: _moment(element) if key in _MOMENTS and _is_number(element) else _dated(element)
+        for key, element in told.items()
+    }
 
 
-def _is_number(one: Any) -> bool:
-    return isinstance(one, int | float) and not isinstance(one, bool)
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _moment(unix: float) -> str:
@@ -282,20 +285,20 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         name = shown(node["name"]) or "no name"
         problem = f": {node['problem']['message']}" if node["problem"] else ""
         console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}{problem}", markup=False)
-    for one in found.get("measurements", ()):
-        what = f" of {one['match']}" if one.get("match") else ""
-        why = f": {one['why']}" if one["why"] else ""
-        owner = "" if one["owner"] == "ncap" else f" ({one['owner']})"
-        console.print(f"measurement {one['id']}{what}{owner}: {one['state']}{why}", markup=False)
-        for node in one["nodes"] if what else ():
+    for known in found.get("measurements", ()):
+        what = f" of {known['match']}" if known.get("match") else ""
+        why = f": {known['why']}" if known["why"] else ""
+        owner = "" if known["owner"] == "ncap" else f" ({known['owner']})"
+        console.print(f"measurement {known['id']}{what}{owner}: {known['state']}{why}", markup=False)
+        for node in known["nodes"] if what else ():
             why = f": {node['why']}" if node["why"] else ""
             console.print(f"  {node['uuid']} {node['state']}{why}", markup=False)
-        if any(node["why"] == "no room on the bus" for node in one["nodes"]):
+        if any(node["why"] == "no room on the bus" for node in known["nodes"]):
             console.print("  → Running streams are not slowed down. A lower --rate leaves room for all.", markup=False)
-    for one in found.get("sinks", ()):
-        why = one["error"] or one["detail"]
-        told = f"{one['state']}, {one['dropped']} dropped{f': {why}' if why else ''}"
-        console.print(f"{shown(one['name'])}: {told}", markup=False)
+    for known in found.get("sinks", ()):
+        why = known["error"] or known["detail"]
+        told = f"{known['state']}, {known['dropped']} dropped{f': {why}' if why else ''}"
+        console.print(f"{shown(known['name'])}: {told}", markup=False)
 
 
 def _verdict(node: dict[str, Any]) -> str:
@@ -391,15 +394,15 @@ def list_tokens(app: App) -> None:
     app.station()
     found = [
         {
-            "name": one.name,
-            "kind": one.kind,
-            "read_only": one.read_only,
-            "created": iso(datetime.fromtimestamp(one.created, UTC)),
-            "until": iso(datetime.fromtimestamp(one.until, UTC)) if one.until else None,
+            "name": token.name,
+            "kind": token.kind,
+            "read_only": token.read_only,
+            "created": iso(datetime.fromtimestamp(token.created, UTC)),
+            "until": iso(datetime.fromtimestamp(token.until, UTC)) if token.until else None,
         }
-        for one in tokens.Tokens(app.home).all()
+        for token in tokens.Tokens(app.home).all()
     ]
-    lines = [f"{one['name']}  {one['kind']}{'  read-only' if one['read_only'] else ''}" for one in found]
+    lines = [f"{known['name']}  {known['kind']}{'  read-only' if known['read_only'] else ''}" for known in found]
     app.emit(
         {"tokens": found}, "\n".join(lines) or "There are no tokens. To create one: teds-provision ncap token add NAME"
     )
@@ -418,8 +421,8 @@ def remove(app: App, name: str) -> None:
     app.emit({"removed": name, "count": gone}, f"Removed: {name}.")
 
 
-for one in (add, list_tokens, remove):
-    token.add_command(one)
+for subcommand in (add, list_tokens, remove):
+    token.add_command(subcommand)
 
-for one in (run, status, measure, detection, open_page, token):
-    ncap.add_command(one)
+for subcommand in (run, status, measure, detection, open_page, token):
+    ncap.add_command(subcommand)

@@ -438,5 +438,5 @@ class ActuatorLines:
         )
 
 
-for one in (check, create, run):
-    node.add_command(one)
+for subcommand in (check, create, run):
+    node.add_command(subcommand)

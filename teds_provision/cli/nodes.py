@@ -143,7 +143,7 @@ def _show_plant(app: App, station: Station, text: str | None, *, as_json: bool) 
         banned = f", revoked by {', '.join(says['revoked'])}" if says["revoked"] else ""
         held = f"held by {holders} (epoch {says['epoch']})" if says["holders"] else "held by nobody"
         line = "  ".join(filter(None, (node["uuid"], shown(node["name"] or ""), f"{held}{written}{banned}")))
-        app.lines([line, *(f"  {one['name']}: {shown(one['why'])}" for one in node["conflicts"])])
+        app.lines([line, *(f"  {conflict['name']}: {shown(conflict['why'])}" for conflict in node["conflicts"])])
 
 
 _FIELDS = (
@@ -264,7 +264,7 @@ _LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
     ("groups", lambda node: ", ".join(node["groups"])),
     ("link key", _link_keys),
     ("rotation", lambda node: node["rotation_due"] or ""),
-    ("conflict", lambda node: [f"{one['name']}: {one['why']}" for one in node.get("conflicts", ())]),
+    ("conflict", lambda node: [f"{conflict['name']}: {conflict['why']}" for conflict in node.get("conflicts", ())]),
     ("remarks", _remarks),
 )
 

@@ -165,9 +165,9 @@ def check(app: App, names: tuple[str, ...]) -> None:
     app.emit({"profiles": told}, _plain(f"{good}: no mistakes found."))
 
 
-def _problem(one: ProfileProblem) -> dict[str, Any]:
-    where = {"file": one.where.file, "line": one.where.line}
-    return {**where, "field": one.field, "message": one.message, "severity": one.severity}
+def _problem(problem: ProfileProblem) -> dict[str, Any]:
+    where = {"file": problem.where.file, "line": problem.where.line}
+    return {**where, "field": problem.field, "message": problem.message, "severity": problem.severity}
 
 
 profile.add_command(check)

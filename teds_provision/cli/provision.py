@@ -301,12 +301,14 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
 def _show_brought(app: App, brought: FactoryDatasheet) -> None:
     """What a board says of itself, a line for each channel, and what was found."""
     app.note(f"Node {brought.image.uuid.hex()} brought its own datasheet: {brought.name or '(no name)'}")
-    for one in brought.channels[:_CHANGES_SHOWN]:
-        kind = one.kind.word if one.kind is not None else "of unknown kind"
-        limits = f"{one.show(one.low)} to {one.show(one.high)}"
-        exact = f", ± {one.show(one.stated_uncertainty, difference=True)}" if one.stated_uncertainty > 0 else ""
-        made = f", calibrated {one.calibrated_at:%Y-%m-%d}" if one.calibrated_at else ""
-        app.note(f"  channel {one.number}: {one.name or '(no name)'}, {kind}, {limits}{exact}{made}")
+    for channel in brought.channels[:_CHANGES_SHOWN]:
+        kind = channel.kind.word if channel.kind is not None else "of unknown kind"
+        limits = f"{channel.show(channel.low)} to {channel.show(channel.high)}"
+        exact = (
+            f", ± {channel.show(channel.stated_uncertainty, difference=True)}" if channel.stated_uncertainty > 0 else ""
+        )
+        made = f", calibrated {channel.calibrated_at:%Y-%m-%d}" if channel.calibrated_at else ""
+        app.note(f"  channel {channel.number}: {channel.name or '(no name)'}, {kind}, {limits}{exact}{made}")
     if len(brought.channels) > _CHANGES_SHOWN:
         app.note(f"  and {len(brought.channels) - _CHANGES_SHOWN} more channels")
     for finding in brought.findings[:_CHANGES_SHOWN]:
@@ -334,12 +336,12 @@ def _tell_plan(app: App, plan: ProvisionPlan) -> None:
 def _tell_plans(app: App, boards: BatchRun) -> None:
     """A plan for each node of the bus that is meant, at last how many they are; the worst refusal ends the command."""
     planned = 0
-    for one in boards.plans():
-        if isinstance(one, steps_room.batch.ProvisionPlan):
+    for plan in boards.plans():
+        if isinstance(plan, steps_room.batch.ProvisionPlan):
             planned += 1
-            _tell_plan(app, one)
+            _tell_plan(app, plan)
         else:
-            _tell_board(app, one)
+            _tell_board(app, plan)
     nodes = "1 node" if planned == 1 else f"{planned or 'No'} nodes"
     app.emit({"totals": {"planned": planned, "failed": boards.ended}}, f"{nodes} would be provisioned.")
     if boards.worst is not None:
@@ -358,7 +360,9 @@ def _print_result(app: App, done: ProvisionResult, *, error: TedsProvisionError 
         "name": summary.name,
         "channels": [vars(channel) for channel in summary.channels],
         "steps": [{"name": s.name, "result": s.result, "seconds": s.seconds} for s in done.steps],
-        "sample": [{key: one[key] for key in ("channel", "value", "unit", "valid", "shown")} for one in done.samples],
+        "sample": [
+            {key: sample[key] for key in ("channel", "value", "unit", "valid", "shown")} for sample in done.samples
+        ],
         "verdict": done.verified.verdict,
         "warnings": list(done.warnings),
         **{name: value for name, value in more.items() if value is not None and name != "failure"},
@@ -424,7 +428,7 @@ def _summary(console: Console, done: ProvisionResult, summary: NodeSummary, more
     table.add_row("node", f"[bold]{escape(summary.name or '(no name)')}[/]")
     table.add_row("UUID", done.who.uuid.hex())
     table.add_row("key", done.who.fingerprint[:16])
-    now = {one["channel"]: one["shown"] for one in done.samples if one["valid"]}
+    now = {sample["channel"]: sample["shown"] for sample in done.samples if sample["valid"]}
     if "unit" in more:
         table.add_row("unit", f"{more['unit']} of {more['of']}")
     for channel in summary.channels:
@@ -595,11 +599,11 @@ class OperatorScreen:
         for line in ["", *big(f"{boards.passed}/{len(boards)}"), ""]:
             console.print(Text(f"    {line}"), no_wrap=True)
         self._line(f"{mark}{now}", style="bold")
-        for one in self._last:
-            row = f"row {one.row}" if one.row is not None else ""
-            line = f"{_clock(one.time)}  {row:<8} {one.uuid.hex()}  {one.result.upper():<8} {one.seconds:6.1f} s"
-            style = "green" if one.result == "passed" else "red"
-            self._line(f"{line}  {self._name(one)}", style=style)
+        for end in self._last:
+            row = f"row {end.row}" if end.row is not None else ""
+            line = f"{_clock(end.time)}  {row:<8} {end.uuid.hex()}  {end.result.upper():<8} {end.seconds:6.1f} s"
+            style = "green" if end.result == "passed" else "red"
+            self._line(f"{line}  {self._name(end)}", style=style)
 
     def _tell_end(self, board: BoardResult) -> None:
         """Seconds and which board; of one that failed why, and what to do, in a few lines."""

@@ -76,20 +76,22 @@ def _lines(result: Mapping[str, Any], summary: RecordingSummary, recording: Reco
     elif not result["complete"]:
         torn = f", and the last {result['torn']} octets are incomplete" if result["torn"] else ""
         yield f"It was cut off: no end was written{torn}."
-    for one in result["channels"]:
-        facts = summary.facts.get((one["uuid"], one["channel"])) or recording.facts.get((one["uuid"], one["channel"]))
-        span = _span(one, facts)
-        name = f"{one.get('node') or one['uuid']}/{one.get('name') or one['channel']}"
-        yield f"  {name}: {one['samples']} values, {one['invalid']} invalid{span}"
-    for one in result["notes"]:
-        yield f"  {_local(one['time'])} {one['why']}"
+    for channel in result["channels"]:
+        facts = summary.facts.get((channel["uuid"], channel["channel"])) or recording.facts.get(
+            (channel["uuid"], channel["channel"])
+        )
+        span = _span(channel, facts)
+        name = f"{channel.get('node') or channel['uuid']}/{channel.get('name') or channel['channel']}"
+        yield f"  {name}: {channel['samples']} values, {channel['invalid']} invalid{span}"
+    for note in result["notes"]:
+        yield f"  {_local(note['time'])} {note['why']}"
 
 
-def _span(one: Mapping[str, Any], facts: ChannelFacts | None) -> str:
-    if one["lowest"] is None or facts is None:
+def _span(channel: Mapping[str, Any], facts: ChannelFacts | None) -> str:
+    if channel["lowest"] is None or facts is None:
         return ""
-    low, unit = measure_view.in_peoples_units(one["lowest"], facts)
-    high, _ = measure_view.in_peoples_units(one["highest"], facts)
+    low, unit = measure_view.in_peoples_units(channel["lowest"], facts)
+    high, _ = measure_view.in_peoples_units(channel["highest"], facts)
     return f", {low:.6g} to {high:.6g} {unit}".rstrip()
 
 
@@ -155,10 +157,10 @@ def _values(shown: Block | GroupRows, summary: RecordingSummary) -> Iterator[str
     """A line for each instant, in the units for people."""
     keys = shown.keys
     known = [summary.facts.get(key) or measure_room.blocks.ChannelFacts(key[0], "", key[1], "") for key in keys]
-    names = [rendering.shown(f"{one.node or one.uuid}/{one.label}") for one in known]
+    names = [rendering.shown(f"{facts.node or facts.uuid}/{facts.label}") for facts in known]
     for instant, row in zip(shown.time.tolist(), shown.value.tolist(), strict=True):
         moment = datetime.fromtimestamp(instant).astimezone().isoformat(sep=" ", timespec="milliseconds")
-        cells = [f"{name} {_value(value, one)}" for name, value, one in zip(names, row, known, strict=True)]
+        cells = [f"{name} {_value(value, facts)}" for name, value, facts in zip(names, row, known, strict=True)]
         yield f"{moment}  {', '.join(cells)}"
 
 

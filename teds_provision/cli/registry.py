@@ -124,24 +124,24 @@ def _write_once(path: Path, octets: bytes) -> None:
         write_new(path, octets, mode=SHARED)
 
 
-def _to_json(one: Roster) -> dict[str, Any]:
+def _to_json(signed_roster: Roster) -> dict[str, Any]:
     return {
-        "registry": one.registry,
-        "name": one.name,
-        "version": one.version,
+        "registry": signed_roster.registry,
+        "name": signed_roster.name,
+        "version": signed_roster.version,
         "members": [
             {"name": member.name, "fingerprint": member.fingerprint, "roles": _in_order(member.roles)}
-            for member in one.members
+            for member in signed_roster.members
         ],
         "removed": [
             {"name": left.name, "fingerprint": left.fingerprint, "why": left.why, "last": left.last[0]}
-            for left in one.removed
+            for left in signed_roster.removed
         ],
         "share": [
             {"what": {share.what[0]: share.what[1] or True}, "to": list(share.to), "forget": share.forget}
-            for share in one.share
+            for share in signed_roster.share
         ],
-        "expires": _time(one.expires),
+        "expires": _time(signed_roster.expires),
     }
 
 
@@ -284,8 +284,8 @@ def unshare(app: App, /, every: bool, group: str | None, profile: str | None, **
 
 
 def _what(every: bool, group: str | None, profile: str | None) -> Any:
-    named = [one for one in (("all", "") if every else None, group and ("group", group),
-                             profile and ("profile", profile)) if one]  # fmt: skip
+    named = [choice for choice in (("all", "") if every else None, group and ("group", group),
+                             profile and ("profile", profile)) if choice]  # fmt: skip
     if len(named) != 1:
         raise click.UsageError("Give one of --all, --group and --profile.")
     return named[0]
@@ -302,7 +302,7 @@ def _what(every: bool, group: str | None, profile: str | None) -> Any:
 def remove(app: App, /, name: str, last: int | None, **how: Any) -> None:
     """Remove a station for good. What it published up to its last page still counts."""
     reasons: tuple[roster.Why, ...] = ("retired", "lost", "stolen")
-    given = [one for one in reasons if how[one]]
+    given = [reason for reason in reasons if how[reason]]
     if len(given) != 1:
         raise click.UsageError("Give one of --retired, --lost and --stolen.")
     (why,) = given
@@ -490,13 +490,13 @@ def sync(app: App, files: Path | None) -> None:
         doors = plant.connecting.check_database(station, post)
     finally:
         post.close()
-    alarms = [one for one in station.plant.tables.alarms() if not one.seen]
+    alarms = [alarm for alarm in station.plant.tables.alarms() if not alarm.seen]
     told = {
         "pushed": done.pushed,
         "fetched": done.fetched,
         "returned": done.returned,
         "parcels": {"in": done.parcels_in, "out": done.parcels_out, "waiting": done.waiting},
-        "alarms": [_alarm(station, one) for one in alarms],
+        "alarms": [_alarm(station, alarm) for alarm in alarms],
         "told": done.told,
         "rosters": done.rosters,
         "open_doors": doors,
@@ -519,18 +519,25 @@ def _synced(station: Station, done: SyncResult, alarms: Sequence[Any]) -> str:
         lines.append(f"{waits} for confirmation: teds-provision import-keys --received")
     lines += [f"roster {version} is now in force" for version in done.rosters]
     lines += done.told
-    lines += [f"ALARM {_alarm_line(station, one)}" for one in alarms]
+    lines += [f"ALARM {_alarm_line(station, alarm)}" for alarm in alarms]
     return "\n".join(lines)
 
 
-def _alarm(station: Station, one: Any) -> dict[str, Any]:
-    return {"code": one.code, "about": one.about, "n": one.n, "why": one.why, "at": one.at, "seen": one.seen}
+def _alarm(station: Station, alarm: Any) -> dict[str, Any]:
+    return {
+        "code": alarm.code,
+        "about": alarm.about,
+        "n": alarm.n,
+        "why": alarm.why,
+        "at": alarm.at,
+        "seen": alarm.seen,
+    }
 
 
-def _alarm_line(station: Station, one: Any) -> str:
+def _alarm_line(station: Station, alarm: Any) -> str:
     held = station.plant.roster
-    name = held.name_of(one.about) if held is not None and one.about else ""
-    return f"{one.code}{f' of {name}' if name else ''}, {one.n}: {one.why}"
+    name = held.name_of(alarm.about) if held is not None and alarm.about else ""
+    return f"{alarm.code}{f' of {name}' if name else ''}, {alarm.n}: {alarm.why}"
 
 
 # -- looking -----------------------------------------------------------------------------------------------------------
@@ -554,11 +561,11 @@ def status(app: App) -> None:
         "name": held.name,
         "roster": held.version,
         "expires": _time(held.expires),
-        "members": [_standing(one) for one in found.standings],
+        "members": [_standing(peer) for peer in found.standings],
         "unsent": found.unsent,
         "synced": record.synced,
         "conflicts": found.conflicts,
-        "alarms": [_alarm(station, one) for one in found.alarms],
+        "alarms": [_alarm(station, alarm) for alarm in found.alarms],
         "to_rotate": plant.removed_members.rotations_due(station),
         "heads": list(found.heads),
         "open_doors": station.plant.tables.doors(),
@@ -568,14 +575,14 @@ def status(app: App) -> None:
         raise click.exceptions.Exit(found.exit_code)
 
 
-def _standing(one: StationStanding) -> dict[str, Any]:
+def _standing(standing: StationStanding) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "fingerprint": one.fingerprint,
-        "roles": list(one.roles),
-        "n": one.n,
-        "age": one.age,
-        "state": one.state,
+        "name": standing.name,
+        "fingerprint": standing.fingerprint,
+        "roles": list(standing.roles),
+        "n": standing.n,
+        "age": standing.age,
+        "state": standing.state,
     }
 
 
@@ -586,11 +593,11 @@ def _shown(station: Station, found: PlantStatus) -> str:
         f"{held.name} {held.registry[:8]}   roster {held.version}, until {held.expires:%Y-%m-%d}"
         f"   heads {heads} of {found.heads[1]}"
     ]
-    wide = max(len(one.name) for one in found.standings)
-    roles = max(len(" ".join(one.roles)) for one in found.standings)
-    for one in found.standings:
-        age = _age(one.age) if one.age is not None else "-"
-        lines.append(f"{one.name:<{wide}}  {' '.join(one.roles):<{roles}}  page {one.n:>5}  {age:>8}  {one.state}")
+    wide = max(len(peer.name) for peer in found.standings)
+    roles = max(len(" ".join(peer.roles)) for peer in found.standings)
+    for peer in found.standings:
+        age = _age(peer.age) if peer.age is not None else "-"
+        lines.append(f"{peer.name:<{wide}}  {' '.join(peer.roles):<{roles}}  page {peer.n:>5}  {age:>8}  {peer.state}")
     last = f"last sync {local_time(found.record.synced)}" if found.record.synced else "never synced"
     lines.append(f"{_count(found.conflicts, 'conflict')}, {_count(found.unsent, 'event')} unsent, {last}")
     review, due = plant.removed_members.last(station), plant.removed_members.rotations_due(station)
@@ -600,7 +607,7 @@ def _shown(station: Station, found: PlantStatus) -> str:
     elif review is not None and review.alone:
         need = "needs" if review.alone == 1 else "need"
         lines.append(f"{_count(review.alone, 'node')} {need} a tap: only a station that left held the key")
-    lines += [f"{'alarm' if one.seen else 'ALARM'} {_alarm_line(station, one)}" for one in found.alarms]
+    lines += [f"{'alarm' if alarm.seen else 'ALARM'} {_alarm_line(station, alarm)}" for alarm in found.alarms]
     doors = station.plant.tables.doors()
     if doors:
         lines.append(f"The database allows what it should not: {', '.join(doors)}")
@@ -611,8 +618,8 @@ def _shown(station: Station, found: PlantStatus) -> str:
     return "\n".join(lines)
 
 
-def _count(number: int, one: str) -> str:
-    return f"{number} {one}{'' if number == 1 else 's'}"
+def _count(number: int, singular: str) -> str:
+    return f"{number} {singular}{'' if number == 1 else 's'}"
 
 
 def _age(seconds: int) -> str:
@@ -643,13 +650,18 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
     uuid = None if node is None else plant.status.resolve(station, node)
     said = plant.status.log(station, uuid=uuid, of=of, since=moment(since) if since else None)
     if app.json:
-        more = ((one, {"fingerprint_of_station": one.station, "page": one.n, "counts": one.counts}) for one in said)
-        print_json_list("events", ({**one.event, "station": held.name_of(one.station), **told} for one, told in more))
+        more = (
+            (stated, {"fingerprint_of_station": stated.station, "page": stated.n, "counts": stated.counts})
+            for stated in said
+        )
+        print_json_list(
+            "events", ({**stated.event, "station": held.name_of(stated.station), **told} for stated, told in more)
+        )
         return
-    for one in said:
-        counts = "" if one.counts else "  (does not count)"
-        who = f"{held.name_of(one.station)} {one.n}"
-        app.lines([sanitize(f"{one.event['at']}  {who}  {one.event['act']}  {_members(one.event)}{counts}")])
+    for stated in said:
+        counts = "" if stated.counts else "  (does not count)"
+        who = f"{held.name_of(stated.station)} {stated.n}"
+        app.lines([sanitize(f"{stated.event['at']}  {who}  {stated.event['act']}  {_members(stated.event)}{counts}")])
 
 
 def _members(event: dict[str, Any]) -> str:
@@ -781,7 +793,7 @@ def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str]
     Pipe it into psql; this program never runs it. Without options it prints the schema, which can be run again at any
     time, and must be after every pg_restore.
     """
-    if sum(one is not None for one in (member, closed, mend)) > 1:
+    if sum(subcommand is not None for subcommand in (member, closed, mend)) > 1:
         raise click.UsageError("Give one of --member, --close and --mend.")
     station = app.station()
     held = plant.apply_pages.require_roster(station)
@@ -803,7 +815,7 @@ def sql(app: App, member: Path | None, closed: str | None, mend: tuple[str, str]
             raise click.UsageError(f"--mend: {mend[1]!r} is not a page number.")
         text = plant.schema.mend_sql(_of_roster(held, mend[0]), int(mend[1]))
     else:
-        text = plant.schema.registry_sql(held.registry, [one.fingerprint for one in held.removed])
+        text = plant.schema.registry_sql(held.registry, [removed.fingerprint for removed in held.removed])
     app.emit({"sql": text}, text.rstrip("\n"))
 
 
@@ -814,8 +826,8 @@ def _of_roster(held: Roster, name: str) -> str:
     return found.fingerprint
 
 
-for one in (
+for subcommand in (
     create, request, add, role, share, unshare, remove, renew, sign, connect, disconnect, sync, status, log, vouch,
     accept, resume, seen, sql,
 ):  # fmt: skip
-    registry.add_command(one)
+    registry.add_command(subcommand)

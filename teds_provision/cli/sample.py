@@ -96,7 +96,7 @@ def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) ->
         samples = measure.sampling.take_samples(trusted, channels)
         standing.require()
     origin = "kept" if trusted.kept else "session"
-    result = {"uuid": uuid.hex(), "from": origin, "samples": [one.as_json() for one in samples]}
+    result = {"uuid": uuid.hex(), "from": origin, "samples": [sample.as_json() for sample in samples]}
     app.emit(result, lambda console: _samples(console, samples))
 
 
@@ -105,13 +105,17 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
     from rich.table import Table
 
     table = Table("channel", "name", "value", "±", "unit", "raw", box=None, pad_edge=False)
-    for one in samples:
-        told = one.as_json().get("shown") or {"value": one.value, "uncertainty": one.uncertainty, "unit": one.unit}
+    for sample in samples:
+        told = sample.as_json().get("shown") or {
+            "value": sample.value,
+            "uncertainty": sample.uncertainty,
+            "unit": sample.unit,
+        }
         sure = told["uncertainty"]
-        value = f"{tidy(told['value'], sure):.6g}" if told["value"] is not None else f"not valid: {one.why}"
+        value = f"{tidy(told['value'], sure):.6g}" if told["value"] is not None else f"not valid: {sample.why}"
         uncertainty = f"{sure:.3g}" if sure is not None else ""
-        name = escape(shown(one.name))
-        table.add_row(str(one.channel), name, escape(value), uncertainty, escape(told["unit"]), str(one.raw))
+        name = escape(shown(sample.name))
+        table.add_row(str(sample.channel), name, escape(value), uncertainty, escape(told["unit"]), str(sample.raw))
     print_table(console, table)
 
 
@@ -132,7 +136,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
             )
         except NodeRefusedError:
             power = None
-        names = {one.number: one.name for one in trusted.sheet.channels}
+        names = {channel.number: channel.name for channel in trusted.sheet.channels}
     result = {
         "uuid": uuid.hex(),
         "mode": "measurement" if found.measuring else "configuration",

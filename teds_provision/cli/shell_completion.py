@@ -151,14 +151,17 @@ def _nodes(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> l
 
 def _groups(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     return _items(
-        ctx, lambda station: [(one.name, "group") for one in station.groups.all() if one.name.startswith(incomplete)]
+        ctx,
+        lambda station: [(group.name, "group") for group in station.groups.all() if group.name.startswith(incomplete)],
     )
 
 
 def _stations(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     return _items(
         ctx,
-        lambda station: [(one.name, one.role) for one in station.policy.listed() if one.name.startswith(incomplete)],
+        lambda station: [
+            (trusted.name, trusted.role) for trusted in station.policy.listed() if trusted.name.startswith(incomplete)
+        ],
     )
 
 

@@ -229,12 +229,12 @@ def print_teds(console: Console, shown: ShownTeds) -> None:
 
 
 def _rows(fields: Iterable[ShownField], depth: int) -> Iterator[tuple[str, ...]]:
-    for one in fields:
-        meaning = escape(one.meaning)
-        if one.weak:
+    for shown in fields:
+        meaning = escape(shown.meaning)
+        if shown.weak:
             meaning = f"[bold red]{meaning}: weak, refused when building or trusting a TEDS[/]"
-        yield str(one.offset), str(one.type), "  " * depth + escape(one.name), escape(one.text), meaning
-        yield from _rows(one.children, depth + 1)
+        yield str(shown.offset), str(shown.type), "  " * depth + escape(shown.name), escape(shown.text), meaning
+        yield from _rows(shown.children, depth + 1)
 
 
 def _print_findings(console: Console, findings: Iterable[Finding], prefix: str) -> None:

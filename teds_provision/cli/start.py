@@ -30,7 +30,7 @@ def start(app: App, ctx: click.Context) -> None:
     except NotFoundError:
         found: dict[str, Any] = {
             "station": None,
-            "links": [_link(each) for each in measure.link_survey.readers()],
+            "links": [_link(survey) for survey in measure.link_survey.readers()],
             "nodes": [],
             "problems": [],
             "next": "teds-provision init",
@@ -38,7 +38,9 @@ def start(app: App, ctx: click.Context) -> None:
     else:
         found = _of_service(app, station) or _of_links(station, _named(ctx))
         waiting = doctor.fleet.nodes(doctor.checks.System(app.home))
-        found["problems"] += [{"what": one.why, "fix": one.fix} for one in waiting if one.result == "warning"]
+        found["problems"] += [
+            {"what": finding.why, "fix": finding.fix} for finding in waiting if finding.result == "warning"
+        ]
         found["next"] = _next(found)
     app.emit(found, lambda console: _print(console, found))
 
@@ -75,7 +77,7 @@ def _of_links(station: Station, named: LinkSettings) -> dict[str, Any]:
                  for link in present for text in link.troubles]  # fmt: skip
     return {
         "station": _station(station),
-        "links": [_link(each) for each in present],
+        "links": [_link(survey) for survey in present],
         "nodes": nodes,
         "known": len(known),
         "problems": problems,
@@ -196,10 +198,10 @@ def _print(console: Console, found: dict[str, Any]) -> None:
         print_table(console, table)
         if len(found["nodes"]) > _SHOWN:
             console.print(f"  … and {len(found['nodes']) - _SHOWN} more", markup=False)
-    for one in found["problems"]:
-        console.print(f"! {one['what']}", markup=False)
-        if one["fix"]:
-            console.print(f"  → {one['fix']}", markup=False)
+    for problem in found["problems"]:
+        console.print(f"! {problem['what']}", markup=False)
+        if problem["fix"]:
+            console.print(f"  → {problem['fix']}", markup=False)
     console.print(f"Next: {found['next']}", markup=False)
     console.print("All commands: teds-provision --help", markup=False)
 

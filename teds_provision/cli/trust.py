@@ -77,22 +77,22 @@ def add(
     """
     station = app.station()
     found = _candidates(station, name, file, folder, role, fingerprint)
-    fresh = [one for one in found if not one.known]
-    told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
+    fresh = [key for key in found if not key.known]
+    told = {"trusted": [_record(key.record) for key in found], "added": len(fresh)}
     if dry_run:
         app.emit({**told, "plan": True}, _shown(found))
         return
-    _add(app, station, [one for one in found if one.known or _agreed(app, one, yes or fingerprint is not None)])
+    _add(app, station, [key for key in found if key.known or _agreed(app, key, yes or fingerprint is not None)])
 
 
 def _add(app: App, station: Station, chosen: list[Candidate]) -> None:
-    fresh = [one for one in chosen if not one.known]
+    fresh = [candidate for candidate in chosen if not candidate.known]
     if fresh:
         station.unlock()  # whom this station trusts is sealed under its vault
     with station.lock("trust add", app.note):
         added = handover.trust.add(station, chosen)
-    told = {"trusted": [_record(one.record) for one in chosen], "added": added}
-    names = ", ".join(one.record.name for one in fresh)
+    told = {"trusted": [_record(candidate.record) for candidate in chosen], "added": added}
+    names = ", ".join(candidate.record.name for candidate in fresh)
     app.emit(told, f"Now trusted: {names}." if added else "Nothing to do.")
 
 
@@ -120,22 +120,24 @@ def _candidates(
     return [found]
 
 
-def _agreed(app: App, one: Candidate, yes: bool) -> bool:
+def _agreed(app: App, candidate: Candidate, yes: bool) -> bool:
     """Show one fingerprint and ask; a folder goes on after a no."""
-    app.note(_shown([one]))
+    app.note(_shown([candidate]))
     if yes or not app.interactive:
         app.confirm("", yes=yes)
         return True
-    return app.ask_for_key(f"Trust the {one.record.role} {one.record.name!r}?", one.record.fingerprint)
+    return app.ask_for_key(
+        f"Trust the {candidate.record.role} {candidate.record.name!r}?", candidate.record.fingerprint
+    )
 
 
 def _shown(found: list[Candidate]) -> str:
     lines = []
-    for one in found:
-        lines.append(f"{one.record.role} {one.record.name}  ({one.path}){'  already trusted' if one.known else ''}")
-        lines.append(f"  {handover.trust.spoken(one.record.fingerprint)}")
-        if one.certificate is not None:
-            lines.append(f"  certified by the CA {protocol.keys.fingerprint(one.certificate.ca)[:32]}")
+    for key in found:
+        lines.append(f"{key.record.role} {key.record.name}  ({key.path}){'  already trusted' if key.known else ''}")
+        lines.append(f"  {handover.trust.spoken(key.record.fingerprint)}")
+        if key.certificate is not None:
+            lines.append(f"  certified by the CA {protocol.keys.fingerprint(key.certificate.ca)[:32]}")
     return "\n".join(lines)
 
 

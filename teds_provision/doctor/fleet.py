@@ -66,15 +66,15 @@ def profiles(system: System) -> Iterator[Finding]:
         yield Finding("profiles", "skipped", f"There is no folder {folder}.")
         return
     listed = [
-        one
-        for one in teds.profile.list_profiles(teds.profile.default_folders(system.home))
-        if folder in one.path.parents
+        listed
+        for listed in teds.profile.list_profiles(teds.profile.default_folders(system.home))
+        if folder in listed.path.parents
     ]
-    for one in listed:
-        if one.error:
-            why = f"Cannot use profile {one.name}: {one.error}"
-            yield Finding("profiles", "failed", why, f"teds-provision profile check {one.path}")
-    if not any(one.error for one in listed):
+    for profile in listed:
+        if profile.error:
+            why = f"Cannot use profile {profile.name}: {profile.error}"
+            yield Finding("profiles", "failed", why, f"teds-provision profile check {profile.path}")
+    if not any(profile.error for profile in listed):
         yield Finding("profiles", "ok", f"{len(listed)} profiles in {folder}.")
 
 

@@ -364,16 +364,16 @@ def bluetooth(system: System) -> Iterator[Finding]:
     except (NoReaderError, UsageError) as failure:
         yield Finding(_BLUETOOTH, "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
         return
-    for each in found:
-        yield _adapter(each, spec, asked=asked)
+    for adapter in found:
+        yield _adapter(adapter, spec, asked=asked)
 
 
 def _require(found: list[AdapterFacts], spec: BleSpec) -> None:
     """Raise NoReaderError where there is no adapter, or not the one that was named."""
     if not found:
         raise NoReaderError("bluetoothd has no adapter.", hint="Plug one in; bluetoothctl list")
-    if spec.adapter is not None and spec.adapter not in {each.name for each in found}:
-        named = ", ".join(each.name for each in found)
+    if spec.adapter is not None and spec.adapter not in {adapter.name for adapter in found}:
+        named = ", ".join(adapter.name for adapter in found)
         raise NoReaderError(f"There is no Bluetooth adapter {spec.adapter}.", hint=f"There is {named}.")
 
 

@@ -41,9 +41,9 @@ def registry(system: System) -> Iterator[Finding]:
         if synced is None or now - synced > _LATE:
             yield Finding("registry", "warning", f"The last sync was {record.synced or 'never'}.", _SYNC)
         yield from _clocks(roster, store.page_newest(), now)
-        alarms = [one for one in store.alarms() if not one.seen]
-        for one in alarms:
-            yield Finding("registry", "warning", f"Alarm {one.code}: {one.why}.", "teds-provision registry status")
+        alarms = [alarm for alarm in store.alarms() if not alarm.seen]
+        for alarm in alarms:
+            yield Finding("registry", "warning", f"Alarm {alarm.code}: {alarm.why}.", "teds-provision registry status")
         conflicts = len({uuid for uuid, _, _ in store.conflicts()})
         said = f"{store.unsent(fingerprint(facts.point))} events unsent, {conflicts} conflicts."
         fix = "teds-provision registry status" if conflicts else ""

@@ -68,8 +68,8 @@ class ImportedRows:
         """Write all of them."""
         self.station.keys.refresh()
         for taken in chunks(nodes):
-            self._turn_to([one.node.uuid for one in taken])
-            back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
+            self._turn_to([planned.node.uuid for planned in taken])
+            back = [planned.node.uuid for planned in taken if planned.node.uuid in self.resting]
             self.station.policy.take_back(back)
             for uuid in back:
                 self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
@@ -77,11 +77,13 @@ class ImportedRows:
 
     def _rows(self, taken: Sequence[PlannedNode]) -> BulkRows:
         return BulkRows(
-            nodes=[self._node(one) for one in taken],
+            nodes=[self._node(planned) for planned in taken],
             whitelist=[entry for entry in map(self._entry, taken) if entry is not None],
-            keys=[self._key(one.node) for one in taken if one.decision != "same"],
+            keys=[self._key(planned.node) for planned in taken if planned.decision != "same"],
             holders=[
-                Holder(one.node.uuid, other, self.now, self.bundle.mode) for one in taken for other in self.others
+                Holder(planned.node.uuid, other, self.now, self.bundle.mode)
+                for planned in taken
+                for other in self.others
             ],
             groups=self._groups(taken),
             marks=self._marks(taken),
@@ -91,9 +93,9 @@ class ImportedRows:
     def _groups(taken: Sequence[PlannedNode]) -> dict[str, list[bytes]]:
         """Return the measurement groups that the bundle puts these nodes in."""
         groups: dict[str, list[bytes]] = {}
-        for one in taken:
-            for label in one.node.groups:
-                groups.setdefault(valid_name(label), []).append(one.node.uuid)
+        for planned in taken:
+            for label in planned.node.groups:
+                groups.setdefault(valid_name(label), []).append(planned.node.uuid)
         return groups
 
     def _turn_to(self, uuids: Sequence[bytes]) -> None:
@@ -115,24 +117,24 @@ class ImportedRows:
             created=self.now,
         )
 
-    def _entry(self, one: PlannedNode) -> WhitelistEntry | None:
+    def _entry(self, planned: PlannedNode) -> WhitelistEntry | None:
         """The whitelist entry, pinned to the node's key; None where it is pinned already."""
-        node = one.node
+        node = planned.node
         pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
         if pin is None:
-            return WhitelistEntry(node.uuid, digits, self.now, "import", one.name)
+            return WhitelistEntry(node.uuid, digits, self.now, "import", planned.name)
         return None if is_whole(pin.fingerprint) else replace(pin, fingerprint=digits, assurance="import")
 
-    def _node(self, one: PlannedNode) -> NodeRecord:
+    def _node(self, planned: PlannedNode) -> NodeRecord:
         """What is known of the node from now on; not its epoch and sequence, which a session has to tell."""
-        node = one.node
+        node = planned.node
         state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
         known = self.known.get(node.uuid)
         if known is None:
             return NodeRecord(
                 node.uuid,
                 node.node_key,
-                one.name,
+                planned.name,
                 node.profile,
                 state,
                 teds_sha256=node.teds_sha256,
@@ -140,7 +142,7 @@ class ImportedRows:
         return replace(
             known,
             point=node.node_key,
-            name=known.name or one.name,
+            name=known.name or planned.name,
             profile=known.profile or node.profile,
             state=known.state or state,
             teds_sha256=known.teds_sha256 or node.teds_sha256,
@@ -150,16 +152,16 @@ class ImportedRows:
         """Rotations that are due after a move; the CA that each node keeps, or keeps once its new key is proven."""
         ca, own = self.bundle.ca, self.station.ca
         marks: dict[bytes, dict[str, Any]] = {}
-        for one in taken:
-            uuid = one.node.uuid
+        for planned in taken:
+            uuid = planned.node.uuid
             if uuid in self.resting:
                 marks[uuid] = {"rotation": f"it was returned by {self.bundle.id}: others have held this key"}
             if self.bundle.mode == "move":
                 marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has held this key"}
-            if one.decision == "same" or self.cas.get(uuid, own) == ca:
+            if planned.decision == "same" or self.cas.get(uuid, own) == ca:
                 continue
-            if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
-                kept: dict[str, Any] = {"next_key_id": one.node.kid, "next_ca": ca}
+            if planned.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
+                kept: dict[str, Any] = {"next_key_id": planned.node.kid, "next_ca": ca}
             else:
                 kept = {"ca": ca}
             marks[uuid] = {**marks.get(uuid, {}), **kept}
@@ -248,10 +250,10 @@ _PassedOver = tuple[tuple[Statement, str], ...]
 
 def _new_revocations(station: Station, opened: OpenedBundle) -> tuple[tuple[Statement, ...], _PassedOver]:
     """The revocations of the bundle that are new here: those that count, and those that do not, with why."""
-    news = [one for one in opened.revocations if station.policy.revocation(one.uuid) is None]
-    judged = [(one, why_not(station, one, opened.bundle)) for one in news]
-    denied = tuple(one for one, why in judged if not why)
-    return denied, tuple((one, why) for one, why in judged if why)
+    news = [revocation for revocation in opened.revocations if station.policy.revocation(revocation.uuid) is None]
+    judged = [(revocation, why_not(station, revocation, opened.bundle)) for revocation in news]
+    denied = tuple(revocation for revocation, why in judged if not why)
+    return denied, tuple((revocation, why) for revocation, why in judged if why)
 
 
 def _is_known_ca(station: Station, ca: bytes) -> bool:
@@ -297,11 +299,11 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
         deny_all(station, plan.denied, bundle)
         ImportedRows(station, plan.opened.bundle).take_in(plan.taken)
         station.handovers.put(row)
-        for one in plan.nodes if station.plant.joined is not None else ():
-            node, told = one.node, {"peer": bundle.sender, "bundle": bundle.id}
-            if one.decision == "refused":
-                station.plant.record_event("refused", node.uuid, why=one.why, **told)
-            elif one.decision != "same":
+        for planned in plan.nodes if station.plant.joined is not None else ():
+            node, told = planned.node, {"peer": bundle.sender, "bundle": bundle.id}
+            if planned.decision == "refused":
+                station.plant.record_event("refused", node.uuid, why=planned.why, **told)
+            elif planned.decision != "same":
                 station.plant.record_event(
                     "took", node.uuid, epoch=node.epoch, key_id=node.kid, mode=bundle.mode, **told
                 )
@@ -342,7 +344,7 @@ class _Judge:
         self.station = station
         self.sender, self.mode = bundle.sender, bundle.mode
         self.denied = {entry.uuid: (entry.fingerprint, entry.why) for entry in policy.revocations()}
-        self.denied |= {one.uuid: (one.fingerprint, one.why) for one in denied}
+        self.denied |= {revocation.uuid: (revocation.fingerprint, revocation.why) for revocation in denied}
         self.tombstones = {tombstone.uuid: tombstone for tombstone in policy.tombstones()}
         self.given: dict[str, bytes] = {}
         """Names that nodes of this bundle get."""

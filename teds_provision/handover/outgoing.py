@@ -171,7 +171,7 @@ class Selection:
             return []
         rows = [row for row in self.open.values() if row.mode == "move" and set(row.peers) == self.receivers]
         together = _of_the_last_run([BundleNotes.from_json(row.nodes) for row in rows])
-        return sorted(bytes.fromhex(uuid) for one in together for uuid in one.uuids)
+        return sorted(bytes.fromhex(uuid) for notes in together for uuid in notes.uuids)
 
 
 def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[bytes, str, int, str]]:
@@ -209,7 +209,7 @@ def _why_node_stays(node: NodeRecord | ExportEligibility, pin: str) -> str:
 
 def _of_the_last_run(notes: list[BundleNotes]) -> list[BundleNotes]:
     """The newest bundle, with all that one command made together with it."""
-    return [one for one in notes if one.run and one.run == notes[-1].run] or notes[-1:]
+    return [note for note in notes if note.run and note.run == notes[-1].run] or notes[-1:]
 
 
 NODES_IN_A_BUNDLE = 50_000

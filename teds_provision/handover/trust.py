@@ -349,16 +349,21 @@ def add(station: Station, chosen: list[Candidate]) -> int:
     """Trust these keys, in one transaction; returns how many were new."""
     new = 0
     with station.transaction():
-        for one in chosen:
-            if one.certificate is not None:
+        for candidate in chosen:
+            if candidate.certificate is not None:
                 station.identity.keep_certificate(
-                    one.certificate.ca, one.certificate.station, one.certificate.signature
+                    candidate.certificate.ca, candidate.certificate.station, candidate.certificate.signature
                 )
-            if one.known:
+            if candidate.known:
                 continue
-            station.policy.trust(one.record)
+            station.policy.trust(candidate.record)
             station.audit(
-                "trust", None, "added", name=one.record.name, role=one.record.role, key=one.record.fingerprint
+                "trust",
+                None,
+                "added",
+                name=candidate.record.name,
+                role=candidate.record.role,
+                key=candidate.record.fingerprint,
             )
             new += 1
     return new
@@ -452,10 +457,10 @@ def remove(station: Station, record: TrustRecord) -> Removal:
 
 def _cas_of(station: Station, record: TrustRecord) -> tuple[bytes, ...]:
     """The CAs whose standing here ends with this key: itself, or those that no other trusted station brought."""
-    trusted = {one.point for one in station.policy.trusted("ca")} | {station.ca}
+    trusted = {trusted.point for trusted in station.policy.trusted("ca")} | {station.ca}
     if record.role == "ca":
         return () if record.point == station.ca else (record.point,)
-    stations = {one.fingerprint for one in station.policy.trusted("station")} - {record.fingerprint}
+    stations = {trusted.fingerprint for trusted in station.policy.trusted("station")} - {record.fingerprint}
     brought = _brought_cas(station)
     ended = [ca for ca, by in brought.items() if record.fingerprint in by and not by & stations and ca not in trusted]
     return tuple(ended)

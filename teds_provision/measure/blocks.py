@@ -146,9 +146,9 @@ class InvalidValues:
 
 def why_invalid(found: Sequence[InvalidValues]) -> str:
     """``66 of channel 1 above its high limit, 360 °``, the largest counts first; empty where all are valid."""
-    most = sorted(found, key=lambda one: -one.count)
-    told = [f"{one.count} of channel {one.channel}: {one.why}" for one in most[:MOST_TOLD]]
-    more = sum(one.count for one in most[MOST_TOLD:])
+    most = sorted(found, key=lambda invalid: -invalid.count)
+    told = [f"{invalid.count} of channel {invalid.channel}: {invalid.why}" for invalid in most[:MOST_TOLD]]
+    more = sum(invalid.count for invalid in most[MOST_TOLD:])
     return "; ".join([*told, *([f"{more} more"] if more else [])])
 
 

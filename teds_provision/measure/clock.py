@@ -101,29 +101,32 @@ class ClockMap:
         """Those that are kept, oldest first."""
         return tuple(self._exchanges)
 
-    def exchange(self, one: Exchange) -> bool:
+    def exchange(self, exchange: Exchange) -> bool:
         """Take an exchange; False where the clock lies (``lie`` says how). It moves no stamp where there is better."""
-        if one.sent >= END_OF_TICKS:
+        if exchange.sent >= END_OF_TICKS:
             self.lie = "the node claims to have run for centuries"
             return False
-        if one.sent < one.received:
+        if exchange.sent < exchange.received:
             self.lie = "by its own clock, the node replied before it received the request"
-        elif one.sent - one.received > (one.answered - one.asked) * (1 + one.drift / 1e6) + 2 * one.step:
+        elif (
+            exchange.sent - exchange.received
+            > (exchange.answered - exchange.asked) * (1 + exchange.drift / 1e6) + 2 * exchange.step
+        ):
             self.lie = "the node claims that its reply took longer than the whole exchange"
         else:
-            if (one.drift + self._own) / 1e6 > self._rate:
-                self._rate = (one.drift + self._own) / 1e6
+            if (exchange.drift + self._own) / 1e6 > self._rate:
+                self._rate = (exchange.drift + self._own) / 1e6
                 self._low, self._high = -math.inf, math.inf  # what was gathered held for a better clock
-            low, high = self._limits(one.tick)
-            if one.offset - one.error > high or one.offset + one.error < low:
+            low, high = self._limits(exchange.tick)
+            if exchange.offset - exchange.error > high or exchange.offset + exchange.error < low:
                 self.lie = "two exchanges contradict each other: the node's clock was set or runs at the wrong speed"
                 return False
-            self._exchanges.append(one)
-            self._narrow(one.tick, one.offset - one.error, one.offset + one.error)
-            self._refit(one.tick)
+            self._exchanges.append(exchange)
+            self._narrow(exchange.tick, exchange.offset - exchange.error, exchange.offset + exchange.error)
+            self._refit(exchange.tick)
             return True
         if not self._known:  # stamps go on: until a sample arrives, the end of the reply is all that there is
-            self._origin, self._offset = one.sent, float(one.answered - one.sent)
+            self._origin, self._offset = exchange.sent, float(exchange.answered - exchange.sent)
         return False
 
     def arrival(self, tick: int, host: int) -> None:
@@ -225,9 +228,9 @@ class ClockMap:
         mean of many, and so does the quickest reply. What they say is carried to ``tick`` along the skew, whose own
         doubt makes old ones say less.
         """
-        at = np.array([one.tick - tick for one in self._exchanges], dtype=np.float64)
-        offsets = np.array([one.offset for one in self._exchanges])
-        errors = np.array([one.error for one in self._exchanges])
+        at = np.array([exchange.tick - tick for exchange in self._exchanges], dtype=np.float64)
+        offsets = np.array([exchange.offset for exchange in self._exchanges])
+        errors = np.array([exchange.error for exchange in self._exchanges])
         base = offsets[-1]
         edge, skew = self._by_arrivals(tick)
         if len(at) >= 4 and at.max() - at.min() >= SPAN_OF_EXCHANGES:

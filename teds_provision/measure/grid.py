@@ -44,12 +44,15 @@ class Grid:
 
     def __init__(self, group: str, facts: Sequence[ChannelFacts], *, patience: float = 0.1) -> None:
         self.group = group
-        self.channels = tuple(one.key for one in facts)
+        self.channels = tuple(channel_facts.key for channel_facts in facts)
         self.patience = patience
-        periods = [one.period for one in facts if one.period]
+        periods = [channel_facts.period for channel_facts in facts if channel_facts.period]
         self.period = min(periods, default=1.0)
         self._columns = {key: place for place, key in enumerate(self.channels)}
-        self._keeps = {one.key: PERIODS_OF_A_VALUE * one.period if one.period else math.inf for one in facts}
+        self._keeps = {
+            channel_facts.key: PERIODS_OF_A_VALUE * channel_facts.period if channel_facts.period else math.inf
+            for channel_facts in facts
+        }
         self._streams: dict[tuple[str, int], _Stream] = {}
         self._next: int | None = None  # number of the next row: its time is number × period
         self._test = False
@@ -76,10 +79,12 @@ class Grid:
         known = self._streams.get(key)
         if known is not None and known.channels == block.channels:
             return known
-        columns = [self._columns[block.uuid, one] for one in block.channels if (block.uuid, one) in self._columns]
+        columns = [
+            self._columns[block.uuid, number] for number in block.channels if (block.uuid, number) in self._columns
+        ]
         if not columns:
             return None
-        keeps = max(self._keeps[self.channels[one]] for one in columns)
+        keeps = max(self._keeps[self.channels[column]] for column in columns)
         known = self._streams[key] = _Stream(block.channels, columns, _side_by_side(columns), keeps)
         return known
 
@@ -87,7 +92,9 @@ class Grid:
         """The rows that are due at unix time ``now``; None where there is none."""
         if self._next is None:
             return None
-        live = [one.newest for one in self._streams.values() if one.newest > now - one.keeps - self.patience]
+        live = [
+            stream.newest for stream in self._streams.values() if stream.newest > now - stream.keeps - self.patience
+        ]
         ready = min(live) if live else -math.inf
         # The small number lets a stamp that was rounded stand for the row that it was taken for.
         until = math.floor(max(ready, now - self.patience) / self.period + 1e-6)
@@ -105,7 +112,7 @@ class Grid:
 
     def began_apart(self) -> float:
         """Seconds between the first samples of the stream that began first and of the one that began last."""
-        began = [one.began for one in self._streams.values() if not math.isnan(one.began)]
+        began = [stream.began for stream in self._streams.values() if not math.isnan(stream.began)]
         return max(began) - min(began) if began else 0.0
 
 

@@ -58,10 +58,10 @@ class StreamInterpreter:
         self._test_pattern = plan.subscribe.test_pattern
         self._steps, self._seconds = np.zeros(0, dtype=np.uint64), np.zeros(0)  # of instants: ns, s after the first
         present = set(plan.layout.channels)
-        why = {one.channel.number: raw_only or _why_raw(one, present) for one in self._channels}
+        why = {interpreter.channel.number: raw_only or _why_raw(interpreter, present) for interpreter in self._channels}
         self.problems = {number: reason for number, reason in why.items() if reason}
 
-        usable = [one.channel.number not in self.problems for one in self._channels]
+        usable = [interpreter.channel.number not in self.problems for interpreter in self._channels]
         self._many = ManyChannels.side_by_side(self._channels, usable)
         self._invalid: dict[tuple[int, str], int] = {}
 
@@ -91,7 +91,10 @@ class StreamInterpreter:
         if len(messages) == 1:
             octets, flags = first.data, first.flags
         else:
-            octets, flags = b"".join([one.data for one in messages]), max([one.flags for one in messages])
+            octets, flags = (
+                b"".join([message.data for message in messages]),
+                max([message.flags for message in messages]),
+            )
         raws, value, valid = self._values(octets)
         flagged = None
         if flags:
@@ -129,21 +132,21 @@ class StreamInterpreter:
     def _count_invalid(self, raws: np.ndarray, valid: np.ndarray, flagged: np.ndarray | None) -> None:
         """Count why values of a block are not valid; ``flagged`` says of which instants the node says so itself."""
         places = {number: k for k, number in enumerate(self._numbers)}
-        for k, one in enumerate(self._channels):
+        for k, interpreter in enumerate(self._channels):
             bad = ~valid[:, k]
             if not bad.any():
                 continue
             found: dict[str, int] = {}
-            if one.channel.number in self.problems:
-                found[self.problems[one.channel.number].removesuffix(".")] = int(np.count_nonzero(bad))
+            if interpreter.channel.number in self.problems:
+                found[self.problems[interpreter.channel.number].removesuffix(".")] = int(np.count_nonzero(bad))
             else:
                 if flagged is not None and flagged.any():
                     found[NODE_SAYS_SO] = int(np.count_nonzero(bad & flagged))
                     bad &= ~flagged
-                others = {number: raws[bad, places[number]] for number in one.others}
-                found |= one.why_invalid(raws[bad, k], others)
+                others = {number: raws[bad, places[number]] for number in interpreter.others}
+                found |= interpreter.why_invalid(raws[bad, k], others)
             for why, count in found.items():
-                key = one.channel.number, why
+                key = interpreter.channel.number, why
                 self._invalid[key] = self._invalid.get(key, 0) + count
 
     def _spaced(self, first: StreamMessage, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -169,26 +172,32 @@ class StreamInterpreter:
             raws = self._many.raw(octets)
             return raws, *self._many.values(raws)
         rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, self._row)
-        columns = [one.reader.raw(rows[:, place]) for one, place in zip(self._channels, self._places, strict=True)]
+        columns = [
+            interpreter.reader.raw(rows[:, place])
+            for interpreter, place in zip(self._channels, self._places, strict=True)
+        ]
         by_number = dict(zip(self._plan.layout.channels, columns, strict=True))
         value = np.full((len(rows), len(columns)), np.nan)
         valid = np.zeros(value.shape, dtype=bool)
-        for k, one in enumerate(self._channels):
-            if one.channel.number in self.problems:
+        for k, interpreter in enumerate(self._channels):
+            if interpreter.channel.number in self.problems:
                 continue
-            found = one.values(columns[k], {number: by_number[number] for number in one.others})
-            value[:, k] = one.unit.to_si(found.value)  # type: ignore[arg-type]  # an array is scaled as a number is
+            found = interpreter.values(columns[k], {number: by_number[number] for number in interpreter.others})
+            value[:, k] = interpreter.unit.to_si(found.value)  # type: ignore[arg-type]  # an array is scaled as a number is
             valid[:, k] = found.valid
         return _together(columns), np.where(valid, value, np.nan), valid
 
 
-def _why_raw(one: ChannelInterpreter, present: set[int]) -> str:
-    if one.problem:
-        return one.problem
-    missing = [number for number in one.others if number not in present]
+def _why_raw(interpreter: ChannelInterpreter, present: set[int]) -> str:
+    if interpreter.problem:
+        return interpreter.problem
+    missing = [number for number in interpreter.others if number not in present]
     if missing:
         other = missing[0]
-        return f"Channel {one.channel.number} is compensated by channel {other}, which is not part of the same stream."
+        return (
+            f"Channel {interpreter.channel.number} is compensated by channel {other}, which is not part of the same "
+            "stream."
+        )
     return ""
 
 

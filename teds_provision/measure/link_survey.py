@@ -56,5 +56,5 @@ def look(station: Station, places: Sequence[str]) -> Iterator[LinkSurvey]:
             yield LinkSurvey(place, "down", error.message, error.hint)
             continue
         nodes = tuple((contact.address or 0, contact.identity) for contact in contacts)
-        troubles = tuple(one.text for one in told if one.kind in ("conflict", "unfinished"))
+        troubles = tuple(notice.text for notice in told if notice.kind in ("conflict", "unfinished"))
         yield LinkSurvey(place, "up", nodes=nodes, troubles=troubles)

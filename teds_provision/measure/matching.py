@@ -103,7 +103,7 @@ class NodeMatch:
         judged = judge(self.fits, Sheet.from_image(image), datetime.now(UTC)) if image is not None else ()
         if met(self.fits, judged):
             return ""
-        return next((one.why.rstrip(".") for one in judged), "its datasheet is unknown")
+        return next((fit.why.rstrip(".") for fit in judged), "its datasheet is unknown")
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def load_of(station: Station, uuid: bytes, request: MeasurementRequest, time: Bu
     image = station.nodes.datasheet(uuid)
     if image is None:
         return NodeLoad()
-    sensors = [one for one in Sheet.from_image(image).channels if one.sample and not one.actuator]
+    sensors = [channel for channel in Sheet.from_image(image).channels if channel.sample and not channel.actuator]
     try:
         plans = plan_node(
             sensors_of(sensors, (), request.kind), time, rate=request.rate, kind=request.kind, at_most=True

@@ -296,7 +296,7 @@ class NodeSupervisor:
         self._claim(trusted, channels)
         plans = self._subscribe(bus, trusted, channels, address) if channels else NodePlans((), 0.0)
         periods = plans.periods()
-        self._events.facts([trusted.facts(one, periods.get(one.number)) for one in (*channels, *actuators)])
+        self._events.facts([trusted.facts(channel, periods.get(channel.number)) for channel in (*channels, *actuators)])
         self.streams.described()
         if actuators:
             self._driven = self._take_up(bus, trusted, actuators, address)
@@ -318,25 +318,25 @@ class NodeSupervisor:
             return []
         wanted = self._request.channels
         return [
-            one
-            for one in trusted.sheet.channels
-            if one.actuator and not one.value_problem and (not wanted or one.number in wanted)
+            channel
+            for channel in trusted.sheet.channels
+            if channel.actuator and not channel.value_problem and (not wanted or channel.number in wanted)
         ]
 
     def _sensors(self, every: Sequence[Channel], actuators: list[Channel]) -> list[Channel]:
         """Sensors to measure; none where only actuators were asked for, or the node has nothing else."""
-        moved = {one.number for one in actuators}
+        moved = {channel.number for channel in actuators}
         asked = [number for number in self._request.channels if number not in moved]
-        nothing_else = all(one.actuator for one in every) or (self._request.channels and not asked)
+        nothing_else = all(channel.actuator for channel in every) or (self._request.channels and not asked)
         if actuators and nothing_else:
             return []
         return sensors_of(every, asked, self._request.kind)
 
     def _claim(self, trusted: VerifiedSession, channels: list[Channel]) -> None:
         """Claim the sensors one by one, or the whole node at once where every sensor is measured."""
-        sensors = [one for one in trusted.sheet.channels if not one.actuator]
+        sensors = [channel for channel in trusted.sheet.channels if not channel.actuator]
         whole = bool(channels) and len(channels) == len(sensors)
-        self._claimed = [0] if whole else [one.number for one in channels]
+        self._claimed = [0] if whole else [channel.number for channel in channels]
         self._lease = self._lease_now()
         for number in self._claimed:
             claim(trusted, number, lease=self._lease)
@@ -352,7 +352,7 @@ class NodeSupervisor:
         return TopicActuators(
             trusted,
             functools.partial(bus.drive, address),
-            tuple(sorted(one.number for one in actuators)),
+            tuple(sorted(channel.number for channel in actuators)),
             dead_man=self._request.dead_man,
             clock=self.streams.clock,
             turn=self.turn,
@@ -502,19 +502,19 @@ class NodeSupervisor:
     def report(self) -> NodeReport:
         """How the node does now."""
         sums = self.streams.summed()
-        errors = [one.clock_error for one in sums if one.clock_error is not None]
+        errors = [totals.clock_error for totals in sums if totals.clock_error is not None]
         return NodeReport(
             uuid=self.uuid.hex(),
             state=self.state,
             why=self._told,
-            samples=sum(one.samples for one in sums),
-            lost=sum(one.lost for one in sums),
-            late=sum(one.late for one in sums),
-            bad=sum(one.bad for one in sums),
-            invalid=sum(one.invalid for one in sums),
+            samples=sum(totals.samples for totals in sums),
+            lost=sum(totals.lost for totals in sums),
+            late=sum(totals.late for totals in sums),
+            bad=sum(totals.bad for totals in sums),
+            invalid=sum(totals.invalid for totals in sums),
             clock_error=max(errors) if errors else None,
             time=time.time(),
-            invalid_why=added(*(one.invalid_why for one in sums)),
+            invalid_why=added(*(totals.invalid_why for totals in sums)),
         )
 
     def _set_state(

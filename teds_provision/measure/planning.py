@@ -139,7 +139,11 @@ class NodePlans:
 
     def periods(self) -> dict[int, float]:
         """Seconds between the samples of each channel."""
-        return {number: one.subscribe.period / 1e9 for one in self.streams for number in one.layout.channels}
+        return {
+            number: stream_plan.subscribe.period / 1e9
+            for stream_plan in self.streams
+            for number in stream_plan.layout.channels
+        }
 
 
 def plan_node(
@@ -197,7 +201,7 @@ def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> st
 
 def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: StreamKind | None) -> list[Channel]:
     """The sensors to measure: those that were asked for, or all; raises BadDataError where one cannot be."""
-    fitting = {one.number: one for one in channels if one.sample and one.kind in _SENSORS_OF[kind]}
+    fitting = {channel.number: channel for channel in channels if channel.sample and channel.kind in _SENSORS_OF[kind]}
     for number in wanted:
         if number not in fitting:
             raise BadDataError(
@@ -222,10 +226,10 @@ _Group = tuple[int, StreamKind, list[Channel]]
 def _groups(channels: Sequence[Channel], rate: float | None, kind: StreamKind | None, *, at_most: bool) -> list[_Group]:
     """Channels by period and kind, at most 16 each; all at the slowest period where that makes too many streams."""
     paced: _Paced = {}
-    for one in channels:
-        event = one.kind == ChannelKind.EVENT_SENSOR
+    for channel in channels:
+        event = channel.kind == ChannelKind.EVENT_SENSOR
         how = StreamKind.EVENT if event else StreamKind.FREE if kind == StreamKind.FREE else StreamKind.PERIODIC
-        paced.setdefault((period_of(one, rate, at_most=at_most), how), []).append(one)
+        paced.setdefault((period_of(channel, rate, at_most=at_most), how), []).append(channel)
     groups = _cut(paced)
     if len(groups) > LAST_STREAM + 1:
         groups = _cut(_at_the_slowest(paced))
@@ -276,7 +280,7 @@ def period_of(channel: Channel, rate: float | None, *, at_most: bool = False) ->
 def _plan(
     number: int, period: int, kind: StreamKind, members: list[Channel], bus: BusTime, test_pattern: bool, start: int
 ) -> StreamPlan:
-    widths = tuple((one.number, one.sample.octets if one.sample else 0) for one in members)
+    widths = tuple((channel.number, channel.sample.octets if channel.sample else 0) for channel in members)
     octets = sum(width for _, width in widths)
     most = most_instants(kind, octets, bus.most_octets)
     if most < 1:

@@ -138,7 +138,7 @@ class Presence:
     def seen_at(self, uuid: bytes) -> Sighting | None:
         """Where a node was seen last; None where it was not, or turned out not to be."""
         with self._turn:
-            return max(self._seen.get(uuid, {}).values(), key=lambda one: one.at, default=None)
+            return max(self._seen.get(uuid, {}).values(), key=lambda sighting: sighting.at, default=None)
 
     def missing(self) -> bool:
         """Whether somebody waits for a node."""
@@ -148,7 +148,11 @@ class Presence:
     def all(self) -> list[Sighting]:
         """Every node that was seen, where it was seen last, by UUID."""
         with self._turn:
-            return [max(places.values(), key=lambda one: one.at) for _, places in sorted(self._seen.items()) if places]
+            return [
+                max(places.values(), key=lambda sighting: sighting.at)
+                for _, places in sorted(self._seen.items())
+                if places
+            ]
 
     def find(self, uuid: bytes, *, seconds: float, stop: threading.Event, fresh: float = 0.0) -> Sighting:
         """Wait for a node that was seen after ``fresh`` (time.monotonic); raises NoNodeError, AddressConflictError."""
@@ -195,8 +199,12 @@ class Presence:
     def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
         """Where to look for a node. A place that was wrong is not taken while another one may still answer."""
         wrong, seen = self._wrong.get(uuid, {}), self._seen.get(uuid, {})
-        places = [one for one in seen.values() if one.at >= fresh]
-        best = min(places, key=lambda one: (wrong.get((one.port.place, one.address), 0.0), -one.at), default=None)
+        places = [sighting for sighting in seen.values() if sighting.at >= fresh]
+        best = min(
+            places,
+            key=lambda sighting: (wrong.get((sighting.port.place, sighting.address), 0.0), -sighting.at),
+            default=None,
+        )
         if best is None or (best.port.place, best.address) not in wrong or len(seen) == len(places):
             return best
         return best if time.monotonic() - best.at >= TWIN else None

@@ -147,11 +147,11 @@ class Measurement:
 
     def _trigger(self) -> None:
         """Pull the trigger when it is due; say for whom, and for how long, it waits."""
-        late = [one for one in self.keepers if not one.ready.is_set()]
+        late = [supervisor for supervisor in self.keepers if not supervisor.ready.is_set()]
         if self._common_start.due(len(self.keepers) - len(late), len(self.keepers)):
             trigger.pull(self._common_start, self.keepers, self.watcher.note)
         elif late and len(late) < len(self.keepers) and self._common_start.tells():
-            names = ", ".join(one.uuid.hex() for one in late[:3]) + (" …" if len(late) > 3 else "")
+            names = ", ".join(supervisor.uuid.hex() for supervisor in late[:3]) + (" …" if len(late) > 3 else "")
             self.watcher.note(f"Waiting for {names} before the trigger, up to {TOGETHER:.0f} s.")
 
     def _until(self, now: float, duration: float | None) -> float:
@@ -161,7 +161,7 @@ class Measurement:
             return math.inf
         self.began()
         # A stream that may begin when its node likes begins a moment after Subscribe.
-        first = [one.streams.first_sample() for one in self.keepers]
+        first = [supervisor.streams.first_sample() for supervisor in self.keepers]
         return max(now + left, *first) + duration
 
     def _all_done(self) -> bool:
@@ -169,7 +169,9 @@ class Measurement:
 
     def _gave_up(self) -> bool:
         """Whether no node ever ran and each has had its time."""
-        return not self._open and all(not one.ever_ran and isinstance(one.error, NoNodeError) for one in self.keepers)
+        return not self._open and all(
+            not supervisor.ever_ran and isinstance(supervisor.error, NoNodeError) for supervisor in self.keepers
+        )
 
     def _look(self) -> None:
         for keeper in self.keepers:
@@ -282,7 +284,7 @@ class Measurement:
         self.lent.discard(uuid)
 
     def _keeper(self, uuid: bytes) -> NodeSupervisor | None:
-        return next((one for one in self.keepers if one.uuid == uuid), None)
+        return next((supervisor for supervisor in self.keepers if supervisor.uuid == uuid), None)
 
     def command(self, command: SetPointCommand) -> None:
         """A set point that came by a sink."""
@@ -305,23 +307,23 @@ class Measurement:
 
     def _with_names(self, facts: Sequence[ChannelFacts]) -> Sequence[ChannelFacts]:
         """The facts of a node that joins, with the names of its topics as they are now: they may be newer than ours."""
-        uuids = {one.uuid for one in facts}
+        uuids = {channel_facts.uuid for channel_facts in facts}
         names = {(uuid.hex(), channel): name for (uuid, channel), name in self.station.measurements.names.items()}
         own = {key: name for key, name in names.items() if key[0] in uuids}
         others = {key: name for key, name in self.facts.names.items() if key[0] not in uuids}
         if dict(self.facts.names) != others | own:
             self.facts = replace(self.facts, names=others | own)
         chosen = {uuid: tuple((number, name) for (key, number), name in own.items() if key == uuid) for uuid in uuids}
-        return [replace(one, chosen=chosen[one.uuid]) for one in facts]
+        return [replace(channel_facts, chosen=chosen[channel_facts.uuid]) for channel_facts in facts]
 
     def _describe(self, facts: Sequence[ChannelFacts]) -> None:
         if self._open:
             facts = self._with_names(facts)
         with self._lock:
             before = dict(self._known)
-            self._known.update((one.key, one) for one in facts)
+            self._known.update((channel_facts.key, channel_facts) for channel_facts in facts)
             if self._known != before and any(sink.wants_rows for sink in self.sinks):
-                for uuid in {one.uuid for one in facts} if self._open else {""}:
+                for uuid in {channel_facts.uuid for channel_facts in facts} if self._open else {""}:
                     self._grids[uuid] = self._new_grid(uuid)
         for sink in self.sinks:
             sink.describe(facts)
@@ -329,11 +331,11 @@ class Measurement:
 
     def _new_grid(self, uuid: str) -> Grid:
         """Of one node, or of all of them ("")."""
-        keepers = [one for one in self.keepers if uuid in ("", one.uuid.hex())]
-        spans = [heard.receiver.plan.span for one in keepers for heard in list(one.streams.running.values())]
+        keepers = [supervisor for supervisor in self.keepers if uuid in ("", supervisor.uuid.hex())]
+        spans = [heard.receiver.plan.span for keeper in keepers for heard in list(keeper.streams.running.values())]
         patience = max(spans, default=0) / 1e9 + 2 * BEAT
-        known = [one for _, one in sorted(self._known.items()) if one.kind != "actuator"]
-        sensors = [one for one in known if uuid in ("", one.uuid)]
+        known = [facts for _, facts in sorted(self._known.items()) if facts.kind != "actuator"]
+        sensors = [facts for facts in known if uuid in ("", facts.uuid)]
         return Grid(uuid or self.facts.group or "all", sensors, patience=patience)
 
     def _report(self, report: NodeReport) -> None:
@@ -374,13 +376,17 @@ class Measurement:
         errors += [error for sink in self.sinks if (error := _as_error(sink)) is not None]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
-        sinks = [{"sink": one.name, "written": one.stats.written, "dropped": one.stats.dropped} for one in self.sinks]
+        sinks = [
+            {"sink": sink.name, "written": sink.stats.written, "dropped": sink.stats.dropped} for sink in self.sinks
+        ]
         return MeasurementEnd(nodes, files, worst, self._common_start.spread, sinks)
 
 
 def _summary(keeper: NodeSupervisor) -> dict[str, Any]:
     """A node of the ``end`` event of ``measure --json``."""
-    streams = [asdict(one) | {"channels": list(one.channels)} for _, one in sorted(keeper.streams.totals.items())]
+    streams = [
+        asdict(totals) | {"channels": list(totals.channels)} for _, totals in sorted(keeper.streams.totals.items())
+    ]
     node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}
     if keeper.error is not None:
         node["error"] = {"code": keeper.error.code, "message": keeper.error.message}

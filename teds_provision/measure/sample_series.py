@@ -69,8 +69,8 @@ def take_samples_of(
     width = sum(reader.octets for reader in readers.values())
     octets = bytearray()
     try:
-        for each in readers:
-            claim(trusted, each, lease=_LEASE)
+        for read_channel in readers:
+            claim(trusted, read_channel, lease=_LEASE)
         began = time.monotonic()
         for taken in range(count):
             time.sleep(max(0.0, began + taken * seconds / (count - 1) - time.monotonic()))
@@ -85,8 +85,8 @@ def take_samples_of(
         trusted.node.request(idle(0), "to let go")
     rows = np.frombuffer(bytes(octets), dtype=np.uint8).reshape(count, width)
     raws, at = {}, 0
-    for each, reader in readers.items():
-        raws[each] = reader.reader.raw(np.ascontiguousarray(rows[:, at : at + reader.octets]))
+    for read_channel, reader in readers.items():
+        raws[read_channel] = reader.reader.raw(np.ascontiguousarray(rows[:, at : at + reader.octets]))
         at += reader.octets
     return SampleSeries(one, raws.pop(number), raws)
 

@@ -61,7 +61,7 @@ def shown_json(value: float | None, uncertainty: float | None, unit: WrittenUnit
 def take_samples(trusted: VerifiedSession, numbers: Sequence[int]) -> list[Sample]:
     """Fresh values of these channels (none: every sensor), taken together as far as one reply holds them."""
     channels = sensors_of(trusted.sheet.channels, numbers, None)
-    interpreters = _interpreters(trusted.sheet, [one.number for one in channels])
+    interpreters = _interpreters(trusted.sheet, [channel.number for channel in channels])
     clock, wall = ClockMap(), WallClock.now()
     for _ in range(3):
         exchange_clock(trusted.node, clock)
@@ -80,7 +80,7 @@ def take_samples(trusted: VerifiedSession, numbers: Sequence[int]) -> list[Sampl
             times[number], good[number] = stamp, reply.valid
             at += one.octets
     trusted.node.request(idle(0), "to let go")
-    return [_sample(interpreters[one.number], raws, good, times[one.number]) for one in channels]
+    return [_sample(interpreters[channel.number], raws, good, times[channel.number]) for channel in channels]
 
 
 def _moment(clock: ClockMap, wall: WallClock, tick: int) -> float:
@@ -93,39 +93,43 @@ def _moment(clock: ClockMap, wall: WallClock, tick: int) -> float:
 def _interpreters(sheet: Sheet, asked: Sequence[int]) -> dict[int, ChannelInterpreter]:
     """Of the asked channels, then of those that their calibration takes as well."""
     found = {number: ChannelInterpreter(sheet, number) for number in asked}
-    more = {other for one in found.values() for other in one.others}
-    known = {one.number for one in sheet.channels}
+    more = {other for interpreter in found.values() for other in interpreter.others}
+    known = {channel.number for channel in sheet.channels}
     return found | {other: ChannelInterpreter(sheet, other) for other in sorted((more & known) - set(found))}
 
 
 def _parts(interpreters: dict[int, ChannelInterpreter]) -> list[list[int]]:
     parts: list[list[int]] = [[]]
     size = 0
-    for number, one in interpreters.items():
-        if parts[-1] and (size + one.octets > ROOM or len(parts[-1]) == MOST_SAMPLE_CHANNELS):
+    for number, interpreter in interpreters.items():
+        if parts[-1] and (size + interpreter.octets > ROOM or len(parts[-1]) == MOST_SAMPLE_CHANNELS):
             parts.append([])
             size = 0
         parts[-1].append(number)
-        size += one.octets
+        size += interpreter.octets
     return parts
 
 
-def _missing(one: ChannelInterpreter, raws: dict[int, np.ndarray]) -> str:
-    missing = [other for other in one.others if other not in raws]
+def _missing(interpreter: ChannelInterpreter, raws: dict[int, np.ndarray]) -> str:
+    missing = [other for other in interpreter.others if other not in raws]
     return f"channel {missing[0]}, which compensates it, is missing" if missing else ""
 
 
-def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int, bool], stamp: float) -> Sample:
-    channel = one.channel
-    why = one.problem or _missing(one, raws)
+def _sample(
+    interpreter: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int, bool], stamp: float
+) -> Sample:
+    channel = interpreter.channel
+    why = interpreter.problem or _missing(interpreter, raws)
     value, valid = math.nan, False
     if not why:
-        found = one.values(raws[channel.number], {other: raws[other] for other in one.others})
-        valid = bool(found.valid[0]) and all(good[other] for other in (channel.number, *one.others))
-        value = one.unit.to_si(float(found.value[0]))
+        found = interpreter.values(raws[channel.number], {other: raws[other] for other in interpreter.others})
+        valid = bool(found.valid[0]) and all(good[other] for other in (channel.number, *interpreter.others))
+        value = interpreter.unit.to_si(float(found.value[0]))
         if not valid:
-            flagged = not all(good[other] for other in (channel.number, *one.others))
-            reasons = one.why_invalid(raws[channel.number], {other: raws[other] for other in one.others})
+            flagged = not all(good[other] for other in (channel.number, *interpreter.others))
+            reasons = interpreter.why_invalid(
+                raws[channel.number], {other: raws[other] for other in interpreter.others}
+            )
             why = "the node marks it as invalid" if flagged else next(iter(reasons), "")
     uncertainty = channel.stated_uncertainty
     return Sample(

@@ -126,8 +126,8 @@ class NodeStanding:
         require_measurable(station, uuid)
         judged = verdict_of(station, uuid)
         verdict = "authentic" if judged is None else judged.verified.verdict
-        failed = [] if judged is None else [one for one in judged.verified.checks if one.result == "failed"]
-        why = "; ".join(one.why or one.name for one in failed)
+        failed = [] if judged is None else [check for check in judged.verified.checks if check.result == "failed"]
+        why = "; ".join(check.why or check.name for check in failed)
         if verdict == "not authentic" or (verdict == "unsigned" and not self.unsigned):
             raise BadDatasheetError(
                 f"The datasheet of node {uuid.hex()} is {verdict} now: {why}. "

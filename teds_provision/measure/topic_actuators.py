@@ -150,7 +150,7 @@ class TopicActuators:
         now = time.monotonic()
         if now >= actuator.claimed_until:
             self._claim(command.channel, actuator)
-        fast_alone = actuator.fast and sum(one.claimed_until > now for one in self._actuators.values()) <= 1
+        fast_alone = actuator.fast and sum(actuator.claimed_until > now for actuator in self._actuators.values()) <= 1
         if not fast_alone:
             actuator.driver = None
         # Nobody answers a Drive message, so now and then a value goes by command: a node that was cut off says so.

@@ -117,7 +117,7 @@ class VerifiedSession:
 
     def facts(self, channel: Channel, period: float | None) -> ChannelFacts:
         """What goes with every value of a channel that gives one every ``period`` seconds."""
-        siblings = tuple((one.number, one.name) for one in self.sheet.channels)
+        siblings = tuple((channel.number, channel.name) for channel in self.sheet.channels)
         if self.unsigned:  # a name to tell channels apart; nothing else that the node says of itself is repeated
             kind = facts_of(self.sheet, channel, name=self.name, fingerprint="", period=period).kind
             bare = ChannelFacts(self.uuid, self.name, channel.number, channel.name, kind, period=period, unsigned=True)
@@ -134,7 +134,7 @@ class VerifiedSession:
         """A channel of the datasheet; raises BadDataError where there is none."""
         found = self.sheet.channel(number)
         if found is None:
-            numbers = ", ".join(str(one.number) for one in self.sheet.channels) or "none"
+            numbers = ", ".join(str(channel.number) for channel in self.sheet.channels) or "none"
             raise BadDataError(f"Node {self.uuid} has no channel {number}; its datasheet has {numbers}.")
         return found
 
@@ -186,7 +186,7 @@ def trusted_from(
     name = record.name if record is not None and record.name else ""
     digest = hashlib.sha256(image.security or b"").hexdigest()
     sheet = Sheet.from_image(image).shown_in(shown_units(station, node.uuid))
-    frames = {number: one for (uuid, number), one in station.measurements.frames.items() if uuid == node.uuid}
+    frames = {number: frame for (uuid, number), frame in station.measurements.frames.items() if uuid == node.uuid}
     return VerifiedSession(node, sheet, digest, name, bare, looked.kept, channel_profiles(station, node.uuid), frames)
 
 

@@ -164,7 +164,9 @@ class _ZeroRun:
             told = guard(
                 station, wanted_image, image, self.order.accept_calibration, record=record, expected=("changed",)
             )
-            changes = tuple(one.text for one in diff_blocks(image.unsigned_blocks(), wanted_image.unsigned_blocks()))
+            changes = tuple(
+                change.text for change in diff_blocks(image.unsigned_blocks(), wanted_image.unsigned_blocks())
+            )
             found = replace(found, changes=changes, warnings=(*found.warnings, *told))
             step.detail = f"zero offset {channel.show(found.offset, difference=True)}"
         if self.dry_run:
@@ -181,7 +183,7 @@ class _ZeroRun:
             slack = max(channel.stated_uncertainty, 0.0) if math.isfinite(channel.stated_uncertainty) else 0.0
             if si < channel.low - slack or si > channel.high + slack:
                 said = unit_for(channel, order.unit) if order.unit is not None else channel.shown
-                asked, low, high = (format_value(each, said) for each in (si, channel.low, channel.high))
+                asked, low, high = (format_value(number, said) for number in (si, channel.low, channel.high))
                 raise PolicyError(
                     f"{asked} exceeds the limits of channel {channel.number}, {low} to {high}.",
                     hint="Limits come from the signed datasheet and cannot be exceeded.",
@@ -236,7 +238,7 @@ class _ZeroRun:
 
 def _require_nobody_else(trusted: VerifiedSession) -> None:
     """Raise PolicyError where another session claims a channel: the node would refuse what was signed by then."""
-    claimed = [one for one in operation(trusted.node).channels.values() if one[0] & ChannelState.CLAIMED_BY_OTHER]
+    claimed = [state for state in operation(trusted.node).channels.values() if state[0] & ChannelState.CLAIMED_BY_OTHER]
     if claimed:
         raise PolicyError(
             f"Node {trusted.uuid} is being measured by another station, source address 0x{claimed[0][1]:02X}.",

@@ -279,7 +279,7 @@ class DynamicMembership:
         if self._budget is None:
             return ""
         rate = self._job.kept.scalar_rate
-        used = sum(one.load.messages(rate, self._rows) for key, one in self._members.items() if key != uuid)
+        used = sum(member.load.messages(rate, self._rows) for key, member in self._members.items() if key != uuid)
         over = used + load.messages(rate, self._rows) > self._budget
         return f"no room in the budget of {self._budget:g} messages/s" if over else ""
 

@@ -159,7 +159,7 @@ class History:
             if time.monotonic() - looked > MINUTE:
                 looked = time.monotonic()
                 with self._turn:
-                    gone = [key for key, one in self._channels.items() if one.hour.newest < time.time() - HOUR]
+                    gone = [key for key, channel in self._channels.items() if channel.hour.newest < time.time() - HOUR]
                     for key in gone:
                         del self._channels[key]
 

@@ -138,8 +138,8 @@ class Live:
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
         """What is known of channels: no line is drawn from one end of a full turn to the other."""
         every = list(facts)
-        turning = {one.key for one in every if one.full_turn}
-        self._turning = (self._turning - {one.key for one in every}) | turning
+        turning = {facts.key for facts in every if facts.full_turn}
+        self._turning = (self._turning - {facts.key for facts in every}) | turning
 
     def event(self, event: str, **facts: Any) -> None:
         """Something happened: a node, a measurement, a link, a step; told to every client in order."""
@@ -201,18 +201,20 @@ class Live:
             return {}
         touched = self._put_aside(blocks)
         out: dict[str, list[list[float | None]]] = {}
-        for key, one in self._channels.items():
-            one.credit = min(_CREDIT, one.credit + POINTS * seconds)
+        for key, channel in self._channels.items():
+            channel.credit = min(_CREDIT, channel.credit + POINTS * seconds)
             if key not in touched or not self._listeners:
-                one.times, one.values = [], []
+                channel.times, channel.values = [], []
                 continue
-            times, values = np.concatenate(one.times), np.concatenate(one.values)
-            one.times, one.values = [], []
+            times, values = np.concatenate(channel.times), np.concatenate(channel.values)
+            channel.times, channel.values = [], []
             turning = key in self._turning
-            times, values = thinned(times, values, int(one.credit), **({"before": one.before} if turning else {}))
+            times, values = thinned(
+                times, values, int(channel.credit), **({"before": channel.before} if turning else {})
+            )
             if len(values):
-                one.before = float(values[-1])
-            one.credit -= len(times)
+                channel.before = float(values[-1])
+            channel.credit -= len(times)
             self.values += len(times)
             if len(times):
                 numbers = [float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()]

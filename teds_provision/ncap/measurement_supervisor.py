@@ -124,7 +124,10 @@ class MeasurementSupervisor:
         """
         NodeMatch.parse(expression).require_groups(self._station)
         same = (expression, rate, frozen)
-        if any((one.match, one.rate, one.frozen) == same for one in self._station.measurements.due()):
+        if any(
+            (measurement.match, measurement.rate, measurement.frozen) == same
+            for measurement in self._station.measurements.due()
+        ):
             return  # it is kept already
         self._begin(KeptMeasurement("run", match=expression, rate=rate, frozen=frozen, dead_man=self._dead_man))
 
@@ -142,8 +145,14 @@ class MeasurementSupervisor:
         """A node that is measured unverified is nobody's for the length of the block, in which it may be signed."""
         loan = NodeLoan(uuid, why)
         with self._guard:
-            every = [one for one in self._running.values() if one.newcomers is not None and uuid in one.uuids]
-        mine = [one.newcomers for one in every if one.kept.id == UnsignedNodes.text and one.newcomers is not None]
+            every = [
+                running for running in self._running.values() if running.newcomers is not None and uuid in running.uuids
+            ]
+        mine = [
+            running.newcomers
+            for running in every
+            if running.kept.id == UnsignedNodes.text and running.newcomers is not None
+        ]
         with self._lending:
             self._loans.setdefault(uuid, []).append(loan)
         try:
@@ -159,14 +168,14 @@ class MeasurementSupervisor:
     def on_sighting(self, uuid: str) -> None:
         """A node answered on a bus; called before anybody else looks at it."""
         with self._guard:
-            every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
+            every = [running.newcomers for running in self._running.values() if running.newcomers is not None]
         for newcomers in every:
             newcomers.on_sighting(uuid)
 
     def look_who_is_meant(self) -> None:
         """Who may be measured, or what an expression names, changed in this process: a group, a key, a datasheet."""
         with self._guard:
-            every = [one.newcomers for one in self._running.values() if one.newcomers is not None]
+            every = [running.newcomers for running in self._running.values() if running.newcomers is not None]
         for newcomers in every:
             newcomers.look_who_is_meant()
 
@@ -174,10 +183,10 @@ class MeasurementSupervisor:
         """End all of them in order; what is kept stays kept."""
         with self._guard:
             every = list(self._running.values())
-        for one in every:
-            one.stop.set()
-        for one in every:
-            self._end(one)
+        for running in every:
+            running.stop.set()
+        for running in every:
+            self._end(running)
 
     # -- what the API asks -------------------------------------------------------------------------------------------
 
@@ -245,7 +254,7 @@ class MeasurementSupervisor:
             with self._station.durable("measure"):
                 kept = self._station.measurements.keep(kept)
                 self._station.audit(
-                    "measure", None, "begun", id=kept.id, group=group or match, nodes=[one.hex() for one in nodes]
+                    "measure", None, "begun", id=kept.id, group=group or match, nodes=[node.hex() for node in nodes]
                 )
             return self._json(self._begin(kept))
 
@@ -267,7 +276,7 @@ class MeasurementSupervisor:
             return
         kind = None if kept.kind is None else StreamKind[kept.kind.upper()]
         channels = Sheet.from_image(image).channels
-        if self._sinks.moves(kept) and channels and all(one.actuator for one in channels):
+        if self._sinks.moves(kept) and channels and all(channel.actuator for channel in channels):
             return  # it has nothing to measure; set points come for it
         for channel in sensors_of(channels, kept.channels, kind):
             period_of(channel, kept.rate)
@@ -298,7 +307,7 @@ class MeasurementSupervisor:
         """Return every one: those that run here, then those that commands of this home run."""
         with self._guard:
             every = list(self._running.values())
-        return [*(self._json(one) for one in every), *(self._json(one) for one in self._of_commands())]
+        return [*(self._json(running) for running in every), *(self._json(running) for running in self._of_commands())]
 
     def _of_commands(self) -> list[RunningMeasurement]:
         """Return those of commands that live, to be shown; the nodes of one whose group is gone are not known."""
@@ -313,7 +322,7 @@ class MeasurementSupervisor:
     def measurement_of(self, uuid: str) -> str | None:
         """The measurement that has a node."""
         with self._guard:
-            return next((key for key, one in self._running.items() if uuid in one.uuids), None)
+            return next((key for key, running in self._running.items() if uuid in running.uuids), None)
 
     def is_measured(self, uuid: str) -> bool:
         """Whether a node is in a session of a measurement now."""
@@ -329,11 +338,11 @@ class MeasurementSupervisor:
     def group_is_measured(self, name: str) -> bool:
         """Whether a measurement of this group runs."""
         with self._guard:
-            return any(one.kept.group == name for one in self._running.values())
+            return any(running.kept.group == name for running in self._running.values())
 
     def _job_of(self, uuid: str) -> MeasurementJob | None:
         with self._guard:
-            return next((one.job for one in self._running.values() if uuid in one.uuids), None)
+            return next((running.job for running in self._running.values() if uuid in running.uuids), None)
 
     @contextmanager
     def session(self, uuid: str) -> Iterator[VerifiedSession | None]:
@@ -412,12 +421,12 @@ class MeasurementSupervisor:
     def sinks(self) -> list[dict[str, Any]]:
         """Every sink with what became of what it was given."""
         with self._guard:
-            jobs = [(key, one.job) for key, one in self._running.items() if one.job is not None]
+            jobs = [(key, running.job) for key, running in self._running.items() if running.job is not None]
         return [sink_json(key, sink) for key, job in jobs for sink in job.sinks]
 
     def budget(self) -> dict[str, Any]:
         """Messages a second that go to ROS and MQTT now, and how many are known to be carried."""
-        now, sent = time.monotonic(), sum(one["messages"] for one in self.sinks() if not one["recorder"])
+        now, sent = time.monotonic(), sum(sink["messages"] for sink in self.sinks() if not sink["recorder"])
         before, count = self._messages
         if now - before >= 1.0:
             self._rate = max(0, sent - count) / (now - before)
@@ -427,20 +436,22 @@ class MeasurementSupervisor:
     def clock_error(self) -> float | None:
         """The worst bound of a node's clock, seconds; None where nothing is measured."""
         with self._guard:
-            reports = [report for one in self._running.values() for report in one.reports.values()]
+            reports = [report for running in self._running.values() for report in running.reports.values()]
         found = [report.get("clock_error") for report in reports if report["state"] == "running"]
-        return max((one for one in found if one is not None), default=None)
+        return max((chosen for chosen in found if chosen is not None), default=None)
 
-    def _json(self, one: RunningMeasurement) -> dict[str, Any]:
-        kept = one.kept
+    def _json(self, running: RunningMeasurement) -> dict[str, Any]:
+        kept = running.kept
         with self._guard:
-            left = [uuid for uuid in one.reports if uuid not in one.past] if one.newcomers is not None else []
+            left = (
+                [uuid for uuid in running.reports if uuid not in running.past] if running.newcomers is not None else []
+            )
         return {
             "id": kept.id,
             "group": kept.group,
             "match": kept.match,
             "frozen": kept.frozen,
-            "uuids": list(one.uuids),
+            "uuids": list(running.uuids),
             "channels": list(kept.channels),
             "rate": kept.rate,
             "kind": kept.kind,
@@ -452,13 +463,15 @@ class MeasurementSupervisor:
             "scalar_rate": kept.scalar_rate,
             "owner": kept.owner,
             "process": None if kept.pid is None else {"id": kept.pid, "started": kept.started},
-            "state": one.state,
-            "why": one.why,
+            "state": running.state,
+            "why": running.why,
             "nodes": [
-                one.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""})
-                for uuid in (dict.fromkeys((*one.uuids, *left)) if kept.lasting else ())
+                running.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""})
+                for uuid in (dict.fromkeys((*running.uuids, *left)) if kept.lasting else ())
             ],
-            "files": [str(file) for sink in (one.job.sinks if one.job is not None else ()) for file in sink.files],
+            "files": [
+                str(file) for sink in (running.job.sinks if running.job is not None else ()) for file in sink.files
+            ],
         }
 
     # -- running -----------------------------------------------------------------------------------------------------
@@ -474,63 +487,63 @@ class MeasurementSupervisor:
         one.thread.start()
         return one
 
-    def _run(self, one: RunningMeasurement) -> None:
+    def _run(self, running: RunningMeasurement) -> None:
         """Measure until it is stopped or its time is over; again from the start after its nodes were replaced."""
-        while self._run_with_members(one):
-            if not self._take_new_members(one):
+        while self._run_with_members(running):
+            if not self._take_new_members(running):
                 return
 
-    def _take_new_members(self, one: RunningMeasurement) -> bool:
+    def _take_new_members(self, running: RunningMeasurement) -> bool:
         """Read again which nodes a measurement has; False if it is not kept any more, because none is left."""
         try:
-            kept = self._station.measurements.get(one.kept.id)
+            kept = self._station.measurements.get(running.kept.id)
             uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
         except NotFoundError as error:
-            self._publish_state(one, "ended", error.message)
+            self._publish_state(running, "ended", error.message)
             with self._guard:
-                self._running.pop(one.kept.id, None)
-            self._live.event("measurement", state="deleted", id=one.kept.id)
+                self._running.pop(running.kept.id, None)
+            self._live.event("measurement", state="deleted", id=running.kept.id)
             return False
         with self._guard:
-            one.kept, one.uuids = kept, uuids
-            one.reports = {uuid: report for uuid, report in one.reports.items() if uuid in uuids}
+            running.kept, running.uuids = kept, uuids
+            running.reports = {uuid: report for uuid, report in running.reports.items() if uuid in uuids}
         return True
 
-    def _has_other_members(self, one: RunningMeasurement, job: MeasurementJob) -> bool:
+    def _has_other_members(self, running: RunningMeasurement, job: MeasurementJob) -> bool:
         """True if `replace` or `decommission` changed the nodes of a measurement in the store."""
-        if one.kept.match is not None or one.kept.frozen:
+        if running.kept.match is not None or running.kept.frozen:
             return False
-        kept = next((kept for kept in self._station.measurements.all() if kept.id == one.kept.id), None)
+        kept = next((kept for kept in self._station.measurements.all() if kept.id == running.kept.id), None)
         if kept is None:  # deleted by `decommission`, unless it came to its end
-            return job.kept.ends is None and not one.stop.is_set()
+            return job.kept.ends is None and not running.stop.is_set()
         try:
-            return {uuid.hex() for uuid in self._station.measurements.nodes_of(kept)} != set(one.uuids)
+            return {uuid.hex() for uuid in self._station.measurements.nodes_of(kept)} != set(running.uuids)
         except NotFoundError:
             return True
 
-    def _run_with_members(self, one: RunningMeasurement) -> bool:
+    def _run_with_members(self, running: RunningMeasurement) -> bool:
         """Take the nodes, then measure; True if the measurement has other nodes now, and is to begin again."""
         taken: list[str] = []
         try:
-            self._wait_for_members(one)
-            for uuid in one.uuids:
-                self._wait_for_turn(one, uuid)
-                if one.stop.is_set():
+            self._wait_for_members(running)
+            for uuid in running.uuids:
+                self._wait_for_turn(running, uuid)
+                if running.stop.is_set():
                     return False
                 taken.append(uuid)
-                self._roster.note(uuid, measurement=one.kept.id)
-            job = one.job = self._new_job(one)
-            self._publish_state(one, "starting")
-            job.start(self._buses, self._watcher(one))
-            while job.alive and not one.stop.wait(0.5):
-                self._publish_state(one, *_state_of(one, job))
-                if self._has_other_members(one, job):
+                self._roster.note(uuid, measurement=running.kept.id)
+            job = running.job = self._new_job(running)
+            self._publish_state(running, "starting")
+            job.start(self._buses, self._watcher(running))
+            while job.alive and not running.stop.wait(0.5):
+                self._publish_state(running, *_state_of(running, job))
+                if self._has_other_members(running, job):
                     job.stop()
                     return True
             job.stop()
-            self._publish_state(one, "ended")
+            self._publish_state(running, "ended")
         except TedsProvisionError as error:
-            self._publish_state(one, "failed", error.message)
+            self._publish_state(running, "failed", error.message)
         finally:
             for uuid in taken:
                 self._turns.release(uuid)
@@ -542,28 +555,28 @@ class MeasurementSupervisor:
             return self._unverified if kept.id == UnsignedNodes.text else ListedNodes(self._adopted)
         return NodeMatch.parse(kept.match or "")
 
-    def _is_for(self, uuid: str, one: RunningMeasurement) -> bool:
+    def _is_for(self, uuid: str, running: RunningMeasurement) -> bool:
         """Whether a node is another measurement's: what nobody has signed is that of what is unverified."""
-        if self._unverified is None or one.kept.id == UnsignedNodes.text:
+        if self._unverified is None or running.kept.id == UnsignedNodes.text:
             return False
         return not self._unverified.why_not(self._station, bytes.fromhex(uuid))
 
-    def _new_job(self, one: RunningMeasurement, *, unverified: bool = False) -> MeasurementJob:
+    def _new_job(self, running: RunningMeasurement, *, unverified: bool = False) -> MeasurementJob:
         return MeasurementJob(
             self._station,
-            one.kept,
-            more=lambda take: self._sinks.more(one.kept, take),
-            admits=self._admits if self._sinks.moves(one.kept) else None,
+            running.kept,
+            more=lambda take: self._sinks.more(running.kept, take),
+            admits=self._admits if self._sinks.moves(running.kept) else None,
             request=MeasurementRequest(patient=True, by="ncap", unverified=unverified),
             opened=self._sinks.open,
         )
 
-    def _wait_for_members(self, one: RunningMeasurement) -> None:
+    def _wait_for_members(self, running: RunningMeasurement) -> None:
         """Who is meant by a frozen expression, as soon as somebody is: then they stay."""
-        if one.kept.match is None:
+        if running.kept.match is None:
             return
-        match = NodeMatch.parse(one.kept.match)
-        while not one.stop.is_set():
+        match = NodeMatch.parse(running.kept.match)
+        while not running.stop.is_set():
             found = dict.fromkeys(uuid for uuid, *_ in self._station.keys.all_key_names())
             meant = [
                 uuid
@@ -574,48 +587,48 @@ class MeasurementSupervisor:
                 and self.measurement_of(uuid.hex()) is None
             ]
             if meant:
-                one.uuids = tuple(uuid.hex() for uuid in meant)
-                one.kept = replace(one.kept, match=None, uuids=tuple(meant), actuators=False)
+                running.uuids = tuple(uuid.hex() for uuid in meant)
+                running.kept = replace(running.kept, match=None, uuids=tuple(meant), actuators=False)
                 return
-            self._publish_state(one, "waiting", match.unknown_type(self._station) or "no known node matches")
-            one.stop.wait(1.0)
+            self._publish_state(running, "waiting", match.unknown_type(self._station) or "no known node matches")
+            running.stop.wait(1.0)
 
-    def _run_open(self, one: RunningMeasurement) -> None:
+    def _run_open(self, running: RunningMeasurement) -> None:
         """Measure whoever comes until it is stopped.
 
         One measurement whose nodes come and go, so that its recordings and topics go on: one for each node would make
         a file each, and have no budget in common.
         """
-        assert one.kept.match is not None
+        assert running.kept.match is not None
 
         def joined(uuid: str) -> None:
             with self._guard:
-                one.uuids = (*one.uuids, uuid)
-                one.past.discard(uuid)
-            self._roster.note(uuid, measurement=one.kept.id)
+                running.uuids = (*running.uuids, uuid)
+                running.past.discard(uuid)
+            self._roster.note(uuid, measurement=running.kept.id)
             if unverified:  # signed later, it is measured on by the other of the two that unverified() begins
                 self._adopted.add(bytes.fromhex(uuid))
 
         def left(uuid: str) -> None:
             with self._guard:
-                there = uuid in one.uuids
-                one.uuids = tuple(other for other in one.uuids if other != uuid)
+                there = uuid in running.uuids
+                running.uuids = tuple(other for other in running.uuids if other != uuid)
             if there:
                 self._roster.note(uuid, "idle", measurement=None, report=None)
 
         def past(uuid: str) -> None:
             with self._guard:
-                one.past.add(uuid)
+                running.past.add(uuid)
 
         def waiting(uuid: str, why: str) -> None:
             with self._guard:
-                one.past.discard(uuid)
-            one.reports[uuid] = {"uuid": uuid, "state": "waiting", "why": why}
-            self._live.event("measurement", state="waiting", id=one.kept.id, uuid=uuid, why=why)
+                running.past.discard(uuid)
+            running.reports[uuid] = {"uuid": uuid, "state": "waiting", "why": why}
+            self._live.event("measurement", state="waiting", id=running.kept.id, uuid=uuid, why=why)
 
         try:
-            unverified = one.kept.id == UnsignedNodes.text
-            job = one.job = self._new_job(one, unverified=unverified)
+            unverified = running.kept.id == UnsignedNodes.text
+            job = running.job = self._new_job(running, unverified=unverified)
             live = [sink for sink in job.sinks if not sink.recorder]  # a file takes what comes: no budget is for it
             newcomers = DynamicMembership(
                 self._station,
@@ -623,9 +636,9 @@ class MeasurementSupervisor:
                 self._turns,
                 self._buses,
                 job,
-                self._who(one.kept),
+                self._who(running.kept),
                 elsewhere=lambda uuid: (
-                    self.measurement_of(uuid) is not None or uuid in self._loans or self._is_for(uuid, one)
+                    self.measurement_of(uuid) is not None or uuid in self._loans or self._is_for(uuid, running)
                 ),
                 joined=joined,
                 left=left,
@@ -634,48 +647,48 @@ class MeasurementSupervisor:
                 budget=BUDGET if live else None,
                 rows=any(sink.wants_rows for sink in live),
             )
-            one.newcomers = newcomers
+            running.newcomers = newcomers
         except TedsProvisionError as error:
-            self._publish_state(one, "failed", error.message)
+            self._publish_state(running, "failed", error.message)
             return
-        self._publish_state(one, "starting")
-        job.start(self._buses, self._watcher(one))
-        unknown = NodeMatch.parse(one.kept.match).unknown_type(self._station)
+        self._publish_state(running, "starting")
+        job.start(self._buses, self._watcher(running))
+        unknown = NodeMatch.parse(running.kept.match).unknown_type(self._station)
         try:
-            while job.alive and not one.stop.is_set():
+            while job.alive and not running.stop.is_set():
                 newcomers.work()
-                self._publish_state(one, *_state_of_open(one, job, unknown))
+                self._publish_state(running, *_state_of_open(running, job, unknown))
         finally:
             job.stop()
             newcomers.end()
-            self._publish_state(one, "ended")
+            self._publish_state(running, "ended")
 
-    def _wait_for_turn(self, one: RunningMeasurement, uuid: str) -> None:
-        while not one.stop.is_set():
+    def _wait_for_turn(self, running: RunningMeasurement, uuid: str) -> None:
+        while not running.stop.is_set():
             try:
-                self._turns.acquire(uuid, f"measurement {one.kept.id}", frozen=True)
+                self._turns.acquire(uuid, f"measurement {running.kept.id}", frozen=True)
                 return
             except TedsProvisionError as error:
-                self._publish_state(one, "waiting", error.message)
-                one.stop.wait(1.0)
+                self._publish_state(running, "waiting", error.message)
+                running.stop.wait(1.0)
 
-    def _end(self, one: RunningMeasurement) -> None:
-        thread = one.thread
+    def _end(self, running: RunningMeasurement) -> None:
+        thread = running.thread
         if thread is not None:
             thread.join(20.0)
         with self._guard:
-            self._running.pop(one.kept.id, None)
+            self._running.pop(running.kept.id, None)
 
-    def _publish_state(self, one: RunningMeasurement, state: str, why: str = "") -> None:
-        if (one.state, one.why) != (state, why):
-            one.state, one.why = state, why
-            self._live.event("measurement", state=state, id=one.kept.id, group=one.kept.group, why=why)
+    def _publish_state(self, running: RunningMeasurement, state: str, why: str = "") -> None:
+        if (running.state, running.why) != (state, why):
+            running.state, running.why = state, why
+            self._live.event("measurement", state=state, id=running.kept.id, group=running.kept.group, why=why)
 
     # -- what it hears -----------------------------------------------------------------------------------------------
 
-    def _watcher(self, one: RunningMeasurement) -> Watcher:
+    def _watcher(self, running: RunningMeasurement) -> Watcher:
         def report(said: NodeReport) -> None:
-            self._report(one, said)
+            self._report(running, said)
 
         def facts(said: Sequence[ChannelFacts]) -> None:
             self._live.learn(said)
@@ -684,10 +697,10 @@ class MeasurementSupervisor:
                 self._roster.refresh([uuid])
 
         def sink(failed: Sink) -> None:
-            self._live.event("sink", **sink_json(one.kept.id, failed))
+            self._live.event("sink", **sink_json(running.kept.id, failed))
 
         def note(text: str) -> None:
-            self._live.event("measurement", state="note", id=one.kept.id, why=text)
+            self._live.event("measurement", state="note", id=running.kept.id, why=text)
 
         def read(uuid: bytes) -> None:
             self._roster.refresh([uuid.hex()])
@@ -695,33 +708,33 @@ class MeasurementSupervisor:
 
         return Watcher(self._live.block, facts, report, sink, note, read)
 
-    def _report(self, one: RunningMeasurement, said: NodeReport) -> None:
+    def _report(self, running: RunningMeasurement, said: NodeReport) -> None:
         names = ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid", "clock_error")
         report = {name: getattr(said, name) for name in names}
-        report["invalid_why"] = [asdict(one) for one in said.invalid_why]
-        before = one.reports.get(said.uuid, {})
-        one.reports[said.uuid] = report
+        report["invalid_why"] = [asdict(invalid) for invalid in said.invalid_why]
+        before = running.reports.get(said.uuid, {})
+        running.reports[said.uuid] = report
         changed = (before.get("state"), before.get("why")) != (said.state, said.why)
         if changed:
-            self._tell_who_comes(one, said, before.get("state"))
+            self._tell_who_comes(running, said, before.get("state"))
         facts: dict[str, Any] = {"report": report}
         if said.state == "running":
             facts |= {"present": True, "seen": time.time(), "problem": None}
             if before.get("state") != "running":
                 facts |= {"heard": None, "looked": time.time()}  # in a session: what it said outside one is past
-        elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, one):
+        elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, running):
             facts["problem"] = as_problem(TedsProvisionError(said.why))
         if changed:
             self._roster.refresh([said.uuid])
         self._roster.note(said.uuid, said.state if changed else None, **facts)
-        if changed and one.job is not None and not one.stop.is_set() and one.newcomers is None:
-            self._publish_state(one, *_state_of(one, one.job))
+        if changed and running.job is not None and not running.stop.is_set() and running.newcomers is None:
+            self._publish_state(running, *_state_of(running, running.job))
 
-    def _is_of(self, uuid: str, one: RunningMeasurement) -> bool:
+    def _is_of(self, uuid: str, running: RunningMeasurement) -> bool:
         """Whether a node is this measurement's, or nobody's: what one that it has left says of it is past."""
-        return self.measurement_of(uuid) in (None, one.kept.id)
+        return self.measurement_of(uuid) in (None, running.kept.id)
 
-    def _tell_who_comes(self, one: RunningMeasurement, said: NodeReport, before: str | None) -> None:
+    def _tell_who_comes(self, running: RunningMeasurement, said: NodeReport, before: str | None) -> None:
         """An event for each node that begins to be measured, is not any more, or waits, and why."""
         if said.state == "running" and before != "running":
             state = "joined"
@@ -731,30 +744,30 @@ class MeasurementSupervisor:
             state = "waiting"
         else:
             return
-        ended = state == "left" and one.stop.is_set()
+        ended = state == "left" and running.stop.is_set()
         why = said.why or ("the measurement ended" if ended else "")
-        self._live.event("measurement", state=state, id=one.kept.id, uuid=said.uuid, why=why)
+        self._live.event("measurement", state=state, id=running.kept.id, uuid=said.uuid, why=why)
 
 
-def _state_of_open(one: RunningMeasurement, job: MeasurementJob, unknown: str) -> tuple[str, str]:
-    if any(one.reports.get(uuid, {}).get("state") == "running" for uuid in one.uuids):
+def _state_of_open(running: RunningMeasurement, job: MeasurementJob, unknown: str) -> tuple[str, str]:
+    if any(running.reports.get(uuid, {}).get("state") == "running" for uuid in running.uuids):
         return "running", ""
     if job.error is not None:
         return "waiting", job.error.message
-    taken = one.newcomers.taken if one.newcomers is not None else 0
+    taken = running.newcomers.taken if running.newcomers is not None else 0
     if taken:
         return "waiting", f"{taken} matching node{'s are' if taken > 1 else ' is'} measured by another measurement"
-    return "waiting", (unknown if not one.reports else "") or "no matching node is present"
+    return "waiting", (unknown if not running.reports else "") or "no matching node is present"
 
 
-def _state_of(one: RunningMeasurement, job: MeasurementJob) -> tuple[str, str]:
-    states = {report["state"] for report in one.reports.values()}
+def _state_of(running: RunningMeasurement, job: MeasurementJob) -> tuple[str, str]:
+    states = {report["state"] for report in running.reports.values()}
     if "running" in states:
-        lacking = [uuid for uuid in one.uuids if one.reports.get(uuid, {}).get("state") != "running"]
-        return "running", f"{len(lacking)} of {len(one.uuids)} nodes are missing" if lacking else ""
+        lacking = [uuid for uuid in running.uuids if running.reports.get(uuid, {}).get("state") != "running"]
+        return "running", f"{len(lacking)} of {len(running.uuids)} nodes are missing" if lacking else ""
     if job.error is not None:
         return "waiting", job.error.message
-    refused = sum(report["state"] == "refused" for report in one.reports.values())
+    refused = sum(report["state"] == "refused" for report in running.reports.values())
     if refused:
-        return "waiting", f"{refused} of {len(one.uuids)} nodes are refused"
+        return "waiting", f"{refused} of {len(running.uuids)} nodes are refused"
     return ("waiting", "no node has answered yet") if states else ("starting", "")

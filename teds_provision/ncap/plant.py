@@ -89,23 +89,23 @@ class PlantWatch:
             "to_rotate": plant.removed_members.rotations_due(self._station),
             "stations": [
                 {
-                    "name": one.name,
-                    "fingerprint": one.fingerprint,
-                    "roles": list(one.roles),
-                    "page": one.n,
-                    "age": one.age,
-                    "state": one.state,
+                    "name": standing.name,
+                    "fingerprint": standing.fingerprint,
+                    "roles": list(standing.roles),
+                    "page": standing.n,
+                    "age": standing.age,
+                    "state": standing.state,
                 }
-                for one in found.standings
+                for standing in found.standings
             ],
             "conflicts": [
                 {"uuid": uuid.hex(), "conflict": name, "detail": detail}
                 for uuid, name, detail in self._station.plant.tables.conflicts()
             ],
             "alarms": [
-                {"code": one.code, "about": roster.name_of(one.about) if one.about else "", "why": one.why,
-                 "at": one.at, "seen": one.seen}
-                for one in found.alarms
+                {"code": alarm.code, "about": roster.name_of(alarm.about) if alarm.about else "", "why": alarm.why,
+                 "at": alarm.at, "seen": alarm.seen}
+                for alarm in found.alarms
             ],
         }  # fmt: skip
 
@@ -187,7 +187,7 @@ class PlantWatch:
         if record is None or roster is None:
             return
         found = plant.status.status(self._station, record, roster)
-        alarms = [one for one in found.alarms if not one.seen]
+        alarms = [alarm for alarm in found.alarms if not alarm.seen]
         if alarms:
             self._publish_state("alarm", f"{alarms[-1].code}: {alarms[-1].why}")
         elif found.expired:

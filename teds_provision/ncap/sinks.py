@@ -140,4 +140,4 @@ def for_readers(told: Any) -> Any:
         return _FOLDERS.sub("", _QUERY.sub(r"\1", _USER.sub(r"\1", told))) if "/" in told else told
     if isinstance(told, dict):
         return {key: for_readers(value) for key, value in told.items()}
-    return [for_readers(one) for one in told] if isinstance(told, list | tuple) else told
+    return [for_readers(sink) for sink in told] if isinstance(told, list | tuple) else told

@@ -79,7 +79,7 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
         if roster.registry == registry:
             read.setdefault(roster.hash, roster)
     known = {row.hash for row in station.plant.tables.rosters()}
-    for roster in sorted(read.values(), key=lambda one: (one.version, one.hash)):
+    for roster in sorted(read.values(), key=lambda roster: (roster.version, roster.hash)):
         own = station.plant.roster
         how, why = taking(roster, own, registry)
         if roster.created > now() + MOST_AHEAD:
@@ -95,9 +95,9 @@ def take_rosters(station: Station, found: Iterable[bytes]) -> list[tuple[Roster,
             alarm(station, "two-rosters", "", roster.version, why)
     held = station.plant.roster
     if held is not None:  # the next version is the cure
-        for one in station.plant.tables.alarms():
-            if one.code == "two-rosters" and one.n < held.version and not one.seen:
-                station.plant.tables.end_alarm(one)
+        for raised in station.plant.tables.alarms():
+            if raised.code == "two-rosters" and raised.n < held.version and not raised.seen:
+                station.plant.tables.end_alarm(raised)
     return told
 
 
@@ -110,8 +110,8 @@ def put_roster(station: Station, roster: Roster) -> None:
         for member in roster.members:  # so that it can be handed keys without the CA key being here
             station.identity.keep_certificate(station.ca, member.point, member.certificate)
         station.audit("registry", None, "roster", version=roster.version, hash=roster.hash)
-        for one, chain in station.plant.tables.chains().items():
-            if before is None or _last(before, one) != _last(roster, one):
+        for station_id, chain in station.plant.tables.chains().items():
+            if before is None or _last(before, station_id) != _last(roster, station_id):
                 recount(station, chain, roster)
         station.plant.tables.queue_judging_of_all()
 
@@ -183,26 +183,28 @@ def _events_of(page: PageRow) -> list[object]:
 def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object]) -> None:
     """Add the events of the next page that counts to what its station claims."""
     tables = station.plant.tables
-    read = [one for one in map(event.read, values) if one is not None]
-    wrong = [one for one in read if isinstance(one, str)]
-    events = [one for one in read if isinstance(one, Event)]
-    known = tables.known_ids(chain.chain, [_number(one.id) for one in events])
+    read = [stated for stated in map(event.read, values) if stated is not None]
+    wrong = [stated for stated in read if isinstance(stated, str)]
+    events = [stated for stated in read if isinstance(stated, Event)]
+    known = tables.known_ids(chain.chain, [_number(stated.id) for stated in events])
     by_node: dict[bytes, list[Event]] = {}
     digests: list[tuple[bytes, int, bool, bytes | None]] = []
-    for one in events:
-        number = _number(one.id)
+    for stated in events:
+        number = _number(stated.id)
         if number in known:
-            wrong.append(f"{one.act}: an id that stood before")
+            wrong.append(f"{stated.act}: an id that stood before")
             continue
         known.add(number)
-        if one.act in ("signed", "vouched"):
-            digest = one.members["teds_sha256"]
-            digests.append((bytes.fromhex(digest), n, one.act == "vouched", seal_of_digest(station, chain, n, one)))
-        elif one.act == "lifted":
-            hash = one.members["of"]
+        if stated.act in ("signed", "vouched"):
+            digest = stated.members["teds_sha256"]
+            digests.append(
+                (bytes.fromhex(digest), n, stated.act == "vouched", seal_of_digest(station, chain, n, stated))
+            )
+        elif stated.act == "lifted":
+            hash = stated.members["of"]
             tables.put_lifting(hash, chain.chain, station.row_macs.note("plant lifted", f"{hash} {chain.station}"))
-        if one.uuid is not None:
-            by_node.setdefault(one.uuid, []).append(one)
+        if stated.uuid is not None:
+            by_node.setdefault(stated.uuid, []).append(stated)
     tables.add_ids(chain.chain, known)
     tables.put_digests(chain.chain, digests)
     _keep_bans(station, chain, events, counts=True)
@@ -210,8 +212,8 @@ def _fold_page(station: Station, chain: Chain, n: int, values: Sequence[object])
     claims: dict[bytes, str] = {}
     for uuid, said in by_node.items():
         claim = Claim.from_json(there[uuid]) if uuid in there else Claim()
-        for one in said:
-            claim.apply_event(one)
+        for stated in said:
+            claim.apply_event(stated)
         claims[uuid] = claim.to_json()
     tables.put_claims(chain.chain, claims)
     if wrong:
@@ -224,9 +226,9 @@ def _number(id: str) -> int:
     return int.from_bytes(bytes.fromhex(id), "big", signed=True)
 
 
-def seal_of_digest(station: Station, chain: Chain, n: int, one: Event) -> bytes:
+def seal_of_digest(station: Station, chain: Chain, n: int, stated: Event) -> bytes:
     """The seal of the row of a digest that was signed, or vouched for, on page ``n``."""
-    return station.row_macs.note("digest", f"{one.members['teds_sha256']} {chain.station} {n} {one.act}")
+    return station.row_macs.note("digest", f"{stated.members['teds_sha256']} {chain.station} {n} {stated.act}")
 
 
 def _keep_bans(station: Station, chain: Chain, values: Iterable[object], *, counts: bool) -> None:
@@ -308,19 +310,19 @@ def _judged(
             continue
         if read.uuid == uuid:
             said.setdefault(uuid, []).append(BanStatement(hash, page_of, counts, read))
-    lifted = {one.hash: _lifters(station, one.hash) for every in said.values() for one in every}
+    lifted = {statement.hash: _lifters(station, statement.hash) for every in said.values() for statement in every}
     judged = {}
     for uuid in uuids:
         statements = said.get(uuid, [])
-        own = here.own(station, uuid, [(one.hash, one.said.statement) for one in statements])
-        node = {one: Claim.from_json(claim) for one, claim in claims.get(uuid, {}).items()}
+        own = here.own(station, uuid, [(statement.hash, statement.said.statement) for statement in statements])
+        node = {station_id: Claim.from_json(claim) for station_id, claim in claims.get(uuid, {}).items()}
         judged[uuid] = merge_claims(roster, node, own, statements, lifted), statements
     return judged
 
 
 def _lifters(station: Station, hash: str) -> set[str]:
     rows = station.plant.tables.liftings_of(hash)
-    return {one for one, mac in rows if station.row_macs.noted("plant lifted", f"{hash} {one}", mac)}
+    return {lifter for lifter, mac in rows if station.row_macs.noted("plant lifted", f"{hash} {lifter}", mac)}
 
 
 def apply_claims(station: Station) -> int:
@@ -366,14 +368,14 @@ def _ban(station: Station, uuid: bytes, seen: MergedClaims, statements: Sequence
     entry = station.policy.revocation(uuid)
     if entry is not None and entry.statement:
         hash = event.hash_of_statement(entry.statement)
-        from_pages = any(one.hash == hash for one in statements)
-        counts = any(one.hash == hash for one in seen.bans)
+        from_pages = any(statement.hash == hash for statement in statements)
+        counts = any(statement.hash == hash for statement in seen.bans)
         if counts or (not from_pages and not _is_lifted(station, entry.statement, hash)):
             return
         station.policy.forgive(uuid)
         station.audit("revoke", uuid, "lifted", by="registry", why=entry.why)
-    for one in seen.bans[:1]:
-        deny.deny(station, one.said, key=station.pins.pinned(uuid))
+    for statement in seen.bans[:1]:
+        deny.deny(station, statement.said, key=station.pins.pinned(uuid))
 
 
 def _is_lifted(station: Station, statement: str, hash: str) -> bool:
@@ -383,7 +385,7 @@ def _is_lifted(station: Station, statement: str, hash: str) -> bool:
         signer = open_revocation(statement, lambda kid: roster.point_of(kid) or _own(station, kid)).sender
     except TedsProvisionError:
         return False
-    return any(one == signer or "keeper" in roster.roles_of(one) for one in _lifters(station, hash))
+    return any(lifter == signer or "keeper" in roster.roles_of(lifter) for lifter in _lifters(station, hash))
 
 
 def _own(station: Station, kid: str) -> bytes | None:
@@ -399,8 +401,8 @@ def heads_digest(station: Station) -> tuple[str, int]:
     Two stations that have all pages have the same one.
     """
     lines = sorted(
-        f"{one} {chain.counted[0]} {chain.counted[1]}\n".encode()
-        for one, chain in station.plant.tables.chains().items()
+        f"{station_id} {chain.counted[0]} {chain.counted[1]}\n".encode()
+        for station_id, chain in station.plant.tables.chains().items()
         if chain.counted[0]
     )
     return hashlib.sha256(b"".join(lines)).hexdigest()[:16], len(lines)

@@ -47,8 +47,10 @@ def check_database(station: Station, post: Transport) -> list[str]:
         return []
     post.sweep()
     doors, roster = post.open_doors(), station.plant.roster
-    left = {one.fingerprint: one.name for one in roster.removed} if roster is not None else {}
-    doors += [f"login of {left[one]}, which was removed" for one in post.open_logins() if one in left]
+    left = {removed.fingerprint: removed.name for removed in roster.removed} if roster is not None else {}
+    doors += [
+        f"login of {left[open_login]}, which was removed" for open_login in post.open_logins() if open_login in left
+    ]
     station.plant.tables.put_doors(doors)
     return doors
 

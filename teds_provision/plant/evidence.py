@@ -73,8 +73,8 @@ def export(tables: LineTables, rows: Iterable[EvidenceRow], folder: Path, *, wri
         make_folder(folder)
     for row in rows:
         if row.uuid not in numbers:
-            ordered = sorted(tables.evidence(uuid=row.uuid), key=lambda one: (one.finished, one.attempt, one.sha256))
-            numbers = {row.uuid: {one.sha256: number for number, one in enumerate(ordered, 1)}}
+            ordered = sorted(tables.evidence(uuid=row.uuid), key=lambda row: (row.finished, row.attempt, row.sha256))
+            numbers = {row.uuid: {row.sha256: number for number, row in enumerate(ordered, 1)}}
         path = folder / f"{row.uuid.hex()}.{numbers[row.uuid][row.sha256]}.json"
         files[path] = not holds(path, row.document)
         if files[path] and write:

@@ -39,13 +39,13 @@ def read_pages(carried: Iterable[CarriedPage], roster: Roster, station: str) -> 
     """Return the pages that a station signed among those under its name, and the numbers of those that it did not."""
     good: list[Page] = []
     junk: list[int] = []
-    for one in carried:
+    for carried_page in carried:
         try:
-            good.append(open_carried(one, roster, station))
+            good.append(open_carried(carried_page, roster, station))
         except NewerFormatError:
             raise
         except TedsProvisionError:
-            junk.append(one.n)
+            junk.append(carried_page.n)
     return good, junk
 
 
@@ -55,15 +55,15 @@ def fetch(station: Station, post: Transport, roster: Roster) -> int:
     Whatever is wrong with the pages of one station holds up no other's.
     """
     heads, fetched = post.heads(), 0
-    for one in roster.by_key:
-        if one == station.fingerprint or one not in heads:
+    for fingerprint in roster.by_key:
+        if fingerprint == station.fingerprint or fingerprint not in heads:
             continue
-        chain = station.plant.tables.chain(one)
+        chain = station.plant.tables.chain(fingerprint)
         newest = max((n for n, _, _ in station.plant.tables.page_names(chain.chain)), default=0)
-        taken = take_carried(station, roster, one, post.pages(one, newest))
+        taken = take_carried(station, roster, fingerprint, post.pages(fingerprint, newest))
         fetched += taken.pages
-        _report_junk(station, roster, one, [carried.n for carried in taken.junk], post)
-        note_waiting(station, one, taken)
+        _report_junk(station, roster, fingerprint, [carried.n for carried in taken.junk], post)
+        note_waiting(station, fingerprint, taken)
     return fetched
 
 
@@ -100,7 +100,7 @@ def take_carried(
         known.add(page.hash)
         batch.append(page)
         taken.pages += 1
-        if sum(len(each.events) for each in batch) >= EVENTS_AT_ONCE:
+        if sum(len(page.events) for page in batch) >= EVENTS_AT_ONCE:
             take_pages(station, roster, batch)
             batch = []
     take_pages(station, roster, batch)
@@ -117,8 +117,10 @@ def note_waiting(station: Station, author: str, taken: Taken) -> None:
         station.plant.tables.put_chain(replace(chain, waits=taken.waits))
 
 
-def _report_junk(station: Station, roster: Roster, one: str, junk: Sequence[int], post: Transport) -> None:
+def _report_junk(station: Station, roster: Roster, name: str, junk: Sequence[int], post: Transport) -> None:
     if not junk:
-        station.plant.tables.end_alarms("junk", one)
+        station.plant.tables.end_alarms("junk", name)
     for n in junk[:1]:
-        alarm(station, "junk", one, n, f"{post.where}: {len(junk)} pages of {roster.name_of(one)} that it did not sign")
+        alarm(
+            station, "junk", name, n, f"{post.where}: {len(junk)} pages of {roster.name_of(name)} that it did not sign"
+        )

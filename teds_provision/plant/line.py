@@ -220,9 +220,11 @@ class LineRun:
         assert self.job is not None
         days = self.job.calibration.max_age_days or 0
         now = datetime.now(UTC)
-        for number, one in (prepared.calibrations or {}).items():
-            if one.date is None or not now - timedelta(days=days) <= one.date <= now + timedelta(days=1):
-                when = "has no date" if one.date is None else f"is dated {one.date:%Y-%m-%d}"
+        for number, calibration in (prepared.calibrations or {}).items():
+            if calibration.date is None or not now - timedelta(days=days) <= calibration.date <= now + timedelta(
+                days=1
+            ):
+                when = "has no date" if calibration.date is None else f"is dated {calibration.date:%Y-%m-%d}"
                 raise PolicyError(
                     f"The calibration {path} of channel {number} {when}; the job allows at most {days} days."
                 )

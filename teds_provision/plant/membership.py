@@ -49,9 +49,9 @@ def found_roster(station: Station, post: Transport, octets: bytes | None) -> Ros
     held = station.plant.roster
     if held is not None:  # it belongs already, and changes what carries
         found.append(held)
-    for one in post.rosters() if octets is None else ():
+    for roster_octets in post.rosters() if octets is None else ():
         try:
-            found.append(open_roster(one, station.ca))
+            found.append(open_roster(roster_octets, station.ca))
         except TedsProvisionError:  # a post holds what anybody put there
             continue
     held = station.plant.roster
@@ -69,7 +69,7 @@ def found_roster(station: Station, post: Transport, octets: bytes | None) -> Ros
         raise PolicyError(
             f"{post.where} contains rosters of {len(registries)} registries.", hint="Choose one: --roster FILE"
         )
-    best = max(mine, key=lambda one: (one.version, one.hash))
+    best = max(mine, key=lambda roster: (roster.version, roster.hash))
     if best.expires <= now():
         raise RosterExpiredError(
             f"The roster of {best.name} expired on {best.expires:%Y-%m-%d}.",
@@ -168,9 +168,9 @@ def branch(station: Station, of: str, hash: str | None, post: Transport | None) 
     wanted = _among(branches, hash)
     if hash is None and post is not None and not post.everybody:
         shown = {carried.n: carried for carried in post.pages(of, n - 1)}
-        wanted = [one for one in branches if n in shown and hash_of(shown[n].octets) == one]
+        wanted = [branch for branch in branches if n in shown and hash_of(shown[n].octets) == branch]
     if len(wanted) != 1:
-        listed = ", ".join(one[:16] for one in branches)
+        listed = ", ".join(branch[:16] for branch in branches)
         raise PolicyError(
             f"Page {n} of {roster.name_of(of)} exists here twice: {listed}.", hint="Choose one: --page HASH"
         )

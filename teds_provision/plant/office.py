@@ -269,7 +269,10 @@ def _calibrations(job: Job, request: SignRequest, profile: Profile) -> dict[int,
     if rule.rule == "any":
         days = timedelta(days=rule.max_age_days or 0)
         now = datetime.now(UTC)
-        if any(one.date is None or not now - days <= one.date <= now + timedelta(days=1) for one in found.values()):
+        if any(
+            calibration.date is None or not now - days <= calibration.date <= now + timedelta(days=1)
+            for calibration in found.values()
+        ):
             raise _RefusedError("job", f"the calibration is older than {days.days} days, or has no date")
     return found
 

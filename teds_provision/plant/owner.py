@@ -123,7 +123,7 @@ def add(station: Station, request: MemberRequest, roles: frozenset[Role]) -> Ros
         if replace(there, signed=None) == member:
             return following(station)
         raise PolicyError(f"{there.name} is already a member.", hint="Change its roles: registry role")
-    if any(one.name == request.name for one in own.members):
+    if any(member.name == request.name for member in own.members):
         raise PolicyError(f"There is already a member called {request.name!r}.", hint="Choose another name: --name")
     return following(station, members=(*own.members, member))
 
@@ -143,7 +143,7 @@ def with_roles(station: Station, name: str, roles: frozenset[Role], last: Place 
     elif "sign" in member.roles:
         place = last if last is not None else station.plant.tables.chain(member.fingerprint).counted
     changed = replace(member, roles=roles, signed=place)
-    return following(station, members=tuple(changed if one is member else one for one in own.members))
+    return following(station, members=tuple(changed if current is member else current for current in own.members))
 
 
 def draft_removal(station: Station, name: str, why: Why, last: int | None) -> Roster:
@@ -164,10 +164,13 @@ def draft_removal(station: Station, name: str, why: Why, last: int | None) -> Ro
         )
     place = chain.counted if last is None else page_place(station, member.fingerprint, last)
     removed = RemovedMember(member.name, member.point, member.roles, why, place, member.signed)
-    members = tuple(one for one in own.members if one is not member)
-    share = tuple(replace(one, to=tuple(to for to in one.to if to != member.fingerprint)) for one in own.share)
+    members = tuple(current for current in own.members if current is not member)
+    share = tuple(replace(share, to=tuple(to for to in share.to if to != member.fingerprint)) for share in own.share)
     return following(
-        station, members=members, removed=(*own.removed, removed), share=tuple(one for one in share if one.to)
+        station,
+        members=members,
+        removed=(*own.removed, removed),
+        share=tuple(listed_share for listed_share in share if listed_share.to),
     )
 
 
@@ -196,13 +199,15 @@ def shared(station: Station, share: Share) -> Roster:
             raise PolicyError(
                 f"{own.name_of(to)} does not have the role 'base', so it cannot receive keys.", hint="registry role"
             )
-    return following(station, share=(*(one for one in own.share if one.what != share.what), share))
+    return following(
+        station, share=(*(listed_share for listed_share in own.share if listed_share.what != share.what), share)
+    )
 
 
 def unshared(station: Station, what: tuple[str, str]) -> Roster:
     """Draft a roster that shares these nodes no more."""
     own = require_roster(station)
-    return following(station, share=tuple(one for one in own.share if one.what != what))
+    return following(station, share=tuple(share for share in own.share if share.what != what))
 
 
 def renewed(station: Station, days: timedelta) -> Roster:
@@ -214,7 +219,7 @@ def require_member(roster: Roster, name: str) -> Member:
     """A member by name or fingerprint; raises NotFoundError."""
     found = roster.named(name)
     if not isinstance(found, Member):
-        known = ", ".join(one.name for one in roster.members)
+        known = ", ".join(member.name for member in roster.members)
         raise NotFoundError(f"{name!r} is not a member of {roster.name}.", hint=f"Members: {known}.")
     return found
 
@@ -260,8 +265,8 @@ def changes(before: Roster | None, after: Roster) -> list[str]:
             said.append(f"  removes {left.name} ({left.why}); its pages up to {left.last[0]} count")
             said.append(f"    {left.fingerprint}")
     shares = set(before.share) if before is not None else set()
-    said += [f"  shares {_share(one)} with {_names(after, one)}" for one in after.share if one not in shares]
-    said += [f"  shares {_share(one)} no more" for one in shares if one.what not in {n.what for n in after.share}]
+    said += [f"  shares {_share(share)} with {_names(after, share)}" for share in after.share if share not in shares]
+    said += [f"  shares {_share(share)} no more" for share in shares if share.what not in {n.what for n in after.share}]
     return said
 
 
@@ -270,5 +275,5 @@ def _share(share: Share) -> str:
 
 
 def _names(roster: Roster, share: Share) -> str:
-    names = ", ".join(roster.name_of(one) for one in share.to)
+    names = ", ".join(roster.name_of(receiver) for receiver in share.to)
     return names + (", and forgets them itself" if share.forget else "")

@@ -166,11 +166,11 @@ class _Reader:
             return "its nodes belong to another CA"
         later = ""
         for page in chunks(plan.taken):
-            held = self._unproven_of(bundle.sender, [one.node.uuid for one in page])
-            pins = self.station.pins.get_many([one.node.uuid for one in page])
-            seen = self.views([one.node.uuid for one in page])
-            for one in page:
-                node, pin = one.node, pins.get(one.node.uuid)
+            held = self._unproven_of(bundle.sender, [planned.node.uuid for planned in page])
+            pins = self.station.pins.get_many([planned.node.uuid for planned in page])
+            seen = self.views([planned.node.uuid for planned in page])
+            for planned in page:
+                node, pin = planned.node, pins.get(planned.node.uuid)
                 if any(key_id != node.kid for key_id in held.get(node.uuid, ())):
                     return f"{node.uuid.hex()}: a key of it from this sender was never proven"
                 offer = sharing.Offer(node.uuid, node.epoch, node.kid, fingerprint(node.node_key))
@@ -209,7 +209,7 @@ class _Reader:
                 for row in tables.parcels("out", "ready", "sent"):
                     if row.kind == "bundle" and row.about == receipt.id and row.peer == receipt.sender:
                         tables.turn_shared(row.id, "taken")
-                        tables.turn_shared(row.id, "refused", [one.uuid for one in receipt.refused])
+                        tables.turn_shared(row.id, "refused", [refused.uuid for refused in receipt.refused])
                         tables.drop_parcel(row.id, "out")
         return True
 
@@ -233,7 +233,7 @@ class _Reader:
 
     def _keep(self, row: ParcelRow, parcel: Parcel) -> bool | None:
         tables = self.station.plant.parcels
-        if sum(one.peer == row.peer for one in tables.parcels("in", "waiting", "later")) >= _KEPT:
+        if sum(parcel_row.peer == row.peer for parcel_row in tables.parcels("in", "waiting", "later")) >= _KEPT:
             return None
         with self.station.transaction():
             tables.put_parcel(row, parcel.octets)
@@ -242,9 +242,9 @@ class _Reader:
     def _refuse(self, error: incoming.NothingImportedError) -> None:
         """Say on the next page that nothing of a bundle was taken: it is never sent again for these keys."""
         with self.station.transaction():
-            for one in error.nodes:
-                told = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": one.why}
-                self.station.plant.record_event("refused", one.node.uuid, **told)
+            for planned in error.nodes:
+                told = {"bundle": error.bundle.id, "peer": error.bundle.sender, "why": planned.why}
+                self.station.plant.record_event("refused", planned.node.uuid, **told)
             self.station.audit("import", None, "refused", handover=error.bundle.id, why=error.message)
 
     def _junk(self, parcel: Parcel, error: TedsProvisionError) -> bool:
@@ -303,7 +303,9 @@ def send_export(station: Station, plan: outgoing.ExportPlan, now: datetime) -> s
     with station.transaction():
         outgoing.record_export(station, sealed)
         parcel = _put_out(station, "bundle", peer, sealed.octets, plan.id, expires=plan.expires)
-        station.plant.parcels.put_shared(((one.uuid, one.epoch) for one in plan.nodes), peer, parcel, "sent")
+        station.plant.parcels.put_shared(
+            ((leaving.uuid, leaving.epoch) for leaving in plan.nodes), peer, parcel, "sent"
+        )
     return parcel
 
 
@@ -369,7 +371,9 @@ def _expire(station: Station, now: datetime) -> None:
                 tables.forget_shared(row.id)
                 tables.drop_parcel(row.id, "out")
             if handover is not None and handover.mode == "move" and handover.state == pending.OPEN:
-                nodes = tuple(bytes.fromhex(one) for one in pending.BundleNotes.from_json(handover.nodes).uuids)
+                nodes = tuple(
+                    bytes.fromhex(uuid_hex) for uuid_hex in pending.BundleNotes.from_json(handover.nodes).uuids
+                )
                 order = outgoing.ExportOrder((row.peer,), nodes, "move")
                 with suppress(PolicyError, NotFoundError):  # revoked or forgotten since: `handover undo` says so
                     send_export(station, outgoing.plan_export(station, order, now), now)
@@ -417,7 +421,7 @@ def _due(
     own = _with_views(views, tables.unshared(receiver))
     gone = quiet or roster.removed  # else whoever made a key shares it
     others = _with_views(views, tables.unshared(receiver, imported=True)) if gone else iter(())
-    mine = (one for one in others if sharing.sharer(roster, one[3], (one[1], one[2]), quiet) == me)
+    mine = (other for other in others if sharing.sharer(roster, other[3], (other[1], other[2]), quiet) == me)
     for uuid, _, _, view in chain(own, mine):
         if sharing.shares_any(shares, view, me) and not sharing.gave_away(view, receiver):
             (disputed if view.conflicts else clear).append(uuid)

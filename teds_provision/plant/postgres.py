@@ -265,7 +265,7 @@ class Registry:
 
     def offered(self, offers: Sequence[Offer]) -> list[CarriedPage]:
         """The octets of some offers of one author, in one round trip."""
-        asked: list[tuple[str, int, str, str]] = [(one.station, one.n, one.hash, one.by) for one in offers]
+        asked: list[tuple[str, int, str, str]] = [(offer.station, offer.n, offer.hash, offer.by) for offer in offers]
         rows = self._rows(
             "select asked.place, coalesce(p.jws, f.jws) from"
             " unnest(%s::int[], %s::bytea[], %s::int[], %s::bytea[], %s::bytea[]) asked(place, author, n, hash, by)"
@@ -282,7 +282,9 @@ class Registry:
         )
         there = {place: jws for place, jws in rows if jws is not None}
         return [
-            CarriedPage(one.station, one.n, there[k].encode(), one.by) for k, one in enumerate(offers) if k in there
+            CarriedPage(offer.station, offer.n, there[k].encode(), offer.by)
+            for k, offer in enumerate(offers)
+            if k in there
         ]
 
     def restore(self, author: str, pages: Sequence[tuple[int, bytes]]) -> None:

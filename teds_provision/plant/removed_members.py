@@ -51,7 +51,7 @@ def review(station: Station, roster: Roster, now: datetime) -> RemovalReview | N
     """
     if not roster.removed:
         return None
-    named = hashlib.sha256("".join(sorted(one.fingerprint for one in roster.removed)).encode()).hexdigest()
+    named = hashlib.sha256("".join(sorted(removed.fingerprint for removed in roster.removed)).encode()).hexdigest()
     before = last(station)
     if before is not None and before.removed == named and abs(now - datetime.fromisoformat(before.at)) < EVERY:
         return before
@@ -118,11 +118,15 @@ def _mark(
         already = station.keys.rotation_due(uuid) or "" if uuid in marked else None
         if already is not None and (already.startswith(STOLEN) or not already.startswith(WHY)):
             continue
-        said = {one: Claim.from_json(text) for one, text in claims.get(uuid, {}).items()}
+        said = {fingerprint: Claim.from_json(text) for fingerprint, text in claims.get(uuid, {}).items()}
         had = beyond.get((uuid, key.epoch, key.key_id), set()) | {
             holder.fingerprint for holder in station.keys.holders(uuid) if roster.removed_one(holder.fingerprint)
         }
-        known = [one for one in roster.removed if one.fingerprint in had or _had(one, (key.epoch, key.key_id), said)]
+        known = [
+            removed
+            for removed in roster.removed
+            if removed.fingerprint in had or _had(removed, (key.epoch, key.key_id), said)
+        ]
         why = _why_due(known, key, said, now, ours)
         if why is not None:
             wanted[uuid] = why
@@ -147,30 +151,32 @@ def _why_due(
     station's to rotate; this one does it when the removal has been known here for ``OTHERS``.
     """
     why = None
-    for one in known:
-        forgot = said[one.fingerprint].forgot if one.fingerprint in said else -1
-        if one.why == "retired" and forgot >= key.epoch:
+    for removed in known:
+        forgot = said[removed.fingerprint].forgot if removed.fingerprint in said else -1
+        if removed.why == "retired" and forgot >= key.epoch:
             continue
-        if key.source == "agreement" or now - ours.get(one.fingerprint, now) >= OTHERS:
-            if one.why == "stolen":
-                return f"{STOLEN}{one.name} has held this key"
-            why = f"{WHY}{one.name} ({one.why}) has held this key"
+        if key.source == "agreement" or now - ours.get(removed.fingerprint, now) >= OTHERS:
+            if removed.why == "stolen":
+                return f"{STOLEN}{removed.name} has held this key"
+            why = f"{WHY}{removed.name} ({removed.why}) has held this key"
     return why
 
 
-def _had(one: RemovedMember, key: Key, said: Mapping[str, Claim]) -> bool:
+def _had(removed: RemovedMember, key: Key, said: Mapping[str, Claim]) -> bool:
     """Whether by anybody's claims of a node somebody who left has held this key of it."""
-    own = said.get(one.fingerprint)
+    own = said.get(removed.fingerprint)
     if own is not None and key in ((own.agreed or ())[:2], own.took, *((e, k) for _, _, e, k, _ in own.gave)):
         return True
-    return any((peer, e, k) == (one.fingerprint, *key) for claim in said.values() for _, peer, e, k, _ in claim.gave)
+    return any(
+        (peer, e, k) == (removed.fingerprint, *key) for claim in said.values() for _, peer, e, k, _ in claim.gave
+    )
 
 
 def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], set[str]]:
     """Keys (UUID, epoch, key id) that who left names on pages that do not count: later ones, and another history's."""
     found: dict[tuple[bytes, int, str], set[str]] = {}
-    for one in roster.removed:
-        chain = station.plant.tables.chains().get(one.fingerprint)
+    for removed in roster.removed:
+        chain = station.plant.tables.chains().get(removed.fingerprint)
         if chain is None:
             continue
         counted = counted_places(station, roster, chain)
@@ -182,7 +188,7 @@ def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], se
                 read = event.read(value)
                 if isinstance(read, event.Event) and read.uuid is not None and "key_id" in read.members:
                     key = read.uuid, read.members["epoch"], read.members["key_id"]
-                    found.setdefault(key, set()).add(one.fingerprint)
+                    found.setdefault(key, set()).add(removed.fingerprint)
     return found
 
 
@@ -190,16 +196,16 @@ def _first_removals(station: Station) -> dict[str, datetime]:
     """Since when the removal of each station that left is known here."""
     since: dict[str, datetime] = {}
     for row in station.plant.tables.rosters():
-        for one in _removed_in(row.octets, station.ca):
+        for fingerprint in _removed_in(row.octets, station.ca):
             at = datetime.fromisoformat(row.at)
-            since[one] = min(since.get(one, at), at)
+            since[fingerprint] = min(since.get(fingerprint, at), at)
     return since
 
 
 @lru_cache(maxsize=64)
 def _removed_in(octets: bytes, ca: bytes) -> frozenset[str]:
     try:
-        return frozenset(one.fingerprint for one in open_roster(octets, ca).removed)
+        return frozenset(removed.fingerprint for removed in open_roster(octets, ca).removed)
     except TedsProvisionError:  # kept as proof of two of one version
         return frozenset()
 

@@ -41,13 +41,13 @@ def note(station: Station, database: Returned, roster: Roster) -> None:
 
 def _digest(station: Station, database: Returned, roster: Roster) -> str:
     """Return a digest of what both sides have of the stations in question, "" if there is none."""
-    states = {one: state for one in sorted(roster.by_key) if (state := database.state(one))}
+    states = {name: state for name in sorted(roster.by_key) if (state := database.state(name))}
     if not states:
         return ""
     chains = station.plant.tables.chains()
     told = hashlib.sha256(f"{roster.hash} {database.takes_pages}\n".encode())
-    for one, state in states.items():
-        names = station.plant.tables.page_names(chains[one].chain) if one in chains else []
+    for name, state in states.items():
+        names = station.plant.tables.page_names(chains[name].chain) if name in chains else []
         told.update(f"{state} {' '.join(hash for _, hash, _ in names)}\n".encode())
     return told.hexdigest()
 
@@ -64,7 +64,7 @@ def own(
         return []
     good: dict[str, Page] = {}
     liars: set[str] = set()
-    offers = [one for one in database.offers(here) if one.by and one.hash not in known]
+    offers = [offer for offer in database.offers(here) if offer.by and offer.hash not in known]
     for carried in _octets(database, offers, liars):
         pages, junk = read_pages([carried], roster, here)
         good.update((page.hash, page) for page in pages)
@@ -81,7 +81,7 @@ def take(station: Station, database: Returned, roster: Roster) -> int:
             continue
         names = station.plant.tables.page_names(station.plant.tables.chain(author).chain)
         known = {hash for _, hash, _ in names}
-        offers = [one for one in database.offers(author) if one.hash not in known]
+        offers = [offer for offer in database.offers(author) if offer.hash not in known]
         liars: set[str] = set()
 
         def distrust(carried: CarriedPage, liars: set[str] = liars) -> None:

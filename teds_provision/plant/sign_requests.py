@@ -192,13 +192,13 @@ def name_of(hash: str) -> str:
 def receivers(station: Station, job: Job) -> list[str]:
     """Fingerprints of everybody that a job is for, but this station."""
     named = [*job.stations, *([job.office] if job.office is not None else [])]
-    return [one for one in dict.fromkeys(named) if one != station.identity.fingerprint]
+    return [fromkey for fromkey in dict.fromkeys(named) if fromkey != station.identity.fingerprint]
 
 
 def send_job(station: Station, post: Transport, job: Job) -> None:
     """Send a job to everybody that it is for; the same again changes nothing."""
-    for one in receivers(station, job):
-        send(station, post, one, job.octets, name_of(hashlib.sha256(f"{job.hash}{one}".encode()).hexdigest()))
+    for receiver in receivers(station, job):
+        send(station, post, receiver, job.octets, name_of(hashlib.sha256(f"{job.hash}{receiver}".encode()).hexdigest()))
 
 
 # -- asking ------------------------------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ class RemoteOffice:
                     pause = min(2 * pause, _MOST_LOOK_SECONDS)
             finally:
                 with self._news:
-                    self._came |= {self._answered(one.document): one for one in found}
+                    self._came |= {self._answered(delivery.document): delivery for delivery in found}
                     self._looking = False
                     self._news.notify_all()
             if not found and time.monotonic() >= until:

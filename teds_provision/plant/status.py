@@ -59,8 +59,8 @@ class PlantStatus:
     @property
     def exit_code(self) -> int:
         """0, 4 with alarms that nobody has seen, 6 where the roster has expired or this station was removed."""
-        removed = not any(one.state == "here" for one in self.standings)
-        return 6 if self.expired or removed else 4 if any(not one.seen for one in self.alarms) else 0
+        removed = not any(standing.state == "here" for standing in self.standings)
+        return 6 if self.expired or removed else 4 if any(not alarm.seen for alarm in self.alarms) else 0
 
 
 def moment(roster: Roster) -> datetime:
@@ -75,7 +75,7 @@ def status(station: Station, record: PlantRecord, roster: Roster) -> PlantStatus
     return PlantStatus(
         record,
         roster,
-        tuple(_standing(station, one, chains.get(one.fingerprint), at) for one in roster.by_key.values()),
+        tuple(_standing(station, member, chains.get(member.fingerprint), at) for member in roster.by_key.values()),
         station.plant.tables.unsent(station.fingerprint),
         len({uuid for uuid, _, _ in station.plant.tables.conflicts()}),
         tuple(station.plant.tables.alarms()),
@@ -84,27 +84,27 @@ def status(station: Station, record: PlantRecord, roster: Roster) -> PlantStatus
     )
 
 
-def _standing(station: Station, one: Any, chain: Chain | None, at: datetime) -> StationStanding:
+def _standing(station: Station, member: Any, chain: Chain | None, at: datetime) -> StationStanding:
     n = chain.counted[0] if chain is not None else 0
     age = None
     if chain is not None and n:
         created = next((c for number, h, c, _ in station.plant.tables.page_times(chain.chain, 50)
                         if (number, h) == chain.counted and c), None)  # fmt: skip
         age = max(0, int((at - datetime.fromisoformat(created)).total_seconds())) if created else None
-    if not isinstance(one, Member):
-        state = one.why
-    elif one.fingerprint == station.fingerprint:
+    if not isinstance(member, Member):
+        state = member.why
+    elif member.fingerprint == station.fingerprint:
         state = "here"
     elif chain is not None and chain.waits is not None:
         state = "newer version"
     elif any(
-        alarm.code == "two-histories" and alarm.about == one.fingerprint for alarm in station.plant.tables.alarms()
+        alarm.code == "two-histories" and alarm.about == member.fingerprint for alarm in station.plant.tables.alarms()
     ):
         state = "two histories"
     else:
         state = "nothing said" if not n else "silent" if age is None or age > SILENT.total_seconds() else "heard"
-    roles = tuple(role for role in ("keeper", "line", "sign", "base", "audit") if role in one.roles)
-    return StationStanding(one.name, one.fingerprint, roles, n, age, state)
+    roles = tuple(role for role in ("keeper", "line", "sign", "base", "audit") if role in member.roles)
+    return StationStanding(member.name, member.fingerprint, roles, n, age, state)
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ def log(
 ) -> Iterator[StatedEvent]:
     """What stations said, chain by chain in the order of their pages: verified when the page came in."""
     roster = require_roster(station)
-    for one, chain in sorted(station.plant.tables.chains().items()):
-        if of is not None and one != of:
+    for fingerprint, chain in sorted(station.plant.tables.chains().items()):
+        if of is not None and fingerprint != of:
             continue
         counted = counted_places(station, roster, chain)
         for page in station.plant.tables.each_page(chain.chain):
@@ -132,7 +132,7 @@ def log(
             for value in load_exact(page.content, "A page").get("events", ()):
                 read = event.read(value)
                 if isinstance(read, event.Event) and uuid in (None, read.uuid):
-                    yield StatedEvent(one, page.n, (page.n, page.hash) in counted, dict(read.members))
+                    yield StatedEvent(fingerprint, page.n, (page.n, page.hash) in counted, dict(read.members))
 
 
 def resolve(station: Station, text: str) -> bytes:
@@ -185,19 +185,23 @@ def nodes(station: Station, roster: Roster, text: str | None = None) -> Iterator
             if wanted and not uuid.hex().startswith(digits) and wanted not in name.lower():
                 continue
             holders = {} if seen.holder is None else seen.holder[1]
-            newest = max(((w[0], roster.name_of(one), w[2]) for one, w in seen.written.items()), default=None)
+            newest = max(
+                ((w[0], roster.name_of(fingerprint), w[2]) for fingerprint, w in seen.written.items()), default=None
+            )
             yield {
                 "uuid": uuid.hex(),
                 "name": seen.name,
                 "says": {
                     "epoch": seen.holder[0] if seen.holder is not None else None,
-                    "holders": {key: [roster.name_of(one) for one in who] for key, who in holders.items()},
+                    "holders": {
+                        key: [roster.name_of(fingerprint) for fingerprint in who] for key, who in holders.items()
+                    },
                     "fingerprint": seen.pin,
-                    "pinned_by": {roster.name_of(one): pin for one, pin in seen.pins.items()},
+                    "pinned_by": {roster.name_of(fingerprint): pin for fingerprint, pin in seen.pins.items()},
                     "sequence": newest[0] if newest is not None else None,
                     "written_by": newest[1] if newest is not None else None,
                     "profile": newest[2] if newest is not None else None,
-                    "revoked": [roster.name_of(one.said.sender) for one in seen.bans],
+                    "revoked": [roster.name_of(statement.said.sender) for statement in seen.bans],
                 },
                 "conflicts": [{"name": conflict, "why": why} for conflict, why in seen.conflicts.items()],
             }

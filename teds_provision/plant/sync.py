@@ -78,7 +78,7 @@ def sync(station: Station, post: Transport, *, connected: bool = True) -> SyncRe
     station.unlock()
     with alone(station):
         done = SyncResult()
-        done.rosters = [one.version for one, how, _ in _rosters(station, post, done) if how.startswith("taken")]
+        done.rosters = [roster.version for roster, how, _ in _rosters(station, post, done) if how.startswith("taken")]
         roster = require_roster(station)
         if roster.member(station.fingerprint) is None:
             apply_claims(station)
@@ -132,7 +132,7 @@ def _rosters(station: Station, post: Transport, done: SyncResult) -> list[tuple[
     held = station.plant.tables.held_roster()
     if held is not None:
         post.post_roster(held.version, held.hash, held.octets)
-    return [(one, str(how), why) for one, how, why in told]
+    return [(told_roster, str(how), why) for told_roster, how, why in told]
 
 
 def _parcels(station: Station, post: Transport, roster: Roster, done: SyncResult) -> None:
@@ -231,7 +231,11 @@ def _require_resumed(station: Station) -> None:
 
     A folder that shows less of it ends nothing.
     """
-    found = [one for one in station.plant.tables.alarms() if one.code == "fork" and one.about == station.fingerprint]
+    found = [
+        raised
+        for raised in station.plant.tables.alarms()
+        if raised.code == "fork" and raised.about == station.fingerprint
+    ]
     if found:
         raise ForkError(
             f"Pages under this station's key that this home did not write were found, from number {found[0].n}"
@@ -244,7 +248,7 @@ def _require_resumed(station: Station) -> None:
 def _follows(chain: Chain, new: Sequence[Page]) -> bool:
     """Whether pages go on, without a gap, from the newest page that counts here."""
     place = chain.counted
-    for page in sorted(new, key=lambda one: one.n):
+    for page in sorted(new, key=lambda page: page.n):
         if (page.n - 1, page.previous) != place:
             return False
         place = page.n, page.hash
@@ -254,9 +258,9 @@ def _follows(chain: Chain, new: Sequence[Page]) -> bool:
 def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
     """Take back pages that this station wrote: their events wait no more, what they say is known again."""
     with station.transaction():
-        take_pages(station, roster, sorted(pages, key=lambda one: one.n))
-        ids = [one.get("id") for page in pages for one in page.events if isinstance(one, dict)]
-        station.plant.tables.drop_events([one for one in ids if isinstance(one, str)])
+        take_pages(station, roster, sorted(pages, key=lambda page: page.n))
+        ids = [stated.get("id") for page in pages for stated in page.events if isinstance(stated, dict)]
+        station.plant.tables.drop_events([id_ for id_ in ids if isinstance(id_, str)])
         for page in pages:
             _know_again(station, page)
         station.audit("registry", None, "adopted", pages=[page.n for page in pages])
@@ -266,14 +270,25 @@ def _know_again(station: Station, page: Page) -> None:
     """Epochs, sequences and units that this station gave before it was put back: none of them is given out twice."""
     reached: dict[bytes, tuple[int, int]] = {}
     signed: set[bytes] = set()
-    for one in map(event.read, page.events):
-        if isinstance(one, event.Event) and one.uuid is not None and (unit := event.unit_of(one)) is not None:
-            _know_unit(station, one.uuid, one, *unit)
-        if isinstance(one, event.Event) and one.act in ("agreed", "signed", "written") and one.uuid is not None:
-            epoch, sequence = reached.get(one.uuid, (0, 0))
-            reached[one.uuid] = max(epoch, one.members["epoch"]), max(sequence, one.members.get("sequence", 0))
-        if isinstance(one, event.Event) and one.act == "signed" and one.uuid is not None:
-            signed.add(one.uuid)
+    for event_read in map(event.read, page.events):
+        if (
+            isinstance(event_read, event.Event)
+            and event_read.uuid is not None
+            and (unit := event.unit_of(event_read)) is not None
+        ):
+            _know_unit(station, event_read.uuid, event_read, *unit)
+        if (
+            isinstance(event_read, event.Event)
+            and event_read.act in ("agreed", "signed", "written")
+            and event_read.uuid is not None
+        ):
+            epoch, sequence = reached.get(event_read.uuid, (0, 0))
+            reached[event_read.uuid] = (
+                max(epoch, event_read.members["epoch"]),
+                max(sequence, event_read.members.get("sequence", 0)),
+            )
+        if isinstance(event_read, event.Event) and event_read.act == "signed" and event_read.uuid is not None:
+            signed.add(event_read.uuid)
     for uuid, (epoch, sequence) in reached.items():
         node = station.nodes.get(uuid)
         if node is not None:
@@ -333,7 +348,7 @@ def resume(station: Station, post: Transport) -> int:
         new = _strange(station, found)
         with station.transaction():
             if new:
-                newest = max(new, key=lambda one: (one.n, one.hash))
+                newest = max(new, key=lambda page: (page.n, page.hash))
                 tables = station.plant.tables
                 theirs = {(page.n, page.hash) for page in found}
                 counted = [(n, hash) for n, hash, _ in tables.page_names(chain.chain) if n <= chain.counted[0]]
@@ -368,12 +383,12 @@ def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
 
 
 def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:
-    adopted = {one.get("id") for page in new for one in page.events if isinstance(one, dict)}
+    adopted = {stated.get("id") for page in new for stated in page.events if isinstance(stated, dict)}
     for n, hash in lost:
         row = station.plant.tables.page(chain.chain, n, hash)
-        for one in load_exact(row.content, "A page")["events"] if row is not None else ():
-            if one["id"] not in adopted:
-                station.plant.queue_event(one)
+        for item in load_exact(row.content, "A page")["events"] if row is not None else ():
+            if item["id"] not in adopted:
+                station.plant.queue_event(item)
 
 
 def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page | None:
@@ -396,7 +411,7 @@ def close_page(station: Station, roster: Roster, *, empty: bool = False) -> Page
         draft = PageDraft(
             roster.registry, n + 1, previous, station.plant.home, now(), _fresh_heads(station, chain), entry
         )
-        octets = seal_page(draft, [one for _, one in events], station.vault.identity())
+        octets = seal_page(draft, [made for _, made in events], station.vault.identity())
         page = open_page(octets, roster.registry, lambda kid: station.point)
         take_pages(station, roster, [page])
         tables.drop_events([id for id, _ in events])
@@ -407,9 +422,9 @@ def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
     """What this station verified of others and did not say yet."""
     said = {about: (n, hash) for who, about, n, hash in station.plant.tables.heads() if who == own.station}
     return {
-        one: chain.counted
-        for one, chain in station.plant.tables.chains().items()
-        if one != own.station and chain.counted[0] and said.get(one) != chain.counted
+        fingerprint: chain.counted
+        for fingerprint, chain in station.plant.tables.chains().items()
+        if fingerprint != own.station and chain.counted[0] and said.get(fingerprint) != chain.counted
     }
 
 
@@ -419,18 +434,18 @@ def _fresh_heads(station: Station, own: Chain) -> dict[str, tuple[int, str]]:
 def _push(station: Station, post: Transport, roster: Roster, done: SyncResult, *, connected: bool) -> None:
     """Put there what is lacking: one's own pages, and in a folder everybody's."""
     heads = post.heads()
-    for one, chain in station.plant.tables.chains().items():
-        own = one == station.fingerprint
+    for fingerprint, chain in station.plant.tables.chains().items():
+        own = fingerprint == station.fingerprint
         if not own and not post.everybody:
             continue
-        there = {hash_of(carried.octets) for carried in post.pages(one, 0)} if post.everybody else set()
-        above = 0 if post.everybody else heads.get(one, 0)
+        there = {hash_of(carried.octets) for carried in post.pages(fingerprint, 0)} if post.everybody else set()
+        above = 0 if post.everybody else heads.get(fingerprint, 0)
         for n, hash, previous in station.plant.tables.page_names(chain.chain):
             if n <= above or hash in there or (own and not post.everybody and n > chain.counted[0]):
                 continue
             row = station.plant.tables.page(chain.chain, n, hash)
             assert row is not None
-            post.append(one, n, previous, hash, octets_of(row))
+            post.append(fingerprint, n, previous, hash, octets_of(row))
             done.pushed += own
     joined, newest = station.plant.joined, own_chain(station).counted[0]
     assert joined is not None

@@ -45,7 +45,11 @@ class EvidenceAnchors:
 
         Raises NotFoundError, NotAuthenticError, BadDataError.
         """
-        listed = None if pins is None else {one.uuid: one.fingerprint or "" for one in whitelist.read_whitelist(pins)}
+        listed = (
+            None
+            if pins is None
+            else {listed.uuid: listed.fingerprint or "" for listed in whitelist.read_whitelist(pins)}
+        )
         named = None if roster is None else open_roster(read_limited(roster, ROSTER.most, "roster"), ca)
         return cls(ca, listed, named)
 
@@ -54,10 +58,10 @@ class EvidenceAnchors:
         one = codec.ready(evidence)
         return self.faults_of(one, codec.check_signatures(one))
 
-    def faults_of(self, one: CheckedEvidence, signatures: Signatures) -> list[str]:
+    def faults_of(self, checked: CheckedEvidence, signatures: Signatures) -> list[str]:
         """As :meth:`faults`, where the signatures were checked already."""
-        evidence = one.evidence
-        found = codec.faults_of(one, signatures, self.ca)
+        evidence = checked.evidence
+        found = codec.faults_of(checked, signatures, self.ca)
         if self.roster is not None:
             found += _wrong_members(evidence, self.roster)
         if self.pins is not None:
@@ -229,13 +233,13 @@ def judge_file(grounds: EvidenceAnchors, path: Path) -> JudgedEvidence:
 def judge_files(grounds: EvidenceAnchors, paths: Sequence[Path]) -> list[JudgedEvidence]:
     """Judge some files: all are read, then all signatures are checked in a row."""
     read = [_read(path) for path in paths]
-    checked = [codec.check_signatures(one) if isinstance(one, CheckedEvidence) else None for one in read]
+    checked = [codec.check_signatures(event) if isinstance(event, CheckedEvidence) else None for event in read]
     found = []
-    for path, one, signatures in zip(paths, read, checked, strict=True):
-        if isinstance(one, CheckedEvidence) and signatures is not None:
-            found.append(JudgedEvidence(path, one.evidence, tuple(grounds.faults_of(one, signatures))))
-        elif isinstance(one, TedsProvisionError):
-            found.append(JudgedEvidence(path, error=one))
+    for path, judged, signatures in zip(paths, read, checked, strict=True):
+        if isinstance(judged, CheckedEvidence) and signatures is not None:
+            found.append(JudgedEvidence(path, judged.evidence, tuple(grounds.faults_of(judged, signatures))))
+        elif isinstance(judged, TedsProvisionError):
+            found.append(JudgedEvidence(path, error=judged))
     return found
 
 

@@ -145,23 +145,23 @@ def yield_stats(station: Station, job: Job, attempts: Iterable[Attempt]) -> list
     names = {key: roster.name_of(key) if roster is not None else key[:16] for key in job.stations}
     found = {key: StationYield(key, names[key], number) for key, number in job.stations.items()}
     by_board: dict[tuple[str, bytes], list[Attempt]] = {}
-    for one in attempts:
-        by_board.setdefault((one.station, one.uuid), []).append(one)
+    for attempt in attempts:
+        by_board.setdefault((attempt.station, attempt.uuid), []).append(attempt)
     times: dict[str, dict[str, list[float]]] = {}
     for (key, _), tries in by_board.items():
         name = roster.name_of(key) if roster is not None else key[:16]
         part = found.setdefault(key, StationYield(key, name, 0))
-        tries.sort(key=lambda one: one.attempt)
+        tries.sort(key=lambda attempt: attempt.attempt)
         part.units += 1
         if tries[0].code == UNREPORTED:
             continue
         part.reported += 1
         part.attempts += len(tries)
-        part.passed += any(one.code is None for one in tries)
+        part.passed += any(attempt.code is None for attempt in tries)
         part.first += tries[0].code is None and tries[0].attempt == 1
-        part.failures.update(one.code for one in tries if one.code is not None)
-        for one in tries:
-            for step, seconds in (one.steps or {}).items() if one.code is None else ():
+        part.failures.update(attempt.code for attempt in tries if attempt.code is not None)
+        for attempt in tries:
+            for step, seconds in (attempt.steps or {}).items() if attempt.code is None else ():
                 times.setdefault(key, {}).setdefault(step, []).append(seconds)
     for key, steps in times.items():
         found[key].steps = {step: (round(median(all_of), 3), max(all_of)) for step, all_of in steps.items()}
@@ -174,13 +174,22 @@ def to_csv(station: Station, attempts: Iterable[Attempt]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     attempts = list(attempts)
-    steps = list(dict.fromkeys(step for one in attempts for step in one.steps or {}))
+    steps = list(dict.fromkeys(step for attempt in attempts for step in attempt.steps or {}))
     writer.writerow([*COLUMNS, *steps])
-    for one in attempts:
-        name = roster.name_of(one.station) if roster is not None else ""
+    for attempt in attempts:
+        name = roster.name_of(attempt.station) if roster is not None else ""
         name = f"'{name}" if name[:1] in ("=", "+", "-", "@") else name  # a sheet would take it for a formula
-        seconds = "" if one.steps is None else f"{sum(one.steps.values()):.3f}"
-        verdict = "passed" if one.code is None else "failed"
-        row = [one.station, name, one.uuid.hex(), one.unit or "", one.attempt, verdict, one.code or "", one.finished]
-        writer.writerow([*row, seconds, *((one.steps or {}).get(step, "") for step in steps)])
+        seconds = "" if attempt.steps is None else f"{sum(attempt.steps.values()):.3f}"
+        verdict = "passed" if attempt.code is None else "failed"
+        row = [
+            attempt.station,
+            name,
+            attempt.uuid.hex(),
+            attempt.unit or "",
+            attempt.attempt,
+            verdict,
+            attempt.code or "",
+            attempt.finished,
+        ]
+        writer.writerow([*row, seconds, *((attempt.steps or {}).get(step, "") for step in steps)])
     return out.getvalue()

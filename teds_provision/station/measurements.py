@@ -57,19 +57,19 @@ class Measurements:
     def all(self) -> list[KeptMeasurement]:
         """Return every one that is kept, oldest first; removes those of dead commands."""
         kept = self._store.measurements()
-        dead = {one.id for one in kept if self._is_of_dead_command(one)}
+        dead = {measurement.id for measurement in kept if self._is_of_dead_command(measurement)}
         with suppress(StoreError):  # a full disk hides no list; the next reader tries again
             for measurement_id in dead:
                 self._store.remove_measurement(measurement_id)
-        return [one for one in kept if one.id not in dead]
+        return [measurement for measurement in kept if measurement.id not in dead]
 
     def due(self) -> list[KeptMeasurement]:
         """Return those that ``ncap`` measures now: its own, the page's and the API's that are not past their end."""
-        return [one for one in self.all() if one.lasting and not _is_past(one)]
+        return [measurement for measurement in self.all() if measurement.lasting and not _is_past(measurement)]
 
     def of_commands(self) -> list[KeptMeasurement]:
         """Return those of commands that live."""
-        return [one for one in self.all() if not one.lasting]
+        return [measurement for measurement in self.all() if not measurement.lasting]
 
     def _is_of_dead_command(self, measurement: KeptMeasurement) -> bool:
         return not measurement.lasting and not OwnerLock(self._home, measurement.id).is_taken
@@ -80,7 +80,7 @@ class Measurements:
         if found is None:
             raise NotFoundError(
                 f"There is no measurement {measurement_id!r}.",
-                hint=f"Measurements: {', '.join(one.id for one in self.all()) or 'none'}.",
+                hint=f"Measurements: {', '.join(measurement.id for measurement in self.all()) or 'none'}.",
             )
         return found
 
@@ -89,8 +89,19 @@ class Measurements:
 
         None if there is none. The row itself stays its owner's; that of a dead command goes with the next :meth:`all`.
         """
-        kept = [one for one in self._store.measurements() if one.group == group and not _is_past(one)]
-        found = next((one for one in reversed(kept) if one.lasting or self._is_of_dead_command(one)), None)
+        kept = [
+            measurement
+            for measurement in self._store.measurements()
+            if measurement.group == group and not _is_past(measurement)
+        ]
+        found = next(
+            (
+                measurement
+                for measurement in reversed(kept)
+                if measurement.lasting or self._is_of_dead_command(measurement)
+            ),
+            None,
+        )
         return None if found is None else replace(found, id="", owner=COMMAND, pid=None, started=None)
 
     def nodes_of(self, measurement: KeptMeasurement) -> tuple[bytes, ...]:
@@ -137,29 +148,36 @@ class Measurements:
             groups = self._groups.hand_on(old, new)
             topics, refused = self._hand_on_names(old, new)
             changed, ended = [], []
-            for one in self._store.measurements():
-                if one.group is None and old in one.uuids:
-                    rest = dict.fromkeys(uuid if uuid != old else new for uuid in one.uuids)
+            for measurement in self._store.measurements():
+                if measurement.group is None and old in measurement.uuids:
+                    rest = dict.fromkeys(uuid if uuid != old else new for uuid in measurement.uuids)
                     uuids = tuple(uuid for uuid in rest if uuid is not None)
                     if uuids:
-                        self._store.put_measurement(replace(one, uuids=uuids))
-                        changed.append(one.id)
+                        self._store.put_measurement(replace(measurement, uuids=uuids))
+                        changed.append(measurement.id)
                     else:
-                        self._store.remove_measurement(one.id)
-                        ended.append(one.id)
-                elif one.group is not None and one.group in groups:
-                    if self._groups.get(one.group).uuids:
-                        changed.append(one.id)
+                        self._store.remove_measurement(measurement.id)
+                        ended.append(measurement.id)
+                elif measurement.group is not None and measurement.group in groups:
+                    if self._groups.get(measurement.group).uuids:
+                        changed.append(measurement.id)
                     else:
-                        self._store.remove_measurement(one.id)
-                        ended.append(one.id)
+                        self._store.remove_measurement(measurement.id)
+                        ended.append(measurement.id)
         return HandedOn(tuple(groups), tuple(topics), tuple(changed), tuple(ended), (*kept, *refused))
 
     def _commands_with(self, uuid: bytes) -> list[str]:
         """Return the `measure` commands that live and have a node, in words."""
         groups = self._groups.of(uuid)
-        mine = [one for one in self.of_commands() if uuid in one.uuids or one.group in groups]
-        return [f"The running command measure {one.group or uuid.hex()} (process {one.pid})" for one in mine]
+        mine = [
+            measurement
+            for measurement in self.of_commands()
+            if uuid in measurement.uuids or measurement.group in groups
+        ]
+        return [
+            f"The running command measure {measurement.group or uuid.hex()} (process {measurement.pid})"
+            for measurement in mine
+        ]
 
     def _hand_on_names(self, old: bytes, new: bytes | None) -> tuple[list[str], list[str]]:
         """Move chosen names and frames; returns the names, and a sentence for each that cannot be moved."""

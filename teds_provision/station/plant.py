@@ -150,7 +150,7 @@ class Plant:
             n > counted.get(about, 0) and held.member(who) is not None and "keeper" in held.roles_of(about)
             for who, about, n, _ in self.tables.heads()
         )
-        added = frozenset(one.fingerprint for one in self.tables.trusted() if one.role == "station")
+        added = frozenset(trusted.fingerprint for trusted in self.tables.trusted() if trusted.role == "station")
         return SignerRules(held, self._identity.ca, counted, behind, added - held.by_key.keys(), self._words)
 
     def _words(self, digest: bytes) -> list[signer.SignatureClaim]:

@@ -51,14 +51,18 @@ class Policy:
         roster = self._plant.roster
         if roster is None:
             return self._store.trusted()
-        others = [one for one in self._store.trusted() if one.role == "ca" or one.fingerprint not in roster.by_key]
+        others = [
+            trusted
+            for trusted in self._store.trusted()
+            if trusted.role == "ca" or trusted.fingerprint not in roster.by_key
+        ]
         added = roster.created.strftime("%Y-%m-%dT%H:%M:%SZ")
         members = [
             TrustRecord(member.name, "station", member.point, member.fingerprint, added)
             for member in roster.members
             if member.point != self._identity.point
         ]
-        return sorted([*others, *members], key=lambda one: one.name)
+        return sorted([*others, *members], key=lambda trusted: trusted.name)
 
     def in_roster(self, fingerprint: str) -> bool:
         """Whether the plant's roster names this key, as a member or as one that left."""
@@ -112,7 +116,7 @@ class Policy:
 
     def trusted_stations(self) -> list[bytes]:
         """Station keys whose datasheets count without a CA: its own, and those added that no roster decides about."""
-        others = (one.point for one in self.trusted("station") if not self.in_roster(one.fingerprint))
+        others = (trusted.point for trusted in self.trusted("station") if not self.in_roster(trusted.fingerprint))
         return [self._identity.point, *others]
 
     def station_points(self) -> dict[str, bytes]:
@@ -131,7 +135,7 @@ class Policy:
 
     def revocations_of(self, uuids: Sequence[bytes]) -> dict[bytes, RevocationRecord]:
         """Those of a page of nodes that are denied, with why."""
-        return {one.uuid: one for one in self._store.revocations_of(uuids)}
+        return {revocation.uuid: revocation for revocation in self._store.revocations_of(uuids)}
 
     def deny(self, revocation: RevocationRecord) -> None:
         """Put a node on the deny list."""

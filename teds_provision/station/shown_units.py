@@ -22,7 +22,7 @@ def shown_units(station: Station, uuid: bytes) -> Mapping[int, str]:
 
 def units_of(channels: Iterable[ChannelProfile]) -> dict[int, str]:
     """The unit of each of these channels that names one to show its values in."""
-    return {one.number: one.display for one in channels if one.display}
+    return {channel.number: channel.display for channel in channels if channel.display}
 
 
 def channel_profiles(station: Station, uuid: bytes) -> Mapping[int, ChannelProfile]:
@@ -43,4 +43,4 @@ def _channels_of(name_or_path: str, home: Path) -> Mapping[int, ChannelProfile]:
 @lru_cache(maxsize=64)  # a plant has a thousand nodes and a dozen types
 def _read(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) -> Mapping[int, ChannelProfile]:
     """Read the channels of a profile; again each second, as the profiles that it extends may change."""
-    return {one.number: one for one in load_profile(path, folders).channels}
+    return {channel.number: channel for channel in load_profile(path, folders).channels}

@@ -113,9 +113,13 @@ def read_factory_datasheet(station: Station, image: Image, *, name: str | None =
 
 def _wrong_with(sheet: Sheet, blocks: Mapping[BlockId, bytes]) -> tuple[list[str], list[str]]:
     """Errors and warnings of a datasheet that can be signed: of its TEDS, its channels, its calibrations."""
-    errors = [f"{name_of(one.access_code)}: {one.message}" for one in sheet.errors]
-    warnings = [f"{name_of(one.access_code)}: {one.message}" for one in sheet.findings if one.severity == "warning"]
-    warnings += [one.value_problem for one in sheet.channels if one.value_problem and not one.actuator]
+    errors = [f"{name_of(finding.access_code)}: {finding.message}" for finding in sheet.errors]
+    warnings = [
+        f"{name_of(finding.access_code)}: {finding.message}"
+        for finding in sheet.findings
+        if finding.severity == "warning"
+    ]
+    warnings += [channel.value_problem for channel in sheet.channels if channel.value_problem and not channel.actuator]
     if any(code == AccessCode.CALIBRATION for _, code in blocks):
         for finding in guarding.check_calibration(blocks):
             said = f"channel {finding.channel}: {finding.message}."
@@ -143,7 +147,11 @@ def _require_own_name(station: Station, uuid: bytes, name: str) -> None:
     others = [other for other in station.nodes.all_named(name) if other != uuid]
     digits = name.lower().removeprefix("0x")
     if len(digits) >= _PREFIX and not set(digits) - set("0123456789abcdef"):
-        others += [one.uuid for one in station.nodes.all() if one.uuid.hex().startswith(digits) and one.uuid != uuid]
+        others += [
+            record.uuid
+            for record in station.nodes.all()
+            if record.uuid.hex().startswith(digits) and record.uuid != uuid
+        ]
     if others:
         raise PolicyError(
             f"Node {uuid.hex()} calls itself {name!r}, but node {others[0].hex()} already has that name.",
@@ -173,7 +181,7 @@ def _strange_texts(block: BlockId, octets: bytes) -> Iterator[str]:
     if block[1] in TEXT_BASED:
         for text in decoded.text:
             letters = text.decode(errors="replace")
-            if any(not one.isprintable() and one not in "\n\r\t" for one in letters):
+            if any(not letter.isprintable() and letter not in "\n\r\t" for letter in letters):
                 yield f"a text in its {where} contains unprintable characters"
 
 

@@ -370,9 +370,11 @@ class BatchRun:
 
     def _require_known(self, found: list[Contact]) -> None:
         """Raise NotWhitelistedError if none of the nodes that answered is one of ours: nothing done is not all done."""
-        if self.progress is not None or any(self._station.pins.entry(one.identity.uuid) is not None for one in found):
+        if self.progress is not None or any(
+            self._station.pins.entry(contact.identity.uuid) is not None for contact in found
+        ):
             return
-        uuids = [one.identity.uuid.hex() for one in found]
+        uuids = [contact.identity.uuid.hex() for contact in found]
         raise NotWhitelistedError(
             f"{len(uuids)} node{'s' if len(uuids) > 1 else ''} answered, but none is on the whitelist: "
             f"{', '.join(uuids[:_SHOWN])}{', …' if len(uuids) > _SHOWN else ''}.",
@@ -429,7 +431,11 @@ class BatchRun:
         if profile is None and record is not None and record.profile:
             with suppress(TedsProvisionError):
                 profile = load_profile(record.profile, default_folders(self._station.home))
-        required = [one.number for one in profile.channels if one.calibration.required] if profile is not None else []
+        required = (
+            [channel.number for channel in profile.channels if channel.calibration.required]
+            if profile is not None
+            else []
+        )
         missing = [str(number) for number in required if (number, AccessCode.CALIBRATION) not in image.blocks]
         if profile is None or not missing:
             return None

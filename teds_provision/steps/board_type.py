@@ -107,10 +107,11 @@ def differences(
         return ()
     if isinstance(wanted, Image):
         meant = {
-            one.number: _ChannelStatement.from_teds(one, wanted.blocks) for one in Sheet.from_image(wanted).channels
+            channel.number: _ChannelStatement.from_teds(channel, wanted.blocks)
+            for channel in Sheet.from_image(wanted).channels
         }
     else:
-        meant = {one.number: _ChannelStatement.wanted(one) for one in wanted.channels}
+        meant = {channel.number: _ChannelStatement.wanted(channel) for channel in wanted.channels}
     meant |= {number: meant[number]._replace(calibrated=True) for number in calibrated if number in meant}
     return tuple(text for number in sorted(meant) for text in _between(number, own.get(number), meant[number]))
 
@@ -124,8 +125,8 @@ def further(has: Mapping[BlockId, bytes], wanted: Image) -> tuple[str, ...]:
     """A warning for the channels that the board describes and nobody wants, if there are any."""
     if not _describes(has):
         return ()
-    channels = {one.number for one in Sheet.from_blocks(has).channels} - {
-        one.number for one in Sheet.from_image(wanted).channels
+    channels = {channel.number for channel in Sheet.from_blocks(has).channels} - {
+        channel.number for channel in Sheet.from_image(wanted).channels
     }
     named = ", ".join(map(str, sorted(channels)))
     return (f"The board has more channels than the profile: {named}.",) if channels else ()
@@ -261,15 +262,15 @@ def _borne(node: Conversation, image: Image, shown: Mapping[int, str] | None) ->
         Image(image.uuid, image.unsigned_blocks())
     )  # what the Security TEDS says is judged already
     sheet, digest = described.shown_in(shown or {}), hashlib.sha256(image.security or b"").digest()
-    found = {one.number: _bears(node, one, digest) for one in sheet.channels}
-    sensors = [one for one in sheet.channels if not one.actuator and found[one.number]]
+    found = {channel.number: _bears(node, channel, digest) for channel in sheet.channels}
+    sensors = [channel for channel in sheet.channels if not channel.actuator and found[channel.number]]
     if not sensors:
         return HardwareCheck(found)
     try:
         samples = tuple(_read(node, sheet, sensors, digest))
     except (NodeRefusedError, BadDataError) as error:  # busy, a fault: the datasheet stands, and a person is told
         return HardwareCheck(found, warnings=(f"No reading was taken: {error.message}",))
-    bad = [str(one["channel"]) for one in samples if not one["valid"]]
+    bad = [str(entry["channel"]) for entry in samples if not entry["valid"]]
     warnings = (f"The reading of channel {', '.join(bad)} is invalid.",) if bad else ()
     return HardwareCheck(found, samples, warnings)
 
@@ -293,8 +294,8 @@ def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
 def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: bytes) -> Iterator[dict[str, Any]]:
     told = OperationReply.decode(node.request(OPERATION, "to tell its mode")).channels
     taken = {number for number, (state, _) in told.items() if state & ChannelState.CLAIMED_BY_OTHER}
-    free = [one for one in sensors if one.number not in taken]
-    readers = {one.number: ChannelInterpreter(sheet, one.number) for one in free}
+    free = [number for number in sensors if number.number not in taken]
+    readers = {channel.number: ChannelInterpreter(sheet, channel.number) for channel in free}
     try:
         for number in readers:
             operate(node, number, digest, lease=_LEASE)
@@ -314,9 +315,9 @@ def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: byte
 
 def _parts(readers: dict[int, ChannelInterpreter]) -> list[list[int]]:
     parts: list[list[int]] = [[]]
-    for number, one in readers.items():
+    for number, interpreter in readers.items():
         if parts[-1] and (
-            sum(readers[other].octets for other in parts[-1]) + one.octets > _ROOM
+            sum(readers[other].octets for other in parts[-1]) + interpreter.octets > _ROOM
             or len(parts[-1]) == MOST_SAMPLE_CHANNELS
         ):
             parts.append([])
@@ -324,11 +325,11 @@ def _parts(readers: dict[int, ChannelInterpreter]) -> list[list[int]]:
     return [part for part in parts if part]
 
 
-def _to_json(one: ChannelInterpreter, raws: dict[int, Any], *, valid: bool) -> dict[str, Any]:
-    channel, value = one.channel, math.nan
-    if not one.problem and all(other in raws for other in one.others):
-        found = one.values(raws[channel.number], {other: raws[other] for other in one.others})
-        value, valid = one.unit.to_si(float(found.value[0])), valid and bool(found.valid[0])
+def _to_json(interpreter: ChannelInterpreter, raws: dict[int, Any], *, valid: bool) -> dict[str, Any]:
+    channel, value = interpreter.channel, math.nan
+    if not interpreter.problem and all(other in raws for other in interpreter.others):
+        found = interpreter.values(raws[channel.number], {other: raws[other] for other in interpreter.others})
+        value, valid = interpreter.unit.to_si(float(found.value[0])), valid and bool(found.valid[0])
     valid = valid and math.isfinite(value)
     return {
         "channel": channel.number,

@@ -269,7 +269,7 @@ def content_digests(prepared: PreparedOrder) -> tuple[str, str]:
 def _digest(profile: Profile) -> bytes:
     blocks = _built_of(profile, _NOBODY, {}, None, 2007).blocks
     said = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]
-    demands = [repr(one.calibration) for one in profile.channels]
+    demands = [repr(channel.calibration) for channel in profile.channels]
     return hashlib.sha256(json.dumps([said, demands]).encode()).digest()
 
 
@@ -301,10 +301,10 @@ def _kept_calibrations(
 
 def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile: Profile | None = None) -> None:
     """Raise CalibrationMisfitError if a calibration of ``has`` was made for another channel than ``new`` describes."""
-    for number, one in kept.items():
+    for number, current in kept.items():
         had, now = described(number, has.blocks), described(number, new.blocks)
         own = profile.channel(number) if profile is not None else None
-        why = guarding.misfit(one, had, now, own)
+        why = guarding.misfit(current, had, now, own)
         if why:
             raise CalibrationMisfitError(
                 f"The calibration of channel {number} that the node has does not fit: {why}.",
@@ -362,7 +362,13 @@ def guard(
         )
     if errors and record:
         station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
-    return merged(tuple(_finding_text(one) for one in findings if one.severity == "error" or one.code not in expected))
+    return merged(
+        tuple(
+            _finding_text(finding)
+            for finding in findings
+            if finding.severity == "error" or finding.code not in expected
+        )
+    )
 
 
 def _is_calibrated(*images: Image | None) -> bool:

@@ -81,8 +81,8 @@ def plan_sheet(
     if told:
         require_board_type(node.uuid, told)
     same = {
-        number: one
-        for number, one in teds_calibrations(present.image).items()
+        number: calibration
+        for number, calibration in teds_calibrations(present.image).items()
         if image.blocks.get((number, AccessCode.CALIBRATION)) == present.image.blocks[number, AccessCode.CALIBRATION]
     }
     require_fit(same, present.image, image)

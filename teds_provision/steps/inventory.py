@@ -65,11 +65,13 @@ def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[di
     """As :func:`inventory`, each with the whole verdict; None where no datasheet of the node was read."""
     known = station.nodes.overview(uuids)
     while page := list(islice(known, PAGE)):
-        listed = [one.uuid for one in page]
-        judged = readings.verdicts_of(station, listed, [one.uuid for one in page if one.keys and one.moved is None])
-        for one in page:
-            found = judged.get(one.uuid)
-            yield _described(one, found), found
+        listed = [overview.uuid for overview in page]
+        judged = readings.verdicts_of(
+            station, listed, [overview.uuid for overview in page if overview.keys and overview.moved is None]
+        )
+        for overview in page:
+            found = judged.get(overview.uuid)
+            yield _described(overview, found), found
 
 
 def _described(known: NodeOverview, judged: NodeVerdict | None) -> dict[str, Any]:

@@ -251,7 +251,7 @@ class _Run:
         prepared = self._prepared(who)
         # before it becomes ours, or costs a unit
         if prepared.profile is not None and (who.state == NodeState.FACTORY or self.line is not None):
-            shown = shown_by(self.node, {one.number for one in prepared.profile.channels})
+            shown = shown_by(self.node, {channel.number for channel in prepared.profile.channels})
             told = differences(shown, prepared.profile, prepared.calibrations or ())
             self._require_its_board(who, prepared, told)
         entry = self._whitelist(who)
@@ -401,7 +401,7 @@ class _Run:
             units = shown_units(self.station, self.node.uuid) if profile is None else units_of(profile.channels)
             borne = check_hardware(self.node, written.on_node, units)
             step.result = DONE if borne.asked else SKIPPED
-            good = sum(bool(one) for one in borne.channels.values())
+            good = sum(bool(channel) for channel in borne.channels.values())
             step.detail = (
                 f"{good} of {len(borne.channels)} channels match the hardware" if borne.asked else "it does not measure"
             )

@@ -99,7 +99,7 @@ class _WhitelistReader:
 
     def _join(self, entry: ListedNode) -> None:
         known = self.entries.get(entry.uuid)
-        pins = [one.fingerprint for one in (known, entry) if one is not None and one.fingerprint]
+        pins = [listed.fingerprint for listed in (known, entry) if listed is not None and listed.fingerprint]
         if known is not None and len(pins) == 2 and not same_key(*pins):
             self.wrong(entry.line, "fingerprint", f"line {known.line} has the same UUID with another key")
             return
@@ -404,7 +404,7 @@ def plan_addition(station: Station, listed: Sequence[ListedNode]) -> WhitelistPl
     Raises KeyMismatchError where a UUID is pinned to another key, PolicyError for a revoked node: then none may be
     added.
     """
-    revoked = {one.uuid: one.why for one in station.policy.revocations()}
+    revoked = {revocation.uuid: revocation.why for revocation in station.policy.revocations()}
     uuids = [entry.uuid for entry in listed if entry.uuid in revoked]
     if uuids:
         shown = ", ".join(f"{uuid.hex()} ({revoked[uuid]})" for uuid in uuids[:_SHOWN])

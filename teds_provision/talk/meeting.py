@@ -220,7 +220,9 @@ def drop_duplicate_uuids(contacts: list[Contact], notice: NoticeSink) -> list[Co
             refuse_duplicate_uuids(group)
         except AddressConflictError as conflict:
             notice(Notice("conflict", f"{conflict.message} {conflict.hint}", uuid=uuid))
-    return [one for one in contacts if len(same[one.identity.uuid]) == 1] or refuse_duplicate_uuids(contacts)
+    return [contact for contact in contacts if len(same[contact.identity.uuid]) == 1] or refuse_duplicate_uuids(
+        contacts
+    )
 
 
 def refuse_duplicate_uuids(contacts: list[Contact]) -> list[Contact]:
@@ -246,7 +248,7 @@ def pick_single_node(station: Station, contacts: list[Contact]) -> Contact:
         if len(choice) == 1:
             return choice[0]
     meant = unfinished or contacts
-    listed = ", ".join(f"{each.identity.uuid.hex()} at 0x{each.address or 0:02x}" for each in meant[:_SHOWN])
+    listed = ", ".join(f"{contact.identity.uuid.hex()} at 0x{contact.address or 0:02x}" for contact in meant[:_SHOWN])
     which = f"{len(meant)} of them not finished" if len(meant) < len(contacts) else ""
     raise UsageError(
         f"{len(contacts)} nodes answer on the bus{', ' if which else ''}{which}: {listed}"
@@ -413,8 +415,8 @@ def _together(
 
     def serve(port: Port) -> None:
         try:
-            for one in _watch(port, work, reporter, stop):
-                arrivals.put(one)
+            for arrival in _watch(port, work, reporter, stop):
+                arrivals.put(arrival)
         except BaseException as error:  # noqa: BLE001 - told by the thread that gives the results
             arrivals.put(error)
 

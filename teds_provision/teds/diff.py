@@ -111,11 +111,11 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
                 found = True
                 yield Change(channel, access_code, "curve", "", "", f"{where}: {text}.")
     contexts = _context(channel, old), _context(channel, new)
-    for path, one, other in _differing(_flat(before), _flat(after)):
+    for path, item, other in _differing(_flat(before), _flat(after)):
         if path[0][0] in skip:
             continue
         found = True
-        was = _shown(one, access_code, path, contexts[0]) if one else ""
+        was = _shown(item, access_code, path, contexts[0]) if item else ""
         now = _shown(other, access_code, path, contexts[1]) if other else ""
         yield Change(channel, access_code, path[-1][0], was, now, _sentence(where, path, was, now))
     if not found:
@@ -265,9 +265,9 @@ def _place(curve: Curve, at: int) -> str:
 def _gain(was: Curve, curve: Curve) -> float | None:
     """Change in percent of the mean slope over the range (least squares), None where it was nothing."""
 
-    def slope(one: Curve) -> float:
-        along = np.moveaxis(one.result, one.main, 0).reshape(len(one.axes[one.main]), -1).mean(axis=1)
-        axis = one.axes[one.main] - one.axes[one.main].mean()
+    def slope(curve: Curve) -> float:
+        along = np.moveaxis(curve.result, curve.main, 0).reshape(len(curve.axes[curve.main]), -1).mean(axis=1)
+        axis = curve.axes[curve.main] - curve.axes[curve.main].mean()
         return float((axis * along).sum() / max((axis * axis).sum(), 1e-300))
 
     before, after = slope(was), slope(curve)

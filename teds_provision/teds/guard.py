@@ -315,7 +315,7 @@ def misfit(calibration: Calibration, had: Channel, now: Channel, of: ChannelProf
     if not had.described:
         return "nothing says for what channel it was made"
     if had.kind is not now.kind:
-        words = [one.kind.word if one.kind is not None else "unknown" for one in (had, now)]
+        words = [channel.kind.word if channel.kind is not None else "unknown" for channel in (had, now)]
         return f"it was made for another type of channel ({words[0]}, not {words[1]})"
     if had.units != now.units:
         return f"it was made for values in {had.si_unit}, and these are in {now.si_unit}"
@@ -341,7 +341,7 @@ def _beyond_raw_range(calibration: Calibration, had: Channel, now: Channel, raw:
         return f"it was made for {told[0]}, and this channel gives {told[1]}"
     if now.actuator or max(abs(raw[0] - before[0]), abs(raw[1] - before[1])) <= step:
         return ""  # points beyond the range were taken when it was made for this very one
-    part = next((one for one in calibration.inputs if one.channel == now.number), calibration.inputs[0])
+    part = next((given for given in calibration.inputs if given.channel == now.number), calibration.inputs[0])
     if part.boundaries[0] < raw[0] - step or part.boundaries[-1] > raw[1] + step:
         return f"it covers raw {part.boundaries[0]:.8g} to {part.boundaries[-1]:.8g}, and this channel gives {told[1]}"
     return ""
@@ -349,7 +349,7 @@ def _beyond_raw_range(calibration: Calibration, had: Channel, now: Channel, raw:
 
 def _points_beyond(calibration: Calibration, had: Channel, now: Channel) -> str:
     """Points of it that new limits leave out; the old limits are the guard's matter."""
-    same = [one for one in ("low", "high") if getattr(had, one) == getattr(now, one)]
+    same = [bound for bound in ("low", "high") if getattr(had, bound) == getattr(now, bound)]
     part = calibration.inputs[0]
     if len(same) == 2 or now.full_turn or len(calibration.inputs) > 1 or not now.has_range:
         return ""

@@ -108,7 +108,9 @@ class Sheet:
         """The same datasheet, with the values of these channels shown to people in these units, where they fit."""
         if not units:
             return self
-        return replace(self, channels=tuple(replace(one, display=units.get(one.number, "")) for one in self.channels))
+        return replace(
+            self, channels=tuple(replace(channel, display=units.get(channel.number, "")) for channel in self.channels)
+        )
 
     def channel(self, number: int) -> Channel | None:
         """Channel of that number, None where it is not described."""

@@ -20,19 +20,23 @@ from teds_provision.api import bodies
 from teds_provision.api.operations import OPERATIONS, document
 from teds_provision.api.schema import BadRequestError, read, schema_of
 
-BODIES = [one.body for one in OPERATIONS if one.body is not None]
+BODIES = [operation.body for operation in OPERATIONS if operation.body is not None]
 SCHEMAS = document()["components"]["schemas"]
 TEXTS = st.sampled_from(["", "transparent", "free", "gripper", "x.toml", "../x", "noise", "ab" * 10])
 NUMBERS = st.sampled_from(
     [0, 1, -1, 1.0, 0.5, 20, 61, 255, 256, 1e6, 1000.0, 10_001, 10**30, 1e300, 1e301, -0.0]
 ) | st.integers(-5, 300)
-VALUES = st.recursive(st.none() | st.booleans() | NUMBERS | TEXTS, lambda one: st.lists(one, max_size=3), max_leaves=4)
+VALUES = st.recursive(
+    st.none() | st.booleans() | NUMBERS | TEXTS,
+    lambda search_strategy: st.lists(search_strategy, max_size=3),
+    max_leaves=4,
+)
 
 
 @pytest.mark.parametrize("body", BODIES, ids=lambda body: str(body.__name__))
 @given(data=st.data())
 def test_a_body_is_refused_exactly_where_its_published_schema_forbids_it(body: type[Any], data: st.DataObject) -> None:
-    names = st.sampled_from([one.name for one in dataclasses.fields(body)] + ["x"])
+    names = st.sampled_from([field.name for field in dataclasses.fields(body)] + ["x"])
     members = data.draw(st.dictionaries(names, VALUES, max_size=4))
     published = jsonschema.Draft202012Validator(schema_of(body, {})).is_valid(members)
     try:
@@ -131,7 +135,7 @@ def test_a_refusal_names_the_member_and_what_it_may_be(body: type[Any], members:
     ],
 )
 def test_the_client_takes_what_the_body_takes(method: Any, body: type[Any], besides: set[str]) -> None:
-    members = {one.name for one in dataclasses.fields(body)} - {"format"}  # the content shows what it is
+    members = {field.name for field in dataclasses.fields(body)} - {"format"}  # the content shows what it is
     assert set(inspect.signature(method).parameters) - {"self"} == members | besides
 
 
@@ -144,8 +148,8 @@ FREE = {"power", "live", "moment", "modeOf"}  # what has no schema: flags of a b
 
 
 def member(schema: dict[str, Any], name: str) -> dict[str, Any] | None:
-    for one in schema.get("anyOf", [schema]):
-        whole = SCHEMAS[one["$ref"].rpartition("/")[2]] if "$ref" in one else one
+    for item in schema.get("anyOf", [schema]):
+        whole = SCHEMAS[item["$ref"].rpartition("/")[2]] if "$ref" in item else item
         if name in whole.get("properties", {}):
             return dict(whole["properties"][name])
     return None

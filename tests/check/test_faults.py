@@ -15,10 +15,10 @@ OF_FRAMES = {"can-flow-control", "can-form", "nfc-wait-time", "nfc-wtx", "identi
 """Rules that hear frames, which a link in memory has none of: ``test_link_rules`` finds faults by them."""
 
 
-def run(station: Station, patch: pytest.MonkeyPatch, one: Faulty) -> CheckReport:
-    if one.bend is not None:
-        one.bend(patch)
-    return checked(station, patch, over=one.over, fault=one.fault, **one.link)
+def run(station: Station, patch: pytest.MonkeyPatch, faulty: Faulty) -> CheckReport:
+    if faulty.bend is not None:
+        faulty.bend(patch)
+    return checked(station, patch, over=faulty.over, fault=faulty.fault, **faulty.link)
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -26,7 +26,7 @@ def test_a_faulty_node_is_found_by_its_rule(station: Station, monkeypatch: pytes
     one = FAULTS[name]
     report = run(station, monkeypatch, one)
     found = failed(report)
-    assert one.rule in found, (found, [each for each in report.checks if each.result == "skipped"])
+    assert one.rule in found, (found, [result for result in report.checks if result.result == "skipped"])
     assert one.words in found[one.rule].detail
     assert found[one.rule].slip == one.slip
     if "*" not in one.also:
@@ -34,7 +34,7 @@ def test_a_faulty_node_is_found_by_its_rule(station: Station, monkeypatch: pytes
 
 
 def test_the_table_leaves_out_only_rules_that_another_fault_breaks_first() -> None:
-    found, every = {one.rule for one in FAULTS.values()}, {each.name for each in RULES}
+    found, every = {faulty.rule for faulty in FAULTS.values()}, {rule.name for rule in RULES}
     assert len(FAULTS) >= 40
     assert found <= every
     assert every - found == OF_FRAMES | SISTERS

@@ -78,7 +78,7 @@ def test_without_factory_a_factory_node_is_left_as_it_was(station: Station) -> N
     report = checked(station, board, factory=False)
     assert board.state == before
     assert not names(report, "failed")
-    tried = {each.name for each in RULES if each.stage in (Stage.PLAIN, Stage.FACTORY)}
+    tried = {rule.name for rule in RULES if rule.stage in (Stage.PLAIN, Stage.FACTORY)}
     assert names(report, "passed") == tried - OF_FRAMES - OF_STATIONS
 
 
@@ -103,7 +103,7 @@ def test_a_run_that_was_cut_leaves_a_node_of_ours(station: Station) -> None:
     report = checked(station, board, factory=False)
     assert board.state.key == held
     assert not names(report, "failed")
-    in_sessions = {each.name for each in RULES if each.stage in (Stage.KEYED, Stage.SESSION)}
+    in_sessions = {rule.name for rule in RULES if rule.stage in (Stage.KEYED, Stage.SESSION)}
     assert in_sessions - OF_STATIONS - {"keyed-untapped", "operate-lease"} <= names(report, "passed")
     again = checked(station, board)
     assert not names(again, "failed")
@@ -296,5 +296,5 @@ def test_a_node_that_falls_silent_loses_no_report(station: Station, via: str) ->
 
 def test_every_clause_is_a_section_of_the_page() -> None:
     sections = set(re.findall(r"^## (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE))
-    assert {each.section for each in RULES} <= sections
-    assert len({each.name for each in RULES}) == len(RULES)
+    assert {rule.section for rule in RULES} <= sections
+    assert len({rule.name for rule in RULES}) == len(RULES)

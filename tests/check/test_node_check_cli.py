@@ -35,7 +35,7 @@ def check(desk: Desk, name: str, *words: object) -> Outcome:
 
 
 def test_a_virtual_node_on_a_bus_keeps_every_rule(desk: Desk) -> None:
-    assert {each.run.__module__ for each in RULES} == {module.__name__ for module in ROOMS}
+    assert {rule.run.__module__ for rule in RULES} == {module.__name__ for module in ROOMS}
     node = desk.node().start(nfc=False, can=True)
     outcome = check(desk, "bench", "check", "--factory", "--yes")
     assert outcome.code == 0, outcome
@@ -43,7 +43,7 @@ def test_a_virtual_node_on_a_bus_keeps_every_rule(desk: Desk) -> None:
     assert told["uuid"] == node.uuid
     assert (told["passed"], told["failed"], told["skipped"]) == (len(RULES) - 4, 0, 4), "NFC, a tap, and channels"
     assert set(told["checks"][0]) == {"rule", "clause", "result", "detail", "slip"}
-    assert {each["slip"] for each in told["checks"]} == {None}
+    assert {check["slip"] for check in told["checks"]} == {None}
     assert "explain" not in told
 
 

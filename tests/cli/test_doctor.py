@@ -52,11 +52,11 @@ def test_it_works_before_there_is_a_station_and_makes_nothing(tmp_path: Path) ->
 def test_a_broken_config_stops_every_command_but_doctor(home: Path) -> None:
     (home / "config.toml").write_text("via = [")
     assert call(home, "nodes").code == 8
-    checks = {one["name"]: one for one in call(home, "--json", "doctor").json["checks"]}
+    checks = {check["name"]: check for check in call(home, "--json", "doctor").json["checks"]}
     assert checks["config"]["result"] == "failed"
     assert checks["store"]["result"] == "ok"
     (home / "config.toml").write_text("via = 'nfc'\nno_input = true\n[provision]\nprofile = 'load-cell'\nprofle = 1\n")
-    config = {one["name"]: one for one in call(home, "--json", "doctor").json["checks"]}["config"]
+    config = {check["name"]: check for check in call(home, "--json", "doctor").json["checks"]}["config"]
     assert "provision.profle" in config["why"]
     assert "no_input" not in config["why"]
 
@@ -67,7 +67,7 @@ def test_values_that_no_command_takes_and_profiles_that_cannot_be_read_are_told(
     (home / "profiles").mkdir()
     (home / "profiles" / "mine.toml").write_text("x = [")
     done = call(home, "--json", "doctor")
-    checks = {one["name"]: one for one in done.json["checks"]}
+    checks = {check["name"]: check for check in done.json["checks"]}
     assert done.code == 1
     assert (checks["config"]["result"], "provision.timeout = -3" in checks["config"]["why"]) == ("failed", True)
     assert (checks["profiles"]["result"], "profile mine" in checks["profiles"]["why"]) == ("failed", True)

@@ -98,7 +98,7 @@ def test_a_pipe_that_nobody_writes_to_is_no_file(bench: Path, command: str, fifo
     said = call(bench, "--json", *arranged(bench, command, fifo))
     assert time.monotonic() - began < SECONDS
     if command == "CONFIG doctor":
-        (check,) = [one for one in said.json["checks"] if one["name"] == "config"]
+        (check,) = [check for check in said.json["checks"] if check["name"] == "config"]
         assert (check["result"], "is a pipe" in check["why"]) == ("failed", True)
         return
     assert said.code in (3, 7, 8), said.out

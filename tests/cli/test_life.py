@@ -124,8 +124,10 @@ def test_groups_names_and_measurements_follow_the_spare_and_forget_what_is_gone(
         station.measurements.set_frame(octets, 0, "tool")
         for group, uuids in (("crane", [old, other]), ("single", [old])):
             station.groups.create(group, [bytes.fromhex(uuid) for uuid in uuids])
-        for one in ("a", "b"):
-            kept = KeptMeasurement(one, group="single" if one == "a" else None, uuids=() if one == "a" else (octets,))
+        for item in ("a", "b"):
+            kept = KeptMeasurement(
+                item, group="single" if item == "a" else None, uuids=() if item == "a" else (octets,)
+            )
             station.measurements.keep(kept)
         station.measurements.rename(bytes.fromhex(spare), 2, "other name")
         station.measurements.rename(octets, 2, "angle")
@@ -136,12 +138,12 @@ def test_groups_names_and_measurements_follow_the_spare_and_forget_what_is_gone(
     assert "'angle' of channel 2" in moved["kept"][0]
     again = yard.done("north", "replace", old, spare, "--yes")
     assert (again["fresh"], again["moved"]["groups"]) == (False, [])
-    groups = {one["name"]: one["uuids"] for one in yard.done("north", "group", "list")["groups"]}
+    groups = {group["name"]: group["uuids"] for group in yard.done("north", "group", "list")["groups"]}
     assert groups == {"crane": sorted([spare, other]), "single": [spare]}
 
     gone = yard.done("north", "decommission", spare, "--force", "--yes", *yard.nowhere)["removed"]
     assert (gone["groups"], gone["measurements"], gone["ended"]) == (["crane", "single"], [], ["a", "b"])
-    groups = {one["name"]: one["uuids"] for one in yard.done("north", "group", "list")["groups"]}
+    groups = {group["name"]: group["uuids"] for group in yard.done("north", "group", "list")["groups"]}
     assert groups == {"crane": [other], "single": []}
     with closing(make_station(yard.homes["north"], "north")) as station:
         assert station.measurements.all() == []

@@ -33,11 +33,11 @@ def test_no_signal_handler_takes_a_lock() -> None:
     found = []
     for module in MODULES:
         tree = ast.parse(module.read_text())
-        functions = {one.name: one for one in ast.walk(tree) if isinstance(one, ast.FunctionDef)}
+        functions = {node.name: node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
         for call in ast.walk(tree):
             if isinstance(call, ast.Call) and ast.unparse(call.func) == "signal.signal":
                 handler = call.args[1]
                 body = functions.get(handler.id, handler) if isinstance(handler, ast.Name) else handler
-                taken = {ast.unparse(one.func) for one in ast.walk(body) if isinstance(one, ast.Call)}
+                taken = {ast.unparse(node.func) for node in ast.walk(body) if isinstance(node, ast.Call)}
                 found += [f"{module.name}:{call.lineno}: {name}" for name in taken if name.endswith(".set")]
     assert found == []

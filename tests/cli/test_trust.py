@@ -59,7 +59,7 @@ def test_the_whole_fingerprint_is_shown_to_compare(home: Path, pem: Path) -> Non
 def test_a_folder(home: Path, pem: Path) -> None:
     (pem.parent / "owner.ca.pem").write_text(to_pem(SoftwareKey(52).point))
     added = unlocked(home, "trust", "add", "--from", pem.parent, "--yes")
-    assert [(one["name"], one["role"]) for one in added.json["trusted"]] == [("lab", "station"), ("owner", "ca")]
+    assert [(item["name"], item["role"]) for item in added.json["trusted"]] == [("lab", "station"), ("owner", "ca")]
     key = ec.generate_private_key(ec.SECP256R1())
     (pem.parent / "oops.txt").write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
     refused = call(home, "--json", "trust", "add", "--from", pem.parent, "--yes")
@@ -129,4 +129,4 @@ def test_each_key_of_a_folder_is_asked_for(home: Path, pem: Path) -> None:
     assert done.code == 0, done
     assert spoken(DIGITS) in done.err
     assert done.out == "Now trusted: west.\n"
-    assert [one["name"] for one in call(home, "--json", "trust", "list").json["trusted"]] == ["west"]
+    assert [item["name"] for item in call(home, "--json", "trust", "list").json["trusted"]] == ["west"]

@@ -307,7 +307,9 @@ def test_a_healthy_station_has_nothing_that_failed(stationed: System, monkeypatc
 
 def test_a_home_open_to_others_gets_its_chmod(stationed: System) -> None:
     stationed.home.chmod(0o777)
-    assert [(one.result, one.fix) for one in look(stationed, "home")] == [("failed", f"chmod 700 {stationed.home}")]
+    assert [(finding.result, finding.fix) for finding in look(stationed, "home")] == [
+        ("failed", f"chmod 700 {stationed.home}")
+    ]
     stationed.home.chmod(0o755)
     (stationed.home / "vault.json").chmod(0o644)
     home, files = look(stationed, "home")
@@ -319,25 +321,25 @@ def test_a_damaged_store_and_a_broken_chain_are_exit_7(stationed: System) -> Non
     with closing(sqlite3.connect(stationed.home / "store.sqlite3")) as connection, connection:
         connection.execute("DROP TRIGGER audit_is_never_changed")
         connection.execute("UPDATE audit SET outcome = 'x'")
-    log = next(one for one in look(stationed, "store") if one.name == "audit log")
+    log = next(finding for finding in look(stationed, "store") if finding.name == "audit log")
     assert (log.result, exit_code([("store", log)])) == ("failed", 7)
     for end in ("-wal", "-shm"):
         (stationed.home / f"store.sqlite3{end}").unlink(missing_ok=True)
     (stationed.home / "store.sqlite3").write_bytes(b"no database" * 1000)
     found = list(examine(stationed))
-    store = next(one for _, one in found if one.name == "store")
+    store = next(finding for _, finding in found if finding.name == "store")
     assert (store.result, "restore" in store.fix) == ("failed", True)
     assert exit_code(found) == 7
 
 
 def test_who_holds_the_store_is_named(stationed: System) -> None:
     with StoreLock(stationed.home, command="provision"):
-        lock = next(one for one in look(stationed, "store") if one.name == "lock")
+        lock = next(finding for finding in look(stationed, "store") if finding.name == "lock")
     assert lock.result == "warning"
     assert re.fullmatch(rf"The store is locked by pid {os.getpid()} \(provision\) since [0-9T:-]+Z\.", lock.why), (
         lock.why
     )
-    lock = next(one for one in look(stationed, "store") if one.name == "lock")
+    lock = next(finding for finding in look(stationed, "store") if finding.name == "lock")
     assert (lock.result, lock.why) == ("ok", "The store is not locked.")
 
 
@@ -350,11 +352,11 @@ def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: S
 def test_nodes_without_a_backup_are_a_warning(stationed: System) -> None:
     with Store.open(stationed.home) as store:
         store.put_node(NodeRecord(bytes(10)))
-    backup = next(one for one in look(stationed, "store") if one.name == "backup")
+    backup = next(finding for finding in look(stationed, "store") if finding.name == "backup")
     assert (backup.result, backup.fix) == ("warning", "teds-provision backup FILE")
     with Store.open(stationed.home) as store:
         store.audit.append("backup", None, "done")
-    assert next(one for one in look(stationed, "store") if one.name == "backup").result == "ok"
+    assert next(finding for finding in look(stationed, "store") if finding.name == "backup").result == "ok"
 
 
 def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: System, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ def made(desk: Desk, name: str) -> tuple[Node, str]:
 
 
 def entry(station: Station, uuid: str) -> dict[str, Any]:
-    (found,) = [one for one in station.ask("whitelist", "list")["whitelist"] if one["uuid"] == uuid]
+    (found,) = [item for item in station.ask("whitelist", "list")["whitelist"] if item["uuid"] == uuid]
     return dict(found)
 
 

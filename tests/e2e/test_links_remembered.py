@@ -32,12 +32,12 @@ def test_a_node_is_found_where_it_was_met_last_and_the_program_alone_says_who_is
     assert "config set can" in said["next"]
     station.ask("config", "set", "can", desk.links.can)
     said = alone(station)
-    assert [(one["uuid"], one["link"], one["whitelisted"]) for one in said["nodes"]] == [(node.uuid, at, False)]
+    assert [(node["uuid"], node["link"], node["whitelisted"]) for node in said["nodes"]] == [(node.uuid, at, False)]
     assert said["next"].startswith("teds-provision identify --add")
     station.ask("config", "unset", "can")
     station.provision("can", "--profile", ANGLE, "--name", ARM)
     said = alone(station)
-    assert [(one["name"], one["verdict"]) for one in said["nodes"]] == [(ARM, "authentic")], "by its last bus"
+    assert [(node["name"], node["verdict"]) for node in said["nodes"]] == [(ARM, "authentic")], "by its last bus"
     assert shlex.split(said["next"]) == ["teds-provision", "measure", ARM], "as it would be typed"
     assert station.ask("verify", ARM)["verdict"] == "authentic", "no link is named"
     # the bus that somebody names goes before the one that is remembered, and is remembered from then on

@@ -82,7 +82,7 @@ def test_a_dry_run_plans_every_node_of_the_bus_that_is_meant(station: Station, b
     done = station.run("--json", "provision", "--all", "--profile", ANGLE, "--dry-run", *links)
     told = [json.loads(line) for line in done.out.splitlines()]
     assert (done.code, told.pop()) == (0, {"totals": {"planned": 2, "failed": 0}})  # the first lacks its calibration
-    plans = {one["uuid"]: one["plan"] for one in told}
+    plans = {item["uuid"]: item["plan"] for item in told}
     rest = ["build", "sign", "write", "verify", "check"]
     assert plans == {UUIDS[0]: ["identify", *rest], UUIDS[1]: ["identify", "agree", *rest]}
     sheet = tmp_path / "boards.csv"

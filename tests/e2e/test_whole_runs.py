@@ -248,8 +248,8 @@ def test_a_draft_renames_nobody_until_it_is_written(station: Station, desk: Desk
     station.ask("build", node.uuid, "--name", "index")
     station.ask("build", node.uuid)  # nothing else is asked for: what lies ready keeps its name
     station.ask("build", other.uuid, "--name", "index")
-    for one in (node, other):
-        station.ask("sign", one.uuid)
+    for known_node in (node, other):
+        station.ask("sign", known_node.uuid)
     station.ask("write", node.uuid, *links)
     assert named() == "index"
     assert "already has the name 'index'" in station.refuses("write", other.uuid, *links, code=6)["message"]

@@ -100,8 +100,8 @@ class Desk:
                 module, [*options, *self.words(words)], clean_environment() | (fault or {}), tuple(secrets)
             )
         finally:
-            for each in secrets:
-                os.close(each)
+            for descriptor in secrets:
+                os.close(descriptor)
 
     def run(
         self,

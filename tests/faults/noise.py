@@ -35,7 +35,7 @@ def crowd(bench: Bench, processes: int = 8) -> str:
         others = [f"{number:02x}" * 10 for number in range(1, processes)]
         words = [("whitelist", "add", uuid) for uuid in others] + [act.words]
         with ThreadPoolExecutor(processes) as pool:
-            done = list(pool.map(lambda each: desk.run(*each), words))
+            done = list(pool.map(lambda item: desk.run(*item), words))
         failed = [f"{run.returncode}: {run.stdout[-200:]}" for run in done if run.returncode]
         listed = desk.run("whitelist", "list").stdout
         missing = [uuid for uuid in [*others, UUID] if uuid not in listed]

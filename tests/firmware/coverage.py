@@ -38,12 +38,12 @@ def counted(build: Path) -> dict[str, Counts]:
 
 def take(said: dict[str, list[dict[str, object]]], found: dict[str, Counts]) -> None:
     """Add what gcov says of one object."""
-    for each in said["files"]:
-        path = Path(str(each["file"]))
+    for file in said["files"]:
+        path = Path(str(file["file"]))
         if path.parent.name != "src" or path.suffix != ".c":
             continue
         counts = found[path.name]
-        lines: list[dict[str, object]] = each["lines"]  # type: ignore[assignment]
+        lines: list[dict[str, object]] = file["lines"]  # type: ignore[assignment]
         for line in lines:
             number: int = line["line_number"]  # type: ignore[assignment]
             branches: list[dict[str, int]] = line["branches"]  # type: ignore[assignment]
@@ -54,7 +54,7 @@ def take(said: dict[str, list[dict[str, object]]], found: dict[str, Counts]) -> 
 
 def reached(counts: list[Counts], branches: bool) -> tuple[int, int]:
     """How many were reached, of how many."""
-    every = [seen for each in counts for (_, place), seen in each.items() if (place >= 0) is branches]
+    every = [seen for count in counts for (_, place), seen in count.items() if (place >= 0) is branches]
     return sum(every), len(every)
 
 

@@ -164,8 +164,8 @@ class Bus:
         due = [until, *(at for at, *_ in self.flying), *(station.due for station in self.stations)]
         due += [node.poll() for node in self.nodes]
         self.now = max(self.now + 1000, min(due))
-        arrived = sorted(each for each in self.flying if each[0] <= self.now)
-        self.flying = [each for each in self.flying if each[0] > self.now]
+        arrived = sorted(pair for pair in self.flying if pair[0] <= self.now)
+        self.flying = [pair for pair in self.flying if pair[0] > self.now]
         for _, _, frame, sender in arrived:
             for node in self.nodes:
                 if node is not sender:
@@ -296,7 +296,7 @@ class Station:
                 self.begin(body)
                 until = self.bus.now + 5 * SECOND
                 while self.bus.now < until:
-                    mine = [each for each in self.replies if each[:1] == body[:1]]
+                    mine = [reply for reply in self.replies if reply[:1] == body[:1]]
                     if mine and mine[0][1:] == b"\0\0\1\x11" and self.at < len(self.body):
                         pause = self.bus.now + 100 * MS  # in place of a flow control
                         while self.bus.now < pause:
@@ -319,11 +319,11 @@ def run(bus: Bus, *conversations: Iterator[None]) -> None:
     until = bus.now + 3600 * SECOND
     while live:
         assert bus.now < until, "it never ends"
-        for each in list(live):
+        for iterator in list(live):
             try:
-                next(each)
+                next(iterator)
             except StopIteration:
-                live.remove(each)
+                live.remove(iterator)
         if live:
             bus.turn(bus.now + 50 * MS)
 

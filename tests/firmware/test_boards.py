@@ -206,4 +206,4 @@ def test_kconfig_takes_in_what_psa_is_asked_for() -> None:
     psa = (builds.FIRMWARE / "port" / "psa" / "teds_psa.c").read_text()
     asked = set(re.findall(r"PSA_ALG_(DETERMINISTIC_ECDSA|ECDSA|ECDH|CCM|HMAC|SHA_256)\b", psa))
     assert asked == {"DETERMINISTIC_ECDSA", "ECDSA", "ECDH", "CCM", "HMAC", "SHA_256"}
-    assert all(f"\tselect PSA_WANT_ALG_{one}\n" in kconfig for one in asked)
+    assert all(f"\tselect PSA_WANT_ALG_{item}\n" in kconfig for item in asked)

@@ -169,7 +169,7 @@ def test_it_compiles_at_the_ends_of_every_size(end: int) -> None:
 def test_a_size_beyond_its_bounds_does_not_compile(word: str) -> None:
     """Where an index would wrap, and the warning that says so is not asked for."""
     builds.need("make", "gcc")
-    words = [f"-D{each}" for each in word.split()]
+    words = [f"-D{name}" for name in word.split()]
     done = _compiles(*words, what=[str(builds.FIRMWARE / "src/octets.c"), str(builds.FIRMWARE / "src/isotp.c")])
     assert done.returncode != 0
     assert "#error" in done.stderr

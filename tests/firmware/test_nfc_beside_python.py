@@ -84,8 +84,8 @@ def taps() -> Iterator[Callable[[int, int], Taps]]:
         return made[-1]
 
     yield make
-    for each in made:
-        each.close()
+    for taps in made:
+        taps.close()
 
 
 def command(dice: random.Random) -> bytes:

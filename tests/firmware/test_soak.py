@@ -87,7 +87,7 @@ def test_two_hundred_nodes_in_c_are_found_on_one_bus_and_some_provisioned(desk: 
     began = time.monotonic()
     found = station.ask("identify", "--timeout", "15", *links)
     print(f"{len(found['nodes'])} nodes found in {time.monotonic() - began:.1f} s")
-    assert {each["uuid"] for each in found["nodes"]} == set(uuids)
+    assert {node["uuid"] for node in found["nodes"]} == set(uuids)
     for uuid in uuids[:3]:
         address = default_can_address(bytes.fromhex(uuid))
         here = [*links[:-1], f"{links[-1]}&node={address}"]

@@ -560,9 +560,9 @@ def check_plant(data: bytes) -> None:
         elif kind is document.PAGE:
             opened = page.open_page(octets, "6f1c0a52-6f0e-4c1b-8a55-0d9ce5609c29", lambda kid: key.point)
             gathered = claim.Claim()
-            for one in map(event.read, opened.events):
-                if isinstance(one, event.Event):
-                    gathered.apply_event(one)
+            for stated in map(event.read, opened.events):
+                if isinstance(stated, event.Event):
+                    gathered.apply_event(stated)
             assert claim.Claim.from_json(gathered.to_json()) == gathered
         else:
             document.open_request(octets)

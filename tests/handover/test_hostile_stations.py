@@ -243,9 +243,9 @@ def test_trust_that_is_removed_ends_with_all_that_hung_on_it(pair: Pair) -> None
 def test_a_ca_that_two_stations_brought_stays_until_both_are_gone(pair: Pair, west: Station) -> None:
     trust(pair.south, west)
     pair.take(pair.export("copy")[0])
-    (north,) = (one for one in pair.south.policy.trusted("station") if one.name == "north")
+    (north,) = (trusted for trusted in pair.south.policy.trusted("station") if trusted.name == "north")
     assert plan_removal(pair.south, north).cas == (pair.north.ca,)
-    (other,) = (one for one in pair.south.policy.trusted("station") if one.name == "west")
+    (other,) = (trusted for trusted in pair.south.policy.trusted("station") if trusted.name == "west")
     assert plan_removal(pair.south, other).cas == ()
 
 
@@ -294,7 +294,7 @@ def test_a_ban_counts_only_from_a_station_with_authority_and_for_the_key_it_name
         seal_revocation(key, uuid=own.uuid, node=pinned, why="no authority", created=now),
         seal_revocation(key, uuid=bytes(10), node="ab" * 32, why="unknown node", created=now),
     )
-    plan = plan_import(pair.south, forged(west, pair.south, revoked=tuple(one.statement for one in said)))
+    plan = plan_import(pair.south, forged(west, pair.south, revoked=tuple(revocation.statement for revocation in said)))
     assert isinstance(plan, ImportPlan)
     assert plan.denied == ()
     assert ["no authority" in why or "is unknown here" in why for _, why in plan.passed_over] == [True, True]
@@ -341,8 +341,8 @@ def test_names_of_a_bundle_never_stand_for_two_nodes_or_for_digits(pair: Pair) -
     nodes = [node_of(board, name=name) for board, name in zip(boards, names, strict=True)]
     plan = plan_import(pair.south, forged(pair.north, pair.south, *nodes))
     assert isinstance(plan, ImportPlan)
-    assert [one.name for one in plan.nodes] == ["gripper-0101", "gripper-0202", "8d4d-0303"]
-    assert all("is called" in one.notes[0] for one in plan.nodes)
+    assert [planned.name for planned in plan.nodes] == ["gripper-0101", "gripper-0202", "8d4d-0303"]
+    assert all("is called" in planned.notes[0] for planned in plan.nodes)
     import_bundle(pair.south, plan)
     assert pair.south.nodes.resolve("gripper") == mine
     assert pair.south.nodes.resolve("gripper-0202") == boards[1].uuid
@@ -353,7 +353,7 @@ def test_names_of_a_bundle_never_stand_for_two_nodes_or_for_digits(pair: Pair) -
 
 def several(pair: Pair, mode: Mode, output: Path) -> list[str]:
     plans = plan_exports(pair.north, ExportOrder(("south",), None, mode), most=2)
-    return [one.plan.id for one in export_all(pair.north, plans, outputs_of(output, len(plans)))]
+    return [exported.plan.id for exported in export_all(pair.north, plans, outputs_of(output, len(plans)))]
 
 
 @pytest.mark.parametrize("mode", ["copy", "move"])

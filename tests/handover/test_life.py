@@ -71,7 +71,7 @@ def test_the_deny_list_travels_in_every_bundle_and_is_honoured(pair: Pair) -> No
     path, _exported = pair.export("copy", nodes=(good.uuid,))
     plan = plan_import(pair.south, path.read_bytes())
     assert isinstance(plan, ImportPlan)
-    assert [one.why for one in plan.denied] == ["lost in transit"]
+    assert [revocation.why for revocation in plan.denied] == ["lost in transit"]
     import_bundle(pair.south, plan)
     with talk(lost) as node, pytest.raises(PolicyError, match="was revoked: lost in transit"):
         agree(pair.south, node, identify(pair.south, node))

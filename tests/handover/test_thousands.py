@@ -102,10 +102,10 @@ def test_names_and_keys_are_held_against_all_that_a_large_receiver_knows(
     with (tmp_path / "all.jwe").open("rb") as file:
         plan = plan_import(south, file)
     assert isinstance(plan, ImportPlan)
-    assert [(one.node.uuid, one.why) for one in plan.nodes if one.why] == [
+    assert [(planned.node.uuid, planned.why) for planned in plan.nodes if planned.why] == [
         (last, "this UUID is known here with another node key")
     ]
-    renamed = {one.node.name: one.name for one in plan.taken if one.name != one.node.name}
+    renamed = {planned.node.name: planned.name for planned in plan.taken if planned.name != planned.node.name}
     assert renamed == {"finger 7": f"finger 7-{uuid_of(7).hex()[-4:]}"}
     import_bundle(south, plan)
     assert len(south.nodes.all()) == COUNT + 1

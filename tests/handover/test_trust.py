@@ -113,7 +113,10 @@ def test_a_folder_of_keys_with_roles_by_name(north: Station, keys: Path) -> None
     (keys / "own.pem").write_text(to_pem(north.point))
     (keys / "README.md").write_text("Public keys.")
     found = candidates_of(north, keys, "station")
-    assert [(one.record.name, one.record.role) for one in found] == [("lab", "station"), ("owner", "ca")]
+    assert [(found_key.record.name, found_key.record.role) for found_key in found] == [
+        ("lab", "station"),
+        ("owner", "ca"),
+    ]
     add(north, found)
     assert SoftwareKey(22).point in north.policy.trusted_cas()
 

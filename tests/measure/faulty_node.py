@@ -266,7 +266,7 @@ SPOILING = (
     too_fast, too_slow, jumping_clock, backward_clock, clock_of_tomorrow, wrong_length, wrong_start, refuses_claims,
     out_of_range, not_valid, test_pattern, babbles, good,
 )  # fmt: skip
-FAULTS: dict[str, Callable[..., None]] = {one.__name__: one for one in (*BENDING, *SPOILING)}
+FAULTS: dict[str, Callable[..., None]] = {item.__name__: item for item in (*BENDING, *SPOILING)}
 
 
 def main() -> None:

@@ -145,7 +145,7 @@ class Hall:
     def address(self, name: str) -> int:
         """Where a node is on the bus now: a stranger may have moved it."""
         told = self.ask("identify", "--via", "can")
-        return int(next(one["can_address"] for one in told["nodes"] if one["uuid"] == self.nodes[name].uuid))
+        return int(next(node["can_address"] for node in told["nodes"] if node["uuid"] == self.nodes[name].uuid))
 
     def ask(self, *words: object, code: int = 0) -> Any:
         """Another command on the bus, to its end."""

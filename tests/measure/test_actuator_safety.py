@@ -272,9 +272,9 @@ def publishers() -> Iterator[list[subprocess.Popen[bytes]]]:
     """Publishers that a test starts; none outlives it."""
     started: list[subprocess.Popen[bytes]] = []
     yield started
-    for one in started:
-        one.kill()
-        one.wait()
+    for process in started:
+        process.kill()
+        process.wait()
 
 
 def listen(hall: Hall, ros: Ros1 | Ros2) -> Running:

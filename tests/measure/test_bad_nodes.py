@@ -118,8 +118,8 @@ def test_every_fault_is_here_and_the_good_node_is_not_disturbed(seen: dict[str, 
 
 
 def test_no_value_is_published_that_is_not_the_calibrated_raw_value(seen: dict[str, Seen]) -> None:
-    for fault, one in seen.items():
-        for line in one.data:
+    for fault, seen_node in seen.items():
+        for line in seen_node.data:
             assert len(line["raw"]) == len(line["value"]) == len(line["valid"]) == len(line["time"])
             for raw, value, valid in zip(line["raw"], line["value"], line["valid"], strict=True):
                 assert (value is not None) == valid, fault
@@ -128,8 +128,8 @@ def test_no_value_is_published_that_is_not_the_calibrated_raw_value(seen: dict[s
 
 
 def test_times_of_a_node_never_go_back_whatever_it_does(seen: dict[str, Seen]) -> None:
-    for fault, one in seen.items():
-        times = [instant for line in one.data for instant in line["time"]]
+    for fault, seen_node in seen.items():
+        times = [instant for line in seen_node.data for instant in line["time"]]
         assert times == sorted(times), fault
 
 

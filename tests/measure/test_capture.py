@@ -117,5 +117,5 @@ def test_two_at_once_into_one_file_lose_no_point(hall: Hall, angle: Shaft, tmp_p
     file = tmp_path / "both.csv"
     words = ("--json", "calibrate", "capture", "angle", 1, "--reference", 1, "--to", file, "--can", hall.can)
     both = [hall.station.start(*words) for _ in range(2)]
-    assert [one.end().code for one in both] == [0, 0]
+    assert [running.end().code for running in both] == [0, 0]
     assert file.read_text().count("1, 30000, ") == 2

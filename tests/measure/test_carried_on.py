@@ -43,11 +43,11 @@ def missing(lines: list[dict[str, Any]]) -> float:
     """
     streams = [stream for node in lines[-1]["nodes"] for stream in node["streams"]]
     assert streams
-    assert all(one["bad"] == 0 for one in streams), streams
+    assert all(stream["bad"] == 0 for stream in streams), streams
     assert lines[-1]["event"] == "end", lines[-1]
     if ran(lines) != ["running", "ended"] * len(lines[-1]["nodes"]) and "lost" in ran(lines):
         return 1.0
-    return max((one["lost"] + one["late"]) / max(1, one["messages"] + one["lost"]) for one in streams)
+    return max((stream["lost"] + stream["late"]) / max(1, stream["messages"] + stream["lost"]) for stream in streams)
 
 
 WHOLE = 0.1
@@ -110,7 +110,7 @@ def test_what_was_asked_beside_is_carried_on_too(hall: Hall) -> None:
     outcome = second.end()
     assert outcome.code == 0, outcome.err
     lines = events(outcome.out)
-    assert {one["result"] for one in lines[-1]["fits"] if one["uuid"] == a} >= {"passed"}
+    assert {fit["result"] for fit in lines[-1]["fits"] if fit["uuid"] == a} >= {"passed"}
     assert all(line["test_pattern"] for line in of(lines))
     assert all(line.get("unsigned", False) is (line["uuid"] == bare) for line in of(lines))
     hall.station.ask("group", "delete", "beside")
@@ -336,7 +336,7 @@ def test_a_node_that_is_taken_off_the_whitelist_is_measured_and_moved_no_more(ha
     """The command ends by itself, its node is let go, and it is refused until the node is listed again."""
     g = hall.nodes["g"].uuid
     row = hall.station.ask("whitelist", "list")["whitelist"]
-    fingerprint = next(one["fingerprint"] for one in row if one["uuid"] == g)
+    fingerprint = next(cell["fingerprint"] for cell in row if cell["uuid"] == g)
     file = hall.folder / f"unlisted-{command}.csv"
     if command == "measure":
         running = hall.begin(g, "--rate", 20, "--to", file)
@@ -355,7 +355,7 @@ def test_a_node_that_is_taken_off_the_whitelist_is_measured_and_moved_no_more(ha
     finally:
         hall.station.ask("whitelist", "add", g, "--fingerprint", fingerprint)
     mode = hall.station.ask("mode", g, "--can", hall.can)
-    assert all(one["claimant"] == 0 for one in mode["channels"]), mode
+    assert all(channel["claimant"] == 0 for channel in mode["channels"]), mode
 
 
 def test_a_set_point_holds_its_source_address_too_where_it_was_named(hall: Hall) -> None:

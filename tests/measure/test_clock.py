@@ -166,8 +166,8 @@ def test_a_clock_that_lies_is_found() -> None:
 
     def lie(*exchanges: Exchange) -> str:
         clock = ClockMap()
-        for one in exchanges:
-            clock.exchange(one)
+        for exchange in exchanges:
+            clock.exchange(exchange)
         return clock.lie
 
     assert lie(honest, later) == ""

@@ -63,7 +63,7 @@ def stamps(path: Path) -> list[float]:
     if path.suffix == ".mcap":
         with path.open("rb") as file:
             found = make_reader(file).iter_messages()
-            return [one.log_time / 1e9 for _, channel, one in found if "/stream_" in channel.topic]
+            return [message.log_time / 1e9 for _, channel, message in found if "/stream_" in channel.topic]
     if path.suffix == ".jsonl":
         return [instant for line in of(events(path.read_text())) for instant in line["time"]]
     lines = [line for line in path.read_text().splitlines() if line[:1].isdigit()]
@@ -74,7 +74,9 @@ def notes(path: Path) -> list[str]:
     """What a recording says of itself."""
     if path.suffix == ".mcap":
         with path.open("rb") as file:
-            return [one.metadata["note"] for one in make_reader(file).iter_metadata() if one.name == "note"]
+            return [
+                metadata.metadata["note"] for metadata in make_reader(file).iter_metadata() if metadata.name == "note"
+            ]
     if path.suffix == ".jsonl":
         return [line["why"] for line in events(path.read_text()) if line["event"] == "note"]
     return [line for line in path.read_text().splitlines() if "clock was set" in line]

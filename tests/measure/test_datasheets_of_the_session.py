@@ -57,11 +57,11 @@ def test_no_value_is_handed_on_before_it_is_known_what_it_means(hall: Hall, tmp_
     late = {"program": (sys.executable, "-c", LATE), "fork": False}
     words = ("--rate", 100, "--duration", 2, "--unsigned", "--to", file)
     lines = hall.measure(*uuids.values(), *words, "--to", file.with_suffix(".jsonl"), **late)
-    parts = [Path(one).read_text().splitlines() for one in lines[-1]["files"] if one.endswith(".csv")]
+    parts = [Path(file).read_text().splitlines() for file in lines[-1]["files"] if file.endswith(".csv")]
     facts = [json.loads(line.partition(": ")[2]) for part in parts for line in part if line.startswith("# channel: ")]
     assert facts
-    for one in facts:
-        assert one["unsigned"] if one["uuid"] == uuids["u"] else one["fingerprint"], one
+    for item in facts:
+        assert item["unsigned"] if item["uuid"] == uuids["u"] else item["fingerprint"], item
     rows = [row for part in parts for row in csv.DictReader(line for line in part if not line.startswith("#"))]
     assert {row["note"] for row in rows if row["uuid"] == uuids["u"]} == {"unsigned datasheet"}
     for name, uuid in uuids.items():
@@ -108,10 +108,10 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
     assert all(line["unsigned"] for line in told if line["event"] in ("channel", "data"))
     with file.with_suffix(".mcap").open("rb") as recording:
         found = make_reader(recording)
-        streams = [one for one in found.get_summary().channels.values() if "/stream_" in one.topic]
-        channels = [one.metadata for one in found.iter_metadata() if one.name == "channel"]
-    assert all(json.loads(one.metadata["channels"])[0]["unsigned"] is True for one in streams)
-    assert [one["unsigned"] for one in channels] == ["true"]
+        streams = [channel for channel in found.get_summary().channels.values() if "/stream_" in channel.topic]
+        channels = [metadata.metadata for metadata in found.iter_metadata() if metadata.name == "channel"]
+    assert all(json.loads(stream.metadata["channels"])[0]["unsigned"] is True for stream in streams)
+    assert [channel["unsigned"] for channel in channels] == ["true"]
     signed = of(hall.measure(hall.nodes["a"].uuid, "--rate", 20, "--duration", 1, "--unsigned"))
     assert all("unsigned" not in line and None not in line["value"] for line in signed)
 

@@ -107,8 +107,8 @@ def test_measure_goes_on_when_there_is_room_again(hall: Hall, tmp_path: Path) ->
         assert first == sorted(first)
         assert second == sorted(second)
         gap = [instant for instant in shown if first[-1] + 1e-5 < instant < second[0] - 1e-5]
-        [line] = [one for one in events(outcome.out) if one["event"] == "sink" and one["state"] == "running"
-                  and one["sink"].endswith(suffix)]  # fmt: skip
+        [line] = [event for event in events(outcome.out) if event["event"] == "sink" and event["state"] == "running"
+                  and event["sink"].endswith(suffix)]  # fmt: skip
         assert line["dropped"] == len(gap) > 100, "exactly those that no part has"
         assert str(len(gap)) in line["why"]
         assert line["why"].encode() in (kept / f"run.2.{suffix}").read_bytes(), "the part says what is missing"

@@ -75,9 +75,9 @@ class Scene:
 
     def samples(self) -> dict[str, list[object]]:
         """All blocks laid end to end."""
-        rows = {"index": [one.index + k for one in self.blocks for k in range(len(one.time))]}
+        rows = {"index": [block.index + k for block in self.blocks for k in range(len(block.time))]}
         for name in ("time", "tick", "raw", "value", "valid"):
-            rows[name] = np.concatenate([getattr(one, name) for one in self.blocks]).tolist() if self.blocks else []
+            rows[name] = np.concatenate([getattr(block, name) for block in self.blocks]).tolist() if self.blocks else []
         return rows  # type: ignore[return-value]
 
 

@@ -54,7 +54,7 @@ def moves(control: Control, process: Running, opening: float) -> bool:
     """One more cycle of the controller; whether the gripper is where it was sent by now."""
     control.cycle(opening)
     process.read(0.01)
-    return any(abs(one["value"] - opening) < 1e-4 for one in acted(process))
+    return any(abs(entry["value"] - opening) < 1e-4 for entry in acted(process))
 
 
 def acted(process: Running) -> list[dict[str, Any]]:
@@ -82,4 +82,4 @@ def test_a_gripper_is_moved_over_the_topics_of_joints(bench: Bench, domain: Doma
     running.signal(signal.SIGTERM)
     outcome = running.end()
     assert outcome.code == 0, outcome.err
-    assert {round(one["value"], 3) for one in acted(process)} <= {0.0, 0.05, 0.02}
+    assert {round(entry["value"], 3) for entry in acted(process)} <= {0.0, 0.05, 0.02}

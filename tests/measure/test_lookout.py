@@ -65,7 +65,7 @@ def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile
     assert not sightings.awaits(Announce(9, 2, uuid_crc(ONE)))
     sightings.add_sighting(seen(TWO, 9))
     waiting.join(60)
-    assert [one.address for one in found] == [9]
+    assert [sighting.address for sighting in found] == [9]
 
 
 class EmptyAir:
@@ -96,8 +96,8 @@ def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
     forged, true = seen(ONE, 7), seen(ONE, 8)
     sightings.add_sighting(forged)
     sightings.wrong(forged)
-    for one in (seen(ONE, 7), true, seen(ONE, 7)):
-        sightings.add_sighting(one)
+    for sighting in (seen(ONE, 7), true, seen(ONE, 7)):
+        sightings.add_sighting(sighting)
     assert find(sightings, ONE).address == 8
 
 
@@ -159,7 +159,7 @@ def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
         if number % 100 == 0:
             sightings.add_sighting(seen(ONE, 7))  # answers now and then, as everyone is asked every 30 s
     assert len(sightings.all()) <= MOST
-    assert {ONE, TWO} <= {one.uuid for one in sightings.all()}
+    assert {ONE, TWO} <= {sighting.uuid for sighting in sightings.all()}
 
 
 def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:

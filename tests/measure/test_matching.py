@@ -48,7 +48,7 @@ def test_a_node_s_array_is_no_channel_s_topic() -> None:
 def test_those_that_come_together_share_and_those_that_run_keep_what_they_have() -> None:
     """What a newcomer wants is known from its datasheet, so nobody waits for it to say so."""
     share = BusShare(BusTime())
-    first, second, third = (bytes([one]) * 10 for one in (1, 2, 3))
+    first, second, third = (bytes([item]) * 10 for item in (1, 2, 3))
     share.expect([first, second], 0.5)
     assert share.others(first, sharing=True).taken == pytest.approx(0.3), "half of the room is the other one's"
     share.taken[first] = share.taken[second] = 0.3

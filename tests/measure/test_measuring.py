@@ -103,7 +103,7 @@ def test_sample_gives_calibrated_values_with_unit_and_uncertainty(bench: Bench) 
 
     best_of(5, 0.5, beside)
     some = bench.ask("sample", bench.gripper.uuid, 3)["samples"]
-    assert [one["channel"] for one in some] == [3]
+    assert [item["channel"] for item in some] == [3]
 
 
 def test_sample_of_an_actuator_or_of_nothing_is_refused(bench: Bench) -> None:
@@ -282,7 +282,7 @@ def test_mode_tells_who_claims_what(bench: Bench) -> None:
     other = [word + "&source=0xF2" if "udp_multicast" in word else word for word in bench.can]
     told = bench.station.ask("mode", bench.gripper.uuid, *other)
     assert told["mode"] == "measurement"
-    by_channel = {one["channel"]: one for one in told["channels"]}
+    by_channel = {channel["channel"]: channel for channel in told["channels"]}
     assert "claimed by other" in by_channel[2]["state"]
     assert by_channel[2]["claimant"] == 0xF1
     running.signal(signal.SIGTERM)

@@ -27,7 +27,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
 
 def topics(hall: Hall) -> dict[tuple[str, int], str]:
     told = hall.station.ask("names", "list")
-    return {(one["uuid"], one["channel"]): one["topic"] for one in told["names"]}
+    return {(name["uuid"], name["channel"]): name["topic"] for name in told["names"]}
 
 
 def test_topics_are_listed_chosen_and_made_again(hall: Hall) -> None:
@@ -46,7 +46,7 @@ def test_topics_are_listed_chosen_and_made_again(hall: Hall) -> None:
 
 
 def frame_of(hall: Hall, uuid: str) -> str | None:
-    [found] = [one["frame"] for one in hall.station.ask("names", "list")["names"] if one["uuid"] == uuid]
+    [found] = [name["frame"] for name in hall.station.ask("names", "list")["names"] if name["uuid"] == uuid]
     return None if found is None else str(found)
 
 

@@ -38,14 +38,14 @@ def test_the_launch_file_says_what_the_command_takes() -> None:
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
     options = {name for option in measure.params for name in option.opts}
-    asked = {one for one in words if one.startswith("--")} - {"--no-input"}
+    asked = {word for word in words if word.startswith("--")} - {"--no-input"}
     assert asked == {"--ros2", "--can", "--dead-man"}
     assert asked <= options
 
 
 def test_the_robots_description_names_the_topics_of_joints() -> None:
     root = ElementTree.parse(PACKAGES / "teds_provision_ros" / "config" / "gripper.ros2_control.xacro").getroot()
-    given = {one.get("name"): one.text for one in root.iter("param")}
+    given = {item.get("name"): item.text for item in root.iter("param")}
     assert given["joint_states_topic"] == f"/${{station}}/{STATES}"
     assert given["joint_commands_topic"] == f"/${{station}}/{COMMANDS}"
     assert float(given["trigger_joint_command_threshold"] or 0) < 0, "commands keep coming, or the dead-man takes over"

@@ -74,7 +74,7 @@ def test_fast_set_points_go_as_drive_messages() -> None:
     scene.actuators.close()
     assert scene.node.asked == 1
     assert len(scene.messages) > WATCHED
-    assert {len(one) for one in scene.messages} == {LENGTH}
+    assert {len(message) for message in scene.messages} == {LENGTH}
     assert not scene.told
 
 

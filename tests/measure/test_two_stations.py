@@ -23,10 +23,10 @@ def south_of(hall: Hall) -> Station:
     """A second station with its own key, to which the first one has copied the keys of all nodes."""
     make_station(hall.folder / "stations" / "south", "south").close()
     north, south, bundle = hall.station, hall.desk.station("south"), hall.folder / "keys.jwe"
-    for one, other, name in ((north, south, "south"), (south, north, "bench")):
+    for station, other, name in ((north, south, "south"), (south, north, "bench")):
         key = hall.folder / f"{name}.pem"
         key.write_text(other.ask("init")["public_key"])
-        one.ask("trust", "add", name, key, "--yes")
+        station.ask("trust", "add", name, key, "--yes")
     ca = hall.folder / "bench.ca.pem"
     ca.write_text(north.ask("init")["ca"]["public_key"])
     south.ask("trust", "add", "bench-ca", ca, "--role", "ca", "--yes")

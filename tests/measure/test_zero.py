@@ -195,9 +195,9 @@ def test_two_at_once_follow_each_other(hall: Hall, angle: Shaft) -> None:
     angle.turn("angle", 50_000)
     words = ("--json", "calibrate", "zero", "angle", 1, "--can", hall.can, "--unit", "degree", "--value")
     both = [hall.station.start(*words, value) for value in (10, 20)]
-    done = [one.end() for one in both]
-    assert [one.code for one in done] == [0, 0], done
-    last = max((one.json for one in done), key=lambda one: one["sequence"])
+    done = [running.end() for running in both]
+    assert [outcome.code for outcome in done] == [0, 0], done
+    last = max((outcome.json for outcome in done), key=lambda item: item["sequence"])
     assert abs(done[0].json["sequence"] - done[1].json["sequence"]) == 1
     assert reads(hall) == pytest.approx(last["after"], abs=1e-5)
 
@@ -208,7 +208,7 @@ def test_a_trial_build_beside_it_is_told_and_the_next_provisioning_keeps_the_zer
     angle.turn("angle", 55_000)
     done = hall.ask("calibrate", "zero", uuid, 1)
     assert any("draft" in text for text in done["warnings"])
-    assert [one["stage"] for one in hall.station.ask("draft", "list")["drafts"]] == ["built"]
+    assert [draft["stage"] for draft in hall.station.ask("draft", "list")["drafts"]] == ["built"]
     hall.station.ask("draft", "drop", uuid)
     for name in ("elbow", "angle"):
         hall.station.ask("provision", uuid, "--name", name, "--yes", "--via", "can", "--can", hall.can)

@@ -181,7 +181,12 @@ def _changes(module: Module, node: ast.AST) -> Iterator[tuple[str, ast.expr | as
             yield f"({left}) {_COMPARISONS[type(op)]} ({right})", node
         case ast.BoolOp():
             other = " or " if isinstance(node.op, ast.And) else " and "
-            yield "(" + other.join(f"({module.source[slice(*module.span(one))]})" for one in node.values) + ")", node
+            yield (
+                "("
+                + other.join(f"({module.source[slice(*module.span(expression))]})" for expression in node.values)
+                + ")",
+                node,
+            )
         case ast.UnaryOp(op=ast.Not()):
             yield f"({module.source[slice(*module.span(node.operand))]})", node
         case ast.If() | ast.IfExp() | ast.While():

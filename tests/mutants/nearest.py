@@ -36,7 +36,7 @@ class Suite:
         """Paths of the test files to run, the most telling first."""
         module = _dotted(ROOT / mutant.path)
         room = module.split(".")[1] if module.count(".") else ""
-        words = {one: self._weights.get(one, 0.0) for one in mutant.words}
+        words = {word: self._weights.get(word, 0.0) for word in mutant.words}
         whole = sum(words.values()) or 1.0
         ranks: list[tuple[float, str]] = []
         for name, distances in self._distances.items():
@@ -77,14 +77,14 @@ class Suite:
         rooms: dict[str, str] = {}
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
-                yield from (one.name for one in node.names if one.name in self._paths)
+                yield from (alias.name for alias in node.names if alias.name in self._paths)
             elif isinstance(node, ast.ImportFrom):
                 above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
                 base = ".".join([*above, *([node.module] if node.module else [])])
-                for one in node.names:
-                    inner = f"{base}.{one.name}"
+                for alias in node.names:
+                    inner = f"{base}.{alias.name}"
                     if inner in self._paths:
-                        rooms[one.asname or one.name] = inner
+                        rooms[alias.asname or alias.name] = inner
                         yield inner
                     elif base in self._paths:
                         yield base

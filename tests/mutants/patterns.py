@@ -269,7 +269,7 @@ PATTERNS = (
     ),
     Pattern("a set point grows old", "TopicActuators._seconds_left", "age > self._dead_man / 1000", "False"),
     Pattern("a set point grows old in the queue", "TopicActuators._send", "self._seconds_left(command)", "None"),
-    Pattern("a browser's token ends", "Tokens.find", "one.until > now", "True"),
+    Pattern("a browser's token ends", "Tokens.find", "known_token.until > now", "True"),
     Pattern("a login link ends", "Tokens.login", "until < time.monotonic()", "False"),
     Pattern(
         "a login link works once",

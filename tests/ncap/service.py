@@ -51,7 +51,7 @@ ANSWERED: set[tuple[str, str, int]] = set()
 
 def described(method: str, path: str, status: int, kind: str, octets: bytes) -> None:
     """Fail where an answer is not what the API's description says."""
-    template = next((one for one in DOCUMENT["paths"] if _matches(one, path.partition("?")[0])), None)
+    template = next((item for item in DOCUMENT["paths"] if _matches(item, path.partition("?")[0])), None)
     if template is None or method.lower() not in DOCUMENT["paths"][template]:
         assert status in (404, 405), (method, path, status)
         return
@@ -133,8 +133,8 @@ class Service:
     def end(self) -> None:
         """SIGTERM, and wait."""
         assert self.process is not None
-        for one in self.closing:
-            one.close()
+        for current in self.closing:
+            current.close()
         self.process.signal(signal.SIGTERM)
         outcome = self.process.end()
         assert outcome.code == 0, outcome

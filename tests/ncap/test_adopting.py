@@ -48,7 +48,7 @@ def events(service: Service, kind: str, uuid: str) -> list[dict[str, Any]]:
     while process.read(0.1):
         pass
     lines = [json.loads(line) for line in process.out[: process.out.rfind("\n") + 1].splitlines()]
-    return [one for one in lines if one.get("event") == kind and one.get("uuid") == uuid]
+    return [line for line in lines if line.get("event") == kind and line.get("uuid") == uuid]
 
 
 def test_with_yes_a_good_one_is_signed_and_measured_without_another_word(desk: Desk) -> None:
@@ -64,7 +64,7 @@ def test_with_yes_a_good_one_is_signed_and_measured_without_another_word(desk: D
 
 def known(service: Service, node: Node) -> bool:
     with service.client() as asked:
-        return any(one["uuid"] == node.uuid for one in asked.nodes())
+        return any(known_node["uuid"] == node.uuid for known_node in asked.nodes())
 
 
 def test_without_it_a_yes_by_the_api_or_a_command_beside_it_signs(desk: Desk) -> None:
@@ -74,7 +74,7 @@ def test_without_it_a_yes_by_the_api_or_a_command_beside_it_signs(desk: Desk) ->
         for node in (first, second):
             until(lambda node=node: known(service, node) and verdict(asked.node(node.uuid)) == "unsigned")
         assert asked.node(first.uuid)["state"] == "keyed"
-        assert [one["name"] for one in asked.node(first.uuid)["channels"]] == ["angle"]
+        assert [channel["name"] for channel in asked.node(first.uuid)["channels"]] == ["angle"]
         asked.provision(first.uuid, adopt=True)
         until(lambda: verdict(asked.node(first.uuid)) == "authentic")
     done = service.station.ask("provision", second.uuid, "--adopt", "--yes", *desk.links.over("can"))
@@ -85,14 +85,14 @@ def test_without_it_a_yes_by_the_api_or_a_command_beside_it_signs(desk: Desk) ->
 def test_a_hostile_one_is_refused_once_and_told(desk: Desk) -> None:
     node = brings(desk, blocks=named(factory(b"\0" * 10), 1, "angle\x1b[2J"))
     service = adopting(desk, "--yes")
-    until(lambda: any(one["state"] == "not adopted" for one in events(service, "node", node.uuid)))
+    until(lambda: any(event["state"] == "not adopted" for event in events(service, "node", node.uuid)))
     with service.client() as asked:
         asked.discover()
         until(lambda: verdict(asked.node(node.uuid)) == "unsigned")
         assert "\x1b" not in json.dumps(asked.node(node.uuid)["channels"])
         asked.provision(node.uuid, adopt=True)
         until(lambda: asked.request("GET", f"/nodes/{node.uuid}/provision", None)["state"] == "failed")
-    assert [one["state"] for one in events(service, "node", node.uuid)].count("not adopted") == 1
+    assert [event["state"] for event in events(service, "node", node.uuid)].count("not adopted") == 1
     refused = service.station.refuses("provision", node.uuid, "--adopt", "--yes", *desk.links.over("can"), code=8)
     assert "unprintable" in refused["message"]
     service.end()
@@ -144,8 +144,8 @@ def test_unverified_ones_are_measured_calibrated_and_everything_says_so(desk: De
         ] == [channel["topic"]]
         listed = desk.station().ask("names", "list")["names"]
         assert [row["topic"] for row in listed if row["uuid"] == node.uuid] == [channel["topic"]]
-        joined = [one for one in events(service, "measurement", node.uuid) if one["state"] == "joined"]
-        assert [one["id"] for one in joined] == ["unverified"]
+        joined = [event for event in events(service, "measurement", node.uuid) if event["state"] == "joined"]
+        assert [entry["id"] for entry in joined] == ["unverified"]
 
         asked.provision(node.uuid, adopt=True)  # by the page: it is signed while it is measured
         until(lambda: verdict(asked.node(node.uuid)) == "authentic")
@@ -154,7 +154,7 @@ def test_unverified_ones_are_measured_calibrated_and_everything_says_so(desk: De
         assert after["channels"][0]["topic"] == "/bench/joint/angle"
         assert not after["unverified"]
         assert after["problem"] is None
-        until(lambda: {one["id"]: len(one["nodes"]) for one in asked.measurements()} == {"unverified": 0, "adopted": 1})
+        until(lambda: {run["id"]: len(run["nodes"]) for run in asked.measurements()} == {"unverified": 0, "adopted": 1})
     assert told(service, node) == [("unverified", "joined"), ("unverified", "left"), ("adopted", "joined")]
     service.end()
     texts = {file.name.split("-")[0]: file.read_text() for file in record.glob("*.csv")}
@@ -171,7 +171,7 @@ def flowing(node: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def told(service: Service, node: Node) -> list[tuple[str, str]]:
-    return [(one["id"], one["state"]) for one in events(service, "measurement", node.uuid)]
+    return [(event["id"], event["state"]) for event in events(service, "measurement", node.uuid)]
 
 
 def test_one_that_is_adopted_by_a_command_beside_goes_on_as_what_is_trusted(desk: Desk) -> None:
@@ -182,10 +182,10 @@ def test_one_that_is_adopted_by_a_command_beside_goes_on_as_what_is_trusted(desk
         service.station.ask("provision", node.uuid, "--adopt", "--yes", *desk.links.over("can"))
         until(lambda: asked.node(node.uuid)["measurement"] in ("run", "adopted"), seconds=AGAIN)
         until(lambda: flowing(asked.node(node.uuid)))
-        of_unverified = lambda: next(one for one in asked.measurements() if one["id"] == "unverified")  # noqa: E731
+        of_unverified = lambda: next(run for run in asked.measurements() if run["id"] == "unverified")  # noqa: E731
         until(lambda: of_unverified()["nodes"] == [], of_unverified)
         until(lambda: asked.node(node.uuid)["problem"] is None)
-    left = [one for one in events(service, "measurement", node.uuid) if one["state"] == "left"]
+    left = [event for event in events(service, "measurement", node.uuid) if event["state"] == "left"]
     assert left[0]["id"] == "unverified"
     service.end()
 

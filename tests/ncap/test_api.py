@@ -44,15 +44,15 @@ def nothing_begun_is_left(service: Service, asked: Client, request: pytest.Fixtu
     """A test that fails leaves no measurement, no group, no other detection and no virtual node to the next one."""
     if "hand" in request.fixturenames:
         request.getfixturevalue("hand")
-    before = [one["uuid"] for one in asked.request("GET", "/virtual")["virtual"]]
+    before = [item["uuid"] for item in asked.request("GET", "/virtual")["virtual"]]
     yield
-    for one in asked.request("GET", "/measurements")["measurements"]:
-        asked.end_measurement(one["id"])
+    for measurement in asked.request("GET", "/measurements")["measurements"]:
+        asked.end_measurement(measurement["id"])
     for group in asked.request("GET", "/groups")["groups"]:
         asked.request("DELETE", f"/groups/{group['name']}")
-    for one in asked.request("GET", "/virtual")["virtual"]:
-        if one["uuid"] not in before:
-            asked.request("DELETE", f"/virtual/{one['uuid']}")
+    for item in asked.request("GET", "/virtual")["virtual"]:
+        if item["uuid"] not in before:
+            asked.request("DELETE", f"/virtual/{item['uuid']}")
     if asked.status()["detection"] != "whitelist":
         asked.request("PUT", "/detection", {"mode": "whitelist"})
     service.desk.clear(but=[service.process])
@@ -99,14 +99,14 @@ def test_a_node_has_its_verdict_with_checks_and_its_channels_with_units(asked: C
     assert opening["uncertainty"] == pytest.approx(1e-4)
     assert opening["topic"] == "/bench/hand/opening"
     assert asked.node(hand[:6])["uuid"] == hand
-    assert hand in {one["uuid"] for one in asked.nodes()}
+    assert hand in {node["uuid"] for node in asked.nodes()}
 
 
 def test_the_datasheet_is_read_decoded_and_given_as_a_document(asked: Client, hand: str) -> None:
     sheet = asked.request("GET", f"/nodes/{hand}/teds")
     assert sheet["verdict"] == "authentic"
-    assert {"MetaTEDS", "XdcrName", "CalTEDS"} <= {one["name"] for one in sheet["teds"]}
-    curve = next(one for one in sheet["curves"] if one["channel"] == 2)
+    assert {"MetaTEDS", "XdcrName", "CalTEDS"} <= {item["name"] for item in sheet["teds"]}
+    curve = next(curve for curve in sheet["curves"] if curve["channel"] == 2)
     assert curve["points"][0] == pytest.approx([0, 0])
     assert curve["points"][-1][1] == pytest.approx(0.11, rel=1e-3)
     assert asked.request("GET", f"/nodes/{hand}/teds?format=xml").startswith("<?xml")
@@ -120,7 +120,9 @@ def test_a_datasheet_is_written_after_its_diff_was_shown(asked: Client, hand: st
     changed = document.replace(">gripper<", ">left hand<").replace(">hand<", ">left hand<")
     assert changed != document
     plan = asked.request("PUT", f"/nodes/{hand}/teds?dry_run=1", {"content": changed, "format": "xml"})
-    assert [one["after"] for one in plan["changes"]] == ['"left hand"'] or "left hand" in plan["changes"][0]["text"]
+    assert [change["after"] for change in plan["changes"]] == ['"left hand"'] or "left hand" in plan["changes"][0][
+        "text"
+    ]
     assert asked.request("PUT", f"/nodes/{hand}/teds?dry_run=1", {"content": document})["changes"] == []
     before = asked.node(hand)["sequence"]
     done = asked.request("PUT", f"/nodes/{hand}/teds", {"content": changed})
@@ -363,7 +365,7 @@ def test_names_are_given_kept_and_taken_back(asked: Client, hand: str) -> None:
 def test_a_node_that_comes_later_is_published_under_its_own_name(service: Service, asked: Client, hand: str) -> None:
     asked.request("GET", "/names")  # made while the node is unknown
     late = virtual(service, "accelerometer", "late comer")
-    topics = [one["topic"] for one in asked.request("GET", "/names")["names"] if one["uuid"] == late]
+    topics = [name["topic"] for name in asked.request("GET", "/names")["names"] if name["uuid"] == late]
     assert topics == ["late_comer", *(f"/bench/late_comer/acceleration_{axis}" for axis in "xyz")]
     asked.request("DELETE", f"/virtual/{late}", {})
 
@@ -381,7 +383,7 @@ def test_groups_are_made_changed_and_deleted(asked: Client, hand: str) -> None:
         asked.request("POST", "/groups", {"name": name, "uuids": [hand]})
         path = f"/groups/{quote(name, safe='')}"
         asked.request("PUT", path, {"uuids": []})
-        assert [one["name"] for one in asked.request("DELETE", path)["groups"]] == ["both"]
+        assert [group["name"] for group in asked.request("DELETE", path)["groups"]] == ["both"]
     refused(asked, 404, "not-found", "PUT", "/groups/none", {"uuids": []})
     assert asked.request("DELETE", "/groups/both")["groups"] == []
     refused(asked, 404, "not-found", "DELETE", "/groups/both")
@@ -417,7 +419,7 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
     made = asked.request("POST", "/virtual", {"content": copy, "name": "copy", "source": "ramp:1"})
     node = verified(service, made["uuid"])
     assert (verdict(node), node["virtual"], len(node["channels"])) == ("authentic", True, 3)
-    assert {one["name"] for one in asked.request("GET", "/virtual")["virtual"]} == {"hand", "copy"}
+    assert {item["name"] for item in asked.request("GET", "/virtual")["virtual"]} == {"hand", "copy"}
     asked.request("DELETE", f"/virtual/{made['uuid']}")
     gone = until(lambda: (node := asked.node(made["uuid"]))["present"] is False and node)
     assert (gone["name"], gone["retired"], gone["whitelisted"]) == (None, "decommissioned", False)
@@ -448,10 +450,10 @@ def test_a_virtual_transducer_is_either_measured_or_removed(service: Service, as
             uuid = virtual(service, "load-cell", "short")
             begun = pool.submit(ask, callers[0], "POST", "/measurements", {"uuids": [uuid]})
             ended = pool.submit(ask, callers[1], "DELETE", f"/virtual/{uuid}", None)
-            there = [one["uuids"] for one in (begun.result(), asked.measurements())[1]]
+            there = [measurement["uuids"] for measurement in (begun.result(), asked.measurements())[1]]
             assert (begun.result(), ended.result(), there) in ((200, 409, [[uuid]]), (422, 200, []))
-            for one in asked.measurements():
-                asked.end_measurement(one["id"])
+            for measurement in asked.measurements():
+                asked.end_measurement(measurement["id"])
             if ended.result() == 409:
                 until(lambda uuid=uuid: asked.node(uuid)["measurement"] is None)
                 asked.request("DELETE", f"/virtual/{uuid}")
@@ -467,7 +469,7 @@ def test_the_mode_that_holds_already_forgets_nobody(asked: Client, hand: str) ->
 def test_detection_decides_who_is_shown(service: Service, asked: Client) -> None:
     node = service.desk.node("stranger", called="stranger").start(nfc=False, can=True)
     until(lambda: asked.status()["strangers"] == 1)
-    assert node.uuid not in {one["uuid"] for one in asked.nodes()}
+    assert node.uuid not in {node["uuid"] for node in asked.nodes()}
     assert service.station.ask("ncap", "detection", "transparent") == {"detection": "transparent"}
     seen = verified(service, node.uuid)
     assert (verdict(seen), seen["state"], seen["whitelisted"]) == ("unsigned", "factory", False)
@@ -518,7 +520,7 @@ def test_more_than_a_thousand_nodes_come_in_pages(service: Service, asked: Clien
     def settled() -> tuple[dict[str, Any], list[str]] | None:
         """The first page, and all of them where no node of another test came between the two questions."""
         first = asked.request("GET", "/nodes")
-        every = [one["uuid"] for one in asked.nodes()]
+        every = [node["uuid"] for node in asked.nodes()]
         return (first, every) if first["total"] > 2000 and first["total"] == len(every) else None
 
     answer, uuids = until(settled)
@@ -526,7 +528,7 @@ def test_more_than_a_thousand_nodes_come_in_pages(service: Service, asked: Clien
     assert len(uuids) == len(set(uuids))
     assert {*many, hand} <= set(uuids)
     few = asked.request("GET", f"/nodes?offset={answer['total'] - 1}&limit=5")
-    assert [one["uuid"] for one in few["nodes"]] == uuids[-1:]
+    assert [node["uuid"] for node in few["nodes"]] == uuids[-1:]
 
 
 def test_a_namesake_that_comes_changes_no_name_that_is_being_published(

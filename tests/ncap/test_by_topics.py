@@ -41,9 +41,9 @@ def publishers() -> Iterator[Publishers]:
     """Publishers that a test starts; none outlives it."""
     started: Publishers = []
     yield started
-    for one in started:
-        one.kill()
-        one.wait()
+    for process in started:
+        process.kill()
+        process.wait()
 
 
 @contextmanager
@@ -190,15 +190,17 @@ def test_two_measurements_are_two_nodes_of_ros_and_neither_ends_the_other(tmp_pa
                 asked.request("POST", "/measurements", {"group": f"group {name}", "rate": 20})
 
             def sinks() -> list[dict[str, Any]]:
-                return [one for one in asked.request("GET", "/status")["sinks"] if one["written"] > 200]
+                return [sink for sink in asked.request("GET", "/status")["sinks"] if sink["written"] > 200]
 
             until(lambda: len(sinks()) == 2, "both publish", 60)
             assert service.process is not None
             began = children(service.process.process.pid, "ros1_child.py")
             nodes = master.tool("rosnode", "list").split() if Path("/usr/bin/rosnode").exists() else []
             assert not nodes or {"/teds_provision_bench_group_g", "/teds_provision_bench_group_h"} <= set(nodes)
-            before = {one["measurement"]: one["written"] for one in sinks()}
-            until(lambda: all(one["written"] > before[one["measurement"]] + 100 for one in sinks()), "both go on", 60)
+            before = {sink["measurement"]: sink["written"] for sink in sinks()}
+            until(
+                lambda: all(sink["written"] > before[sink["measurement"]] + 100 for sink in sinks()), "both go on", 60
+            )
             assert children(service.process.process.pid, "ros1_child.py") == began
             assert len(began) == 2
             service.end()

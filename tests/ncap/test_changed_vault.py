@@ -31,8 +31,8 @@ def running(desk: Desk) -> Iterator[Service]:
 
 def measured_in_a_new_session(asked: Client, uuid: str) -> dict[str, Any]:
     """End what is measured of a node, measure it again, and wait for its values."""
-    for one in asked.request("GET", "/measurements")["measurements"]:
-        asked.end_measurement(one["id"])
+    for measurement in asked.request("GET", "/measurements")["measurements"]:
+        asked.end_measurement(measurement["id"])
     until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") is None)
     asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
 

@@ -58,11 +58,11 @@ def test_a_node_of_the_whitelist_does_not_wait_for_strangers(hall: Hall, tmp_pat
     service = Service(hall.desk, hall.station, ("--detection", "transparent"))
     with Attacker(group, port, silent_strangers(STRANGERS)):
         asked = service.start().client()
-        until(lambda: sum(one["present"] for one in asked.nodes()) == len(STRANGERS))
+        until(lambda: sum(node["present"] for node in asked.nodes()) == len(STRANGERS))
         hall.nodes["a"].start(can=hall.desk.links.can)
         until(lambda: asked.node(hall.nodes["a"].uuid)["verified"])
         assert verdict(asked.node(hall.nodes["a"].uuid)) == "authentic"
-        waiting = sum(one["verdict"] is None and one["problem"] is None for one in asked.nodes())
+        waiting = sum(node["verdict"] is None and node["problem"] is None for node in asked.nodes())
         assert waiting > len(STRANGERS) / 2, "the strangers still waited when it had been looked at"
     service.end()
     hall.nodes["a"].kill()
@@ -100,12 +100,12 @@ def test_reads_of_a_node_that_does_not_answer_hold_up_no_other_request(hall: Hal
             read.append(service.raw("GET", f"/api/v1/nodes/{node.uuid}/teds", reader).status)
 
     readers = [threading.Thread(target=ask, daemon=True) for _ in range(12)]
-    for one in readers:
-        one.start()
+    for number in readers:
+        number.start()
     until(lambda: asked.node(node.uuid)["busy"] or asked.status(), "it is being read")
     assert service.raw("GET", "/api/v1/status", writer).status == 200
     assert service.raw("PUT", f"/api/v1/nodes/{node.uuid}/channels/1", writer, '{"hold": 0}').status < 500
     assert not read, "a node that is silent is waited for, and all of this was answered before"
     service.kill()
-    for one in readers:
-        one.join(60)
+    for number in readers:
+        number.join(60)

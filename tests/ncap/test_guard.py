@@ -215,8 +215,8 @@ def test_a_token_that_may_only_read_is_shown_what_went_wrong_without_its_folder(
     feed.write_text("t,value\n0,1\n")
     with service.client() as asked:
         asked.request("POST", "/virtual", {"profile": "load-cell", "name": "one", "source": f"file:{feed}"})
-        [uuid] = [one["uuid"] for one in asked.request("GET", "/virtual")["virtual"]]
-        until(lambda: uuid in [one["uuid"] for one in asked.nodes()])
+        [uuid] = [item["uuid"] for item in asked.request("GET", "/virtual")["virtual"]]
+        until(lambda: uuid in [node["uuid"] for node in asked.nodes()])
     reader = {"Authorization": f"Bearer {service.token('reader', '--read-only')}"}
     for path in ("/virtual", "/nodes", f"/nodes/{uuid}", "/status", "/measurements", "/log", "/profiles", "/names"):
         answer = service.raw("GET", f"/api/v1{path}", reader)
@@ -254,7 +254,7 @@ def test_tokens_that_are_made_at_once_are_all_kept(tmp_path: Path) -> None:
     homes = [Tokens(tmp_path) for _ in range(4)]
 
     def make(number: int) -> list[str]:
-        return [homes[number].add(f"{number}-{one}") for one in range(10)]
+        return [homes[number].add(f"{number}-{value}") for value in range(10)]
 
     with ThreadPoolExecutor(len(homes)) as pool:
         made = [token for tokens in pool.map(make, range(len(homes))) for token in tokens]
@@ -280,10 +280,10 @@ def test_a_browser_is_let_in_for_thirty_days_and_its_login_link_for_five_minutes
     assert found is not None
     assert found.read_only
     now.wall += 2
-    for each in (tokens, Tokens(tmp_path)):
-        assert each.find(cookie) is None, "the daemon has it in memory, and the file still names it"
-        assert [one.name for one in each.all()] == ["script"]
-        assert each.find(script) is not None
+    for tokens_object in (tokens, Tokens(tmp_path)):
+        assert tokens_object.find(cookie) is None, "the daemon has it in memory, and the file still names it"
+        assert [token.name for token in tokens_object.all()] == ["script"]
+        assert tokens_object.find(script) is not None
     tokens.add("another")
     assert "browser" not in (tmp_path / "ncap-tokens.json").read_text()
 
@@ -375,7 +375,9 @@ def test_no_answer_holds_a_secret(service: Service, bearer: dict[str, str | None
     document = json.loads(flash.read_text())
     secrets = {PASSPHRASE, str(document["key"]), str(document["flash"]["key"]), str(bearer["Authorization"])[7:]}
     secrets |= {
-        one for one in _strings(json.loads((service.station.home / "ncap-tokens.json").read_text())) if len(one) == 64
+        string
+        for string in _strings(json.loads((service.station.home / "ncap-tokens.json").read_text()))
+        if len(string) == 64
     }
     paths = ["status", "nodes", f"nodes/{uuid}", f"nodes/{uuid}/teds", "groups", "measurements", "names", "virtual",
              "log", "profiles", "detection"]  # fmt: skip

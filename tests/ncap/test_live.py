@@ -50,7 +50,7 @@ def test_no_line_crosses_the_wrap_of_a_full_turn(steps: list[float], most: int, 
     assert len(kept_times) == len(kept) <= max(most, 0)
     assert list(kept_times) == sorted(kept_times)
     with_before = [before, *kept]
-    assert all(np.isnan([one, other]).any() or abs(one - other) <= np.pi for one, other in pairwise(with_before))
+    assert all(np.isnan([item, other]).any() or abs(item - other) <= np.pi for item, other in pairwise(with_before))
     if most >= 4 and len(steps):
         assert len(kept)
     for moment, value in zip(kept_times, kept, strict=True):
@@ -120,11 +120,13 @@ def test_at_most_a_hundred_points_a_second_and_slow_channels_whole(rate: float, 
     def too_few() -> float:
         """Points a second that are missing: a loop that stands still gives a burst, of which some are left out."""
         messages = asyncio.run(run())
-        times = [t for one in messages if one["type"] == "values" for t in one["channels"]["ab" * 10 + "/1"][0]]
+        times = [
+            t for message in messages if message["type"] == "values" for t in message["channels"]["ab" * 10 + "/1"][0]
+        ]
         assert times == sorted(times)
         span = (times[-1] - times[0]) or 1.0
         assert len(times) / span <= POINTS * 1.15, len(times) / span
-        assert any(one["type"] == "beat" for one in messages)
+        assert any(message["type"] == "beat" for message in messages)
         return least - len(times) / span
 
     best_of(5, least * 0.1, too_few)
@@ -143,11 +145,13 @@ def test_a_client_that_does_not_read_costs_one_slot_and_is_told_what_it_missed()
         return found, late, slow.dropped
 
     found, late, dropped = asyncio.run(run())
-    sent = sum(one["type"] == "values" for one in found)
+    sent = sum(entry["type"] == "values" for entry in found)
     assert dropped == sent - 1, "newest wins"
-    assert [one["messages"] for one in late if one["type"] == "dropped"] == [dropped]
-    assert sum(one["type"] == "values" for one in late) == 1
-    assert [one["state"] for one in late if one["type"] == "event"] == list("01234"), "events are never thinned"
+    assert [message["messages"] for message in late if message["type"] == "dropped"] == [dropped]
+    assert sum(message["type"] == "values" for message in late) == 1
+    assert [message["state"] for message in late if message["type"] == "event"] == list("01234"), (
+        "events are never thinned"
+    )
 
 
 def test_a_client_that_leaves_too_many_events_is_told_to_ask_anew() -> None:
@@ -218,9 +222,9 @@ def test_fifty_clients_of_which_ten_never_read(service: Service) -> None:
             began = time.monotonic()
             while min(counts) == 0 or time.monotonic() < began + 2.0:
                 assert time.monotonic() < end, counts
-                for number, one in enumerate(quick):
+                for number, client_connection in enumerate(quick):
                     with suppress(TimeoutError):
-                        counts[number] += json.loads(one.recv(0.001))["type"] == "values"
+                        counts[number] += json.loads(client_connection.recv(0.001))["type"] == "values"
             after = measured()
             assert after["samples"] > before["samples"]
             return int(after["lost"] - before["lost"])

@@ -62,7 +62,7 @@ def ncap(hall: Hall) -> Service:
 
 def listed(service: Service) -> list[dict[str, Any]]:
     with service.client() as asked:
-        return [dict(one) for one in asked.measurements()]
+        return [dict(measurement) for measurement in asked.measurements()]
 
 
 def test_ncap_shows_the_measurement_of_a_command_and_never_takes_it_over(hall: Hall) -> None:
@@ -120,7 +120,7 @@ def test_what_the_socket_the_page_and_a_token_begin_is_carried_on_by_ncap(hall: 
     assert (mine["owner"], mine["process"]) == ("ncap", None)
     assert (theirs["owner"], theirs["scalar_rate"]) == ("api:plotter", 3)
     service.kill()
-    assert {one["owner"] for one in listed(ncap(hall))} == {"ncap", "api:plotter"}
+    assert {entry["owner"] for entry in listed(ncap(hall))} == {"ncap", "api:plotter"}
 
 
 def test_ncap_waits_for_the_group_that_a_command_measures_and_gets_it_afterwards(hall: Hall, tmp_path: Path) -> None:
@@ -129,5 +129,5 @@ def test_ncap_waits_for_the_group_that_a_command_measures_and_gets_it_afterwards
     with service.client() as asked:
         asked.request("POST", "/measurements", {"group": "arm", "rate": 20})
     killed(command)
-    until(lambda: [one["state"] for one in listed(service)] == ["running"], "its own measurement begins")
+    until(lambda: [entry["state"] for entry in listed(service)] == ["running"], "its own measurement begins")
     assert [row.owner for row in rows(hall)] == ["ncap"]

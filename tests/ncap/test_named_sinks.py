@@ -114,7 +114,7 @@ def test_a_running_daemon_takes_the_names_of_its_owner(desk: Desk) -> None:
                 asked.request("POST", "/measurements", {"uuids": [hand], "sinks": sinks})
             assert (refusal.value.status, refusal.value.code) == (422, "usage")
         noted = asked.request("GET", "/log?act=api")["entries"]
-        assert {(one["actor"], one["outcome"], one["failed"]) for one in noted} == {("writer", "usage", True)}
+        assert {(item["actor"], item["outcome"], item["failed"]) for item in noted} == {("writer", "usage", True)}
         assert noted[0]["facts"]["sinks"] == ["mqtt://evil@127.0.0.1?password-file=/etc/passwd"]
         made = asked.request("POST", "/measurements", {"uuids": [hand], "sinks": ["lab", "run.csv"]})
         assert made["sinks"][0] == "lab"

@@ -66,11 +66,11 @@ class Lab:
 
     def told(self, uuid: str | None = None) -> list[dict[str, Any]]:
         """Events of measurements that name a node."""
-        every = [one for one in self.lines() if one.get("event") == "measurement" and "uuid" in one]
-        return [one for one in every if uuid in (None, one["uuid"])]
+        every = [line for line in self.lines() if line.get("event") == "measurement" and "uuid" in line]
+        return [entry for entry in every if uuid in (None, entry["uuid"])]
 
     def states(self, node: Node) -> list[str]:
-        return [one["state"] for one in self.told(node.uuid)]
+        return [entry["state"] for entry in self.told(node.uuid)]
 
     def comes(self, node: Node, times: int = 1) -> None:
         until(lambda: self.states(node).count("joined") == times and self.states(node)[-1] == "joined", node.uuid)
@@ -170,7 +170,7 @@ def test_a_node_that_is_carried_to_another_bus_of_the_station_goes_on_there_at_o
         with lab.service.client() as asked:
             assert str(asked.node(right.uuid)["link"]).startswith(f"can:{bus or lab.desk.links.can}")
         went, came = map(unix, lab.told(right.uuid)[-2:])
-        present = [unix(one) for one in lab.lines() if one.get("state") == "came" and one["uuid"] == right.uuid]
+        present = [unix(line) for line in lab.lines() if line.get("state") == "came" and line["uuid"] == right.uuid]
         return max(went, came) - present[-1]
 
     best_of(4, 2.5, carried)
@@ -194,7 +194,7 @@ def test_a_node_is_written_while_it_is_matched_and_nobody_else_notices(lab: Lab)
     assert first.end().code == 0
     until(lambda: lab.states(right)[-1] == "joined")
     assert lab.states(right).count("left") in (1, 2), "one gap, or two where the writers came one after the other"
-    assert any(one["why"] == "let go for provision" for one in lab.told(right.uuid))
+    assert any(entry["why"] == "let go for provision" for entry in lab.told(right.uuid))
     lab.flows(right)
     assert lab.states(left) == ["joined"]
     lab.service.end()
@@ -221,7 +221,7 @@ def test_a_sensor_is_zeroed_while_everybody_is_measured_and_the_gap_is_told(lab:
     assert done["before"] > 0.5, "by whichever calibration it has by now"
     lab.comes(right, 2)
     lab.flows(right)
-    assert [(one["state"], one["why"]) for one in lab.told(right.uuid)] == [
+    assert [(entry["state"], entry["why"]) for entry in lab.told(right.uuid)] == [
         ("joined", ""),
         ("left", "let go for calibrate zero"),
         ("joined", ""),
@@ -279,7 +279,7 @@ def test_whom_a_person_revokes_leaves_and_the_others_stay(lab: Lab) -> None:
     assert (lab.states(left), lab.states(right)) == (["joined"], ["joined"])
     with lab.service.client() as asked:
         assert third.uuid not in asked.measurements()[0]["uuids"]
-        until(lambda: third.uuid not in [one["uuid"] for one in asked.measurements()[0]["nodes"]])
+        until(lambda: third.uuid not in [report["uuid"] for report in asked.measurements()[0]["nodes"]])
     lab.service.end()
     third.kill()
     lab.nodes.remove(third)
@@ -341,12 +341,14 @@ def test_a_type_that_nobody_knows_is_told_while_its_measurement_waits(lab: Lab) 
     assert said.code == 0, "a node of that type may come from another station"
     assert "no profile and no known node is called 'load-cel'" in said.err
     with lab.service.client() as asked:
-        [one] = until(lambda: [one for one in asked.measurements() if one["why"]])
+        [one] = until(lambda: [measurement for measurement in asked.measurements() if measurement["why"]])
         assert (one["state"], one["why"]) == ("waiting", "no profile and no known node is called 'load-cel'")
         asked.end_measurement(one["id"])
     assert "load-cell" not in lab.service.station.run("ncap", "measure", "type:load-cell").err
     with lab.service.client() as asked:  # it is kept, and would begin with the service of the next test
-        asked.end_measurement(next(one["id"] for one in asked.measurements() if one["match"] == "type:load-cell"))
+        asked.end_measurement(
+            next(measurement["id"] for measurement in asked.measurements() if measurement["match"] == "type:load-cell")
+        )
     lab.service.end()
 
 
@@ -359,7 +361,7 @@ def test_a_measurement_whose_nodes_are_anothers_says_so(lab: Lab) -> None:
         first = asked.measure(match="all")["id"]
 
         def why(of: str) -> str:
-            return next(str(one["why"]) for one in asked.measurements() if one["id"] == of)
+            return next(str(measurement["why"]) for measurement in asked.measurements() if measurement["id"] == of)
 
         until(lambda: why(first) == "2 matching nodes are measured by another measurement")
         shown = lab.service.station.run("ncap", "status").out
@@ -448,7 +450,7 @@ def test_actuators_of_who_comes_are_never_claimed(desk: Desk) -> None:
         place = next(link["place"] for link in asked.status()["links"] if link["virtual"])
         bus = place.removeprefix("can:").partition("&source=")[0]
         mode = service.station.ask("mode", uuid, "--via", "can", "--can", bus)
-    claimed = {one["channel"]: bool(one["claimant"]) for one in mode["channels"]}
+    claimed = {channel["channel"]: bool(channel["claimant"]) for channel in mode["channels"]}
     assert claimed == {1: False, 2: True, 3: True}, mode
     service.end()
 
@@ -459,8 +461,8 @@ def test_a_node_that_this_very_process_provisions_is_measured_at_once(desk: Desk
 
     def provisioned() -> float:
         uuid = virtual(service)
-        until(lambda: "joined" in [one["state"] for one in lines_of(service) if one.get("uuid") == uuid])
-        mine = {one["state"]: unix(one) for one in reversed(lines_of(service)) if one.get("uuid") == uuid}
+        until(lambda: "joined" in [entry["state"] for entry in lines_of(service) if entry.get("uuid") == uuid])
+        mine = {item["state"]: unix(item) for item in reversed(lines_of(service)) if item.get("uuid") == uuid}
         return mine["joined"] - mine["came"]
 
     best_of(3, 3.0, provisioned)

@@ -46,18 +46,18 @@ def lab(one_lab: Lab) -> Iterator[Lab]:
 
 
 def whys(lab: Lab, node: Node) -> list[tuple[str, str]]:
-    return [(one["state"], one["why"]) for one in lab.told(node.uuid)]
+    return [(entry["state"], entry["why"]) for entry in lab.told(node.uuid)]
 
 
 def spoilt(node: Node, block: tuple[int, int]) -> bytes:
     """Change an octet of a TEDS in the flash of a node that is off; gives the flash as it was."""
     before = node.octets
     told = json.loads(before)
-    for one in told["flash"]["blocks"]:
-        if tuple(one[:2]) == block:
-            octets = bytearray.fromhex(one[2])
+    for item in told["flash"]["blocks"]:
+        if tuple(item[:2]) == block:
+            octets = bytearray.fromhex(item[2])
             octets[len(octets) // 2] ^= 1
-            one[2] = octets.hex()
+            item[2] = octets.hex()
     (node.folder / "flash.json").write_text(json.dumps(told))
     assert node.octets != before
     return before
@@ -89,7 +89,7 @@ def test_a_node_whose_other_teds_was_changed_is_found_out_behind_its_measurement
     left, right = lab.nodes
     right.kill()
     blocks = [(channel, code) for channel, code, _ in right.flash["blocks"]]
-    before = spoilt(right, next(one for one in blocks if one[0] == 1))
+    before = spoilt(right, next(block for block in blocks if block[0] == 1))
     lab.start()
     lab.comes(left)
     lab.power(right)
@@ -212,7 +212,7 @@ def test_a_group_that_is_started_by_hand_and_measured_as_it_comes_has_each_node_
         until(lambda: lab.states(right)[-1] == "left")
         by_hand = asked.measure(right.uuid, rate=20)["id"]
         lab.power(right)
-        until(lambda: [one["id"] for one in lab.told(right.uuid) if one["state"] == "joined"] == ["run", by_hand])
+        until(lambda: [entry["id"] for entry in lab.told(right.uuid) if entry["state"] == "joined"] == ["run", by_hand])
         asked.end_measurement(by_hand)
         until(lambda: lab.told(right.uuid)[-1]["state"] == "joined" and lab.told(right.uuid)[-1]["id"] == "run")
     assert lab.states(left) == ["joined"]

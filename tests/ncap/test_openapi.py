@@ -24,7 +24,7 @@ def test_every_route_is_described_and_nothing_else() -> None:
         for route in routes
         for method in (route.methods or set()) - {"HEAD"}
     }
-    assert there == {(one.method, one.path) for one in OPERATIONS}
+    assert there == {(operation.method, operation.path) for operation in OPERATIONS}
 
 
 def test_every_schema_is_one_and_every_reference_leads_somewhere() -> None:
@@ -45,7 +45,7 @@ def test_every_schema_is_one_and_every_reference_leads_somewhere() -> None:
                 walk(inner)
 
     walk(described)
-    names = [one["operationId"] for path in described["paths"].values() for one in path.values()]
+    names = [item["operationId"] for path in described["paths"].values() for item in path.values()]
     assert len(names) == len(set(names))
 
 
@@ -73,16 +73,16 @@ def test_bodies_made_from_the_description_never_break_the_daemon(service: Servic
     """What fits a described body, and what does not, gets an answer that is described: never a bug."""
     odd: list[Any] = [None, "", "x" * 5000, -1, 1e400, 10**30, True, [], [[]], {}, {"a": 1}, "\u0000", "\ud83d", "../x"]
     with service.client() as asked:
-        for one in OPERATIONS:
-            if one.body is None or one.path == "/login-link":
+        for operation in OPERATIONS:
+            if operation.body is None or operation.path == "/login-link":
                 continue
-            path = one.path.replace("{number}", "1")
+            path = operation.path.replace("{number}", "1")
             path = re.sub(r"{\w+}", "nobody", path)
-            names = [member.name for member in dataclasses.fields(one.body)] or ["x"]
+            names = [member.name for member in dataclasses.fields(operation.body)] or ["x"]
             for name in names:
                 for value in odd:
-                    status = _status(asked, one.method, path, {name: value})
-                    assert status in (200, 201, 202, 404, 422), (one.method, path, name, value)
+                    status = _status(asked, operation.method, path, {name: value})
+                    assert status in (200, 201, 202, 404, 422), (operation.method, path, name, value)
         groups = asked.request("GET", "/groups")["groups"]
         for group in groups:
             asked.request("DELETE", f"/groups/{quote(group['name'], safe='')}")

@@ -96,7 +96,7 @@ def test_who_may_only_read_is_told_no_paths() -> None:
         running = asyncio.create_task(live.run())
         await asyncio.sleep(0.01)
         live.event("sink", state="failed", error="/home/me/run.csv cannot be written: the disk is full.")
-        found = [await one.wait() for one in every]
+        found = [await live_client.wait() for live_client in every]
         running.cancel()
         return found
 
@@ -120,12 +120,12 @@ def test_what_waits_for_the_stores_lock_holds_up_no_other_request(service: Servi
 
     makers = [threading.Thread(target=make, args=(number,), daemon=True) for number in range(12)]
     with StoreLock(service.station.home, command="another command"):
-        for one in makers:
-            one.start()
+        for thread in makers:
+            thread.start()
         asked = until(lambda: [service.raw("GET", "/api/v1/status", headers).status for _ in range(20)])
         assert (set(asked), answers) == ({200}, [])
-    for one in makers:
-        one.join(PATIENCE)
+    for thread in makers:
+        thread.join(PATIENCE)
     assert set(answers) <= {201, 423, 503}
     assert 201 in answers
 
@@ -150,19 +150,19 @@ def test_the_log_names_who_asked_for_what_and_why_it_was_refused(service: Servic
         assert (begun["actor"], refused["actor"], refused["failed"]) == ("robot 7", "robot 7", True)
         assert (refused["facts"]["value"], refused["facts"]["unit"]) == (5, "m")
         assert "0.11" in refused["facts"]["why"]
-        assert {"@" in one["actor"] for one in own} == {True}
+        assert {"@" in item["actor"] for item in own} == {True}
         [mode] = asked.request("GET", "/log?act=detection&limit=1")["entries"]
         assert (mode["actor"], mode["facts"]["mode"]) == ("page", "whitelist")
 
         failed = asked.request("GET", "/log?failed=1&text=ROBOT%207")["entries"]
-        assert [one["seq"] for one in failed] == [refused["seq"]]
+        assert [item["seq"] for item in failed] == [refused["seq"]]
         assert asked.request("GET", f"/log?text={hand[:12]}&limit=3")["entries"]
         assert asked.request("GET", "/log?text=100%25_no'such")["entries"] == []
         before = asked.request("GET", f"/log?before={refused['seq']}&limit=2")["entries"]
-        assert [one["seq"] for one in before] == [refused["seq"] - 2, refused["seq"] - 1]
+        assert [item["seq"] for item in before] == [refused["seq"] - 2, refused["seq"] - 1]
         assert asked.request("GET", "/log?since=2099-01-01T00:00:00Z")["entries"] == []
         newest = asked.request("GET", f"/log?since={int(begun['time'])}&limit=1000")["entries"]
-        assert begun["seq"] in {one["seq"] for one in newest}
+        assert begun["seq"] in {item["seq"] for item in newest}
     for query in ("before=0", "since=yesterday", f"text={'x' * 300}", "limit=0"):
         assert service.raw("GET", f"/api/v1/log?{query}", bearer).status == 422, query
     shown = service.station.ask("log", "--act", "set")["entries"]

@@ -61,15 +61,17 @@ def test_metrics_are_prometheus_text_with_what_counts(
     answer = open_service.raw("GET", "/metrics", bearer)
     assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
     line = re.compile(r'[a-z_]+(\{([a-z]+="(\\.|[^"\\])*",?)*\})? [-+0-9.eE]+\Z')
-    values = [one for one in answer.text.splitlines() if not one.startswith("#")]
-    assert not [one for one in values if not line.match(one)]
-    samples = next(one for one in values if one.startswith("teds_samples_total"))
+    values = [splitline for splitline in answer.text.splitlines() if not splitline.startswith("#")]
+    assert not [value for value in values if not line.match(value)]
+    samples = next(value for value in values if value.startswith("teds_samples_total"))
     assert hand in samples
     assert float(samples.rpartition(" ")[2]) > 0
-    assert any(one.startswith("teds_sink_written_total") and 'sink="seen.csv"' in one for one in values), "no folder"
-    names = [one.rpartition(" ")[0] for one in values]
+    assert any(value.startswith("teds_sink_written_total") and 'sink="seen.csv"' in value for value in values), (
+        "no folder"
+    )
+    names = [value.rpartition(" ")[0] for value in values]
     assert len(names) == len(set(names)), "Prometheus takes no two samples of one series"
-    assert any(one.startswith("teds_link_up") and one.endswith(" 1") for one in values)
+    assert any(value.startswith("teds_link_up") and value.endswith(" 1") for value in values)
 
 
 def test_a_counter_has_all_its_digits_and_a_series_one_line() -> None:
@@ -91,7 +93,7 @@ def test_the_paths_of_clause_12(open_service: Service, hand: str, bearer: dict[s
         return open_service.raw("GET", f"/1451/{path}", bearer)
 
     def fields(answer: Answer) -> dict[str, Any]:
-        return {one.tag: one.text for one in ElementTree.fromstring(answer.text)}
+        return {element.tag: element.text for element in ElementTree.fromstring(answer.text)}
 
     found = ask("Discovery/TIMDiscovery")
     assert ElementTree.fromstring(found.text).tag == "TIMDiscoveryHTTPResponse"

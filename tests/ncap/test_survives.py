@@ -254,7 +254,7 @@ def test_a_full_disk_ends_the_recording_with_an_error_that_everyone_sees(lab: La
     lab.service.start(program=limited(400_000))
     lab.measure(sinks=["full.csv"], rate=2000)
     with lab.service.client() as asked:
-        sink = until(lambda: next((one for one in asked.status()["sinks"] if one["state"] == "failed"), None))
+        sink = until(lambda: next((sink for sink in asked.status()["sinks"] if sink["state"] == "failed"), None))
         assert "full.csv" in sink["error"]
         assert sink["hint"]
         assert sink["dropped"] == 0, "a recorder drops nothing: it ends"
@@ -293,9 +293,9 @@ def test_no_virtual_node_outlives_a_daemon_that_was_killed(desk: Desk, moment: f
 
 
 def _command_lines() -> Iterator[str]:
-    for one in Path("/proc").glob("[0-9]*/cmdline"):
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):
-            yield one.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            yield path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
 
 
 def test_an_actuator_that_another_command_holds_is_423(desk: Desk) -> None:
@@ -320,7 +320,7 @@ def test_factory_nodes_of_a_bus_are_taken_up_where_that_was_asked_for(desk: Desk
     node = desk.node("new", called="new").start(nfc=False, can=True)
     service = Service(desk, desk.station()).start("--detection", "transparent", "--adopt")
     with service.client() as asked:
-        until(lambda: any(one["whitelisted"] for one in asked.nodes()))
+        until(lambda: any(node["whitelisted"] for node in asked.nodes()))
         found = verified(service, node.uuid)
         assert (found["epoch"], found["whitelisted"]) == (1, True)
     assert service.station.keys(node.uuid) == [("active", 1)]
@@ -360,7 +360,7 @@ def test_two_daemons_on_one_bus_measure_their_own_nodes(lab: Lab, prepared: Path
             until(lambda: [node["uuid"] for node in asked.nodes() if node["present"]] == [lab.node.uuid])
             until(lambda: asked.node(lab.node.uuid)["verified"] or asked.node(lab.node.uuid)["problem"])
             assert lab.flows()["measuring"]["state"] == "running"
-            assert [one.status()["links"][0]["notice"] for one in (asked, own)] == [None, None]
+            assert [current.status()["links"][0]["notice"] for current in (asked, own)] == [None, None]
         second.end()
     finally:
         other.clear()

@@ -41,12 +41,12 @@ def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> 
         assert (asked_for["state"], asked_for["waits_for"]) == ("waiting", "tap")
         node.start()
         following.join(60)
-        told = [one for one in events if one.get("event") == "provision"]
+        told = [event for event in events if event.get("event") == "provision"]
         assert told[0]["state"] == "waiting"
-        done = [one["step"] for one in told if one.get("result") in ("done", "nothing to do", "skipped")]
+        done = [entry["step"] for entry in told if entry.get("result") in ("done", "nothing to do", "skipped")]
         assert done == ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
         assert told[-1]["state"] == "done", told[-1]
-        tapped = next(one for one in events if one.get("event") == "node" and one["state"] == "tapped")
+        tapped = next(event for event in events if event.get("event") == "node" and event["state"] == "tapped")
         assert tapped["uuid"] == node.uuid
         found = asked.node(node.uuid)
         assert (found["name"], verdict(found), found["via"]) == ("crane", "authentic", "nfc")
@@ -132,7 +132,7 @@ def test_the_next_board_that_is_tapped_is_provisioned_whichever_it_is(desk: Desk
 
 
 def service_run(asked: Any, uuid: str) -> Any:
-    found = next((one for one in asked.nodes() if one["uuid"] == uuid), None)
+    found = next((node for node in asked.nodes() if node["uuid"] == uuid), None)
     if found is None or verdict(found) != "authentic":
         return None
     run = asked.request("GET", f"/nodes/{uuid}/provision")

@@ -81,8 +81,8 @@ def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch
     looked: list[str] = []
     watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
     gone, stays = sighting(1), sighting(2)
-    for one in (gone, stays):
-        watch.on_sighting(one)
+    for item in (gone, stays):
+        watch.on_sighting(item)
     watch._pending.clear()
     watch._look_for_all()
     watch.on_sighting(sighting(2))

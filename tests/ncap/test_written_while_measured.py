@@ -53,11 +53,11 @@ def told(lab: Lab) -> list[dict[str, Any]]:
     while process.read(0.1):
         pass
     lines = [json.loads(line) for line in process.out[: process.out.rfind("\n") + 1].splitlines()]
-    return [one for one in lines if one.get("event") == "measurement" and one.get("uuid") == lab.node.uuid]
+    return [line for line in lines if line.get("event") == "measurement" and line.get("uuid") == lab.node.uuid]
 
 
 def states(lab: Lab) -> list[str]:
-    return [one["state"] for one in told(lab)]
+    return [entry["state"] for entry in told(lab)]
 
 
 def calibrated(lab: Lab, most: float) -> Path:
@@ -81,8 +81,8 @@ def test_a_node_is_provisioned_while_it_is_measured_and_the_gap_is_told(lab: Lab
     lab.flows()
     lab.service.end()
     lines = [json.loads(line) for line in (lab.service.station.home / "recordings/gap.jsonl").read_text().splitlines()]
-    assert len({one["fingerprint"] for one in lines if one["event"] == "channel"}) == 2
-    assert any(one["event"] == "status" and one["why"] == "let go for provision" for one in lines)
+    assert len({line["fingerprint"] for line in lines if line["event"] == "channel"}) == 2
+    assert any(line["event"] == "status" and line["why"] == "let go for provision" for line in lines)
 
 
 def test_write_and_address_have_the_node_let_go_too(lab: Lab) -> None:

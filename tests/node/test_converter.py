@@ -86,8 +86,8 @@ def test_raw_numbers_are_rounded_and_kept_within_the_sample(channel: tuple[Sheet
 
 def test_floats_carry_si_values() -> None:
     sheet = Sheet.from_image(Image(UUID, load_profile("gripper").build(UUID).blocks))
-    for each in sheet.channels:
-        converter = Converter(sheet, each)
+    for channel in sheet.channels:
+        converter = Converter(sheet, channel)
         middle = (converter.low + converter.high) / 2
         assert converter.value(converter.octets(Reading(value=middle))) == pytest.approx(middle, rel=2e-3)
 

@@ -91,8 +91,8 @@ class Lab:
 
     def _tidy(self) -> None:
         with client.connect(home=self.station.home) as station:
-            for one in station.request("GET", "/measurements")["measurements"]:
-                station.end_measurement(one["id"])
+            for measurement in station.request("GET", "/measurements")["measurements"]:
+                station.end_measurement(measurement["id"])
             for group in station.request("GET", "/groups")["groups"]:
                 station.request("DELETE", f"/groups/{quote(group['name'], safe='')}")
             if station.status()["detection"] != "whitelist":

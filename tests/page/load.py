@@ -59,7 +59,7 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
     """Two tactile fingers of 12 channels each, measured at RATE, twenty of them drawn."""
     with client.connect(home=lab.station.home) as station:
         asked = [{"profile": "tactile-finger-sensor", "name": name, "source": "sine:3"} for name in ("index", "thumb")]
-        uuids = [station.request("POST", "/virtual", one)["uuid"] for one in asked]
+        uuids = [station.request("POST", "/virtual", entry)["uuid"] for entry in asked]
         until(
             lambda: all((station.node(uuid)["verdict"] or {}).get("verdict") == "authentic" for uuid in uuids),
             "not provisioned",
@@ -95,7 +95,9 @@ def heap(devtools: CDPSession) -> int:
 
 def samples(station: client.Client) -> tuple[int, int]:
     """Samples taken and lost so far."""
-    nodes = [node for one in station.request("GET", "/measurements")["measurements"] for node in one["nodes"]]
+    nodes = [
+        node for measurement in station.request("GET", "/measurements")["measurements"] for node in measurement["nodes"]
+    ]
     return sum(node.get("samples", 0) for node in nodes), sum(node.get("lost", 0) for node in nodes)
 
 

@@ -25,7 +25,9 @@ def violations(page: Page) -> list[str]:
     if not page.evaluate("window.axe !== undefined"):
         page.evaluate(AXE)
     found = page.evaluate(f"axe.run(document, {RULES})")["violations"]
-    return [f"{one['id']}: {node['target']} {node['failureSummary'][:300]}" for one in found for node in one["nodes"]]
+    return [
+        f"{item['id']}: {node['target']} {node['failureSummary'][:300]}" for item in found for node in item["nodes"]
+    ]
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (1600, "dark")])

@@ -76,7 +76,7 @@ def test_everything_that_is_trusted_is_measured_by_one_button(browser: Browser, 
         page.get_by_role("button", name="Measure all trusted nodes").click()
         card = page.locator(".group", has=page.get_by_role("heading", name="All trusted nodes"))
         card.get_by_text(re.compile(r"\d+ nodes? measured: .*hand")).wait_for()
-        assert [one["match"] for one in lab.measurements()] == ["all"]
+        assert [measurement["match"] for measurement in lab.measurements()] == ["all"]
         card.get_by_role("button", name="Stop").click()
         page.get_by_role("button", name="Measure all trusted nodes").wait_for()
         assert lab.measurements() == []
@@ -114,14 +114,18 @@ def test_who_measures_says_whether_topics_may_move_actuators_and_when_these_are_
             card.get_by_label("Dead-man, ms").fill("")
             page.get_by_role("button", name="Start arm").click()
             card.get_by_text("safe state 300 ms after the last one").wait_for()
-            assert [(one["actuators"], one["dead_man"]) for one in fresh.measurements()] == [(True, 300)]
+            assert [(measurement["actuators"], measurement["dead_man"]) for measurement in fresh.measurements()] == [
+                (True, 300)
+            ]
             page.get_by_role("button", name="Stop arm").click()
             page.get_by_role("button", name="Start arm").wait_for()
             may.uncheck()
             card.get_by_label("Dead-man, ms").fill("250")
             page.get_by_role("button", name="Start arm").click()
             card.get_by_text("Not accepted in this measurement").wait_for()
-            assert [(one["actuators"], one["dead_man"]) for one in fresh.measurements()] == [(False, 250)]
+            assert [(measurement["actuators"], measurement["dead_man"]) for measurement in fresh.measurements()] == [
+                (False, 250)
+            ]
             page.get_by_role("button", name="Stop arm").click()
             page.get_by_role("button", name="Start arm").wait_for()
             # The same of one node by itself.
@@ -132,7 +136,7 @@ def test_who_measures_says_whether_topics_may_move_actuators_and_when_these_are_
             ).uncheck()
             page.get_by_role("button", name="Measure", exact=True).click()
             page.get_by_text("Not accepted in this measurement").wait_for()
-            assert [one["actuators"] for one in fresh.measurements()] == [False]
+            assert [measurement["actuators"] for measurement in fresh.measurements()] == [False]
 
 
 def test_a_station_without_topics_says_that_it_takes_no_set_points(browser: Browser, lab: Lab) -> None:
@@ -153,10 +157,13 @@ def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(br
         hold.hover()
         page.mouse.down()
         page.get_by_text("Moving: 39.998 mm").wait_for()
-        until(lambda: any(abs(one["value"] - 0.04) < 1e-4 and not one["safe"] for one in lab.moved("hand")), "not set")
+        until(
+            lambda: any(abs(entry["value"] - 0.04) < 1e-4 and not entry["safe"] for entry in lab.moved("hand")),
+            "not set",
+        )
         began = len(lab.moved("hand"))
         page.wait_for_timeout(1500)  # longer than what one word holds: the page goes on asking
-        assert not any(one["safe"] for one in lab.moved("hand")[began:])
+        assert not any(entry["safe"] for entry in lab.moved("hand")[began:])
         page.mouse.up()
         page.get_by_text("Safe: confirmed by the node at").wait_for()
         assert lab.moved("hand")[-1]["safe"]
@@ -247,7 +254,7 @@ def test_provisioning_waits_for_the_tap_and_follows_it(browser: Browser, lab: La
         page.get_by_role("heading", name="oven", exact=True).wait_for()
         steps = page.locator(".steps li")
         assert steps.count() >= 6
-        assert {one.split("\n")[0] for one in steps.all_inner_texts()} <= {"done", "not needed"}
+        assert {inner_text.split("\n")[0] for inner_text in steps.all_inner_texts()} <= {"done", "not needed"}
         assert lab.nodes["oven"].uuid in page.url
         running.close()
 

@@ -56,13 +56,13 @@ def line(tmp_path: Path) -> Iterator[Lab]:
 
 def test_a_job_shows_its_yield_its_seconds_and_its_failures(browser: Browser, line: Lab, tmp_path: Path) -> None:
     with client.connect(home=line.station.home) as asked:
-        jobs = sorted(asked.request("GET", "/jobs")["jobs"], key=lambda one: -one["units"])
-        assert [(one["title"], one["units"], one["passed"], one["total"]) for one in jobs] == [
+        jobs = sorted(asked.request("GET", "/jobs")["jobs"], key=lambda item: -item["units"])
+        assert [(job["title"], job["units"], job["passed"], job["total"]) for job in jobs] == [
             ("three angles", 3, 3, 8),
             ("<b>later</b>", 0, 0, 3),
         ]
         told = asked.request("GET", f"/jobs/{jobs[0]['id'][:8]}")
-        parts = {one["name"]: one for one in told["stations"]}
+        parts = {station["name"]: station for station in told["stations"]}
         assert parts["owner"]["first_pass"] == pytest.approx(2 / 3, abs=1e-3)
         assert parts["owner"]["failures"] == {"node-silent": 1}
         assert (parts[EAST]["units"], parts[EAST]["first_pass"]) == (0, None)

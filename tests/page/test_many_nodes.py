@@ -31,8 +31,8 @@ def crowd(lab: Lab) -> Iterator[Lab]:
     lab.ask("whitelist", "import", file)
     yield lab
     with Store.open(lab.station.home) as store, store.together():
-        for one in listed:
-            store.remove_whitelist(bytes.fromhex(one["uuid"]))
+        for entry in listed:
+            store.remove_whitelist(bytes.fromhex(entry["uuid"]))
 
 
 def called(lab: Lab, *nodes: str) -> list[str]:
@@ -45,8 +45,8 @@ def others(lab: Lab) -> list[str]:
     """What nodes are called that tests before these provisioned, and left there."""
     mine = {lab.nodes[node].uuid for node in ("hand", "slew")}
     with client.connect(home=lab.station.home) as station:
-        known = [one for one in station.nodes() if (one["verdict"] or {}).get("verdict") == "authentic"]
-    return [one["name"] for one in known if one["uuid"] not in mine]
+        known = [node for node in station.nodes() if (node["verdict"] or {}).get("verdict") == "authentic"]
+    return [node["name"] for node in known if node["uuid"] not in mine]
 
 
 def names(page: Page) -> list[str]:

@@ -197,7 +197,7 @@ def test_what_describes_itself_is_shown_unverified_and_signed_by_a_button(browse
     fresh.run("--detection", "transparent", "--adopt", "--unverified", "--rate", "20")
     node = brings(fresh.desk, "shaft 40 mm", can=fresh.can)
     with client.connect(home=fresh.station.home) as asked:
-        until(lambda: any(one["uuid"] == node.uuid and one["unverified"] for one in asked.nodes()))
+        until(lambda: any(known_node["uuid"] == node.uuid and known_node["unverified"] for known_node in asked.nodes()))
     with opened(browser, fresh, route=f"nodes/{node.uuid}/datasheet") as page:
         page.get_by_text("Unverified", exact=True).first.wait_for()
         page.get_by_role("heading", name="shaft 40 mm", exact=True).wait_for()

@@ -76,4 +76,4 @@ def test_a_line_is_drawn_only_through_points_that_belong_together(
         found = page.evaluate(BINS, [RING.read_text(), points, silence])
     finally:
         page.close()
-    assert [("-" if one == "nothing" else one) for one in found] == bins
+    assert [("-" if item == "nothing" else item) for item in found] == bins

@@ -32,7 +32,10 @@ GOOD, BAD, NOT_RUN = ".", "X", "-"
 
 def table(found: Iterable[Found]) -> str:
     """Return the result of each cell: a row for each change, a column for each long run, a letter for each time."""
-    results = {(one.cell.change.name, one.cell.run, one.cell.when): BAD if one.complaints else GOOD for one in found}
+    results = {
+        (current.cell.change.name, current.cell.run, current.cell.when): BAD if current.complaints else GOOD
+        for current in found
+    }
     width = max(len(change.name) for change in CHANGES)
     heads = list(LONG_RUNS)
     lines = ["  ".join([" " * width, *heads])]
@@ -69,10 +72,10 @@ def main(arguments: list[str]) -> int:
         return found
 
     with Scenes.open() as scenes, ThreadPoolExecutor(chosen.jobs) as pool:
-        found = [one for one in pool.map(run, cells) if one is not None]
+        found = [item for item in pool.map(run, cells) if item is not None]
     print(table(found))
-    bad = sum(bool(one.complaints) for one in found)
-    pairs = len({(one.cell.change.name, one.cell.run) for one in found})
+    bad = sum(bool(current.complaints) for current in found)
+    pairs = len({(current.cell.change.name, current.cell.run) for current in found})
     seconds = time.monotonic() - began
     print(
         f"{len(found)} of {len(cells)} cells of {pairs} pairs: "

@@ -237,7 +237,7 @@ class Ncap(Measuring):
         if status.code:
             self.complaints.append(f"ncap status: {status}")
             return
-        foreign = [one["id"] for one in status.lines[-1]["measurements"] if one["id"] != "run"]
+        foreign = [measurement["id"] for measurement in status.lines[-1]["measurements"] if measurement["id"] != "run"]
         if foreign:
             self.complaints.append(f"ncap run measures what another command began: {foreign}")
 

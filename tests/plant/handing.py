@@ -58,7 +58,7 @@ class MemoryPost:
         return None
 
     def parcels(self, to: str) -> Iterator[Parcel]:
-        yield from [one for one in self.there.values() if one.to == to]
+        yield from [parcel for parcel in self.there.values() if parcel.to == to]
 
     def send(self, parcel: Parcel) -> None:
         from teds_provision.errors import PolicyError
@@ -158,7 +158,9 @@ class Plant:
         """Have all trust each other, as the roster does."""
         for station in self.stations.values():
             for name, other in self.stations.items():
-                if other is not station and not any(one.point == other.point for one in station.policy.trusted()):
+                if other is not station and not any(
+                    trusted.point == other.point for trusted in station.policy.trusted()
+                ):
                     path = station.home.parent / f"{name}.pem"
                     from teds_provision.protocol.keys import to_pem
 
@@ -170,8 +172,8 @@ class Plant:
 
         def see(uuid: bytes) -> MergedClaims:
             claims: dict[str, Claim] = {}
-            for each, station in self.stations.items():
-                if each in self.deaf and each != name:
+            for word, station in self.stations.items():
+                if word in self.deaf and word != name:
                     continue
                 for _, _, text in station.plant.tables.outbox(10_000):
                     told = event.read(json.loads(text))

@@ -71,10 +71,10 @@ def roster_of(
 ) -> Roster:
     draft = Roster(
         REGISTRY, "plant", version, "" if version == 1 else "ab" * 32, NOW, NOW + timedelta(days=90),
-        tuple(Member(one.name, one.key.point, certificate(one.key), one.roles, signed.get(one.name))
-              for one in members),
-        tuple(RemovedMember(one.name, one.key.point, one.roles, "stolen", last, signed.get(one.name))
-              for one, last in removed),
+        tuple(Member(speaker.name, speaker.key.point, certificate(speaker.key), speaker.roles, signed.get(speaker.name))
+              for speaker in members),
+        tuple(RemovedMember(speaker.name, speaker.key.point, speaker.roles, "stolen", last, signed.get(speaker.name))
+              for speaker, last in removed),
     )  # fmt: skip
     return open_roster(seal_roster(draft, CA), CA.point)
 
@@ -103,27 +103,27 @@ class Reader:
         self.counting[station] = counts
         seen: set[str] = set()
         for place in counts.pages:
-            for one in map(event.read, there[place].events):
-                if not isinstance(one, event.Event) or one.id in seen:
+            for item in map(event.read, there[place].events):
+                if not isinstance(item, event.Event) or item.id in seen:
                     continue
-                seen.add(one.id)
-                self._take(station, place, one)
+                seen.add(item.id)
+                self._take(station, place, item)
         for place, page in sorted(there.items()):
-            for one in map(event.read, page.events):
-                if isinstance(one, event.Event) and one.act == "revoked" and one.uuid is not None:
-                    said = open_revocation(one.members["statement"], self.roster.point_of)
+            for event_read in map(event.read, page.events):
+                if isinstance(event_read, event.Event) and event_read.act == "revoked" and event_read.uuid is not None:
+                    said = open_revocation(event_read.members["statement"], self.roster.point_of)
                     held = BanStatement(event.hash_of_statement(said.statement), station, place in counts.pages, said)
-                    if held not in self.statements.setdefault(one.uuid, []):
-                        self.statements[one.uuid].append(held)
+                    if held not in self.statements.setdefault(event_read.uuid, []):
+                        self.statements[event_read.uuid].append(held)
 
-    def _take(self, station: str, place: Place, one: event.Event) -> None:
-        if one.act in ("signed", "vouched"):
-            word = SignatureClaim(station, place[0], one.act == "vouched")
-            self.words.setdefault(one.members["teds_sha256"], []).append(word)
-        elif one.act == "lifted":
-            self.liftings.setdefault(one.members["of"], set()).add(station)
-        elif one.uuid is not None:
-            self.claims.setdefault(one.uuid, {}).setdefault(station, Claim()).apply_event(one)
+    def _take(self, station: str, place: Place, stated: event.Event) -> None:
+        if stated.act in ("signed", "vouched"):
+            word = SignatureClaim(station, place[0], stated.act == "vouched")
+            self.words.setdefault(stated.members["teds_sha256"], []).append(word)
+        elif stated.act == "lifted":
+            self.liftings.setdefault(stated.members["of"], set()).add(station)
+        elif stated.uuid is not None:
+            self.claims.setdefault(stated.uuid, {}).setdefault(station, Claim()).apply_event(stated)
 
     def view(self, uuid: bytes, own: LocalState | None = None) -> MergedClaims:
         own = own or LocalState("f" * 64)

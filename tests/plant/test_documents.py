@@ -24,7 +24,7 @@ KINDS: dict[str, DocumentKind] = {
     for kind in (document.ROSTER, document.PAGE, document.MEMBER_REQUEST, document.JOB, document.SIGN_REQUEST,
                  document.SIGNED)
 }  # fmt: skip
-DOCUMENTS = [name for name, one in KAT["documents"].items() if one["typ"] in KINDS]
+DOCUMENTS = [name for name, item in KAT["documents"].items() if item["typ"] in KINDS]
 CA = KEYS["ca"]
 
 
@@ -158,7 +158,7 @@ NORTH, WEST = a_member("north", "keeper"), a_member("west", "line", "sign")
 def test_the_known_rosters_are_read_and_follow_each_other() -> None:
     first, second = (open_roster(octets_of(f"roster {n}"), CA.point) for n in (1, 2))
     assert [member.name for member in first.members] == ["north", "west", "office", "south"]
-    assert [one.name for one in second.removed] == ["west"]
+    assert [removed.name for removed in second.removed] == ["west"]
     assert second.removed[0].last == (1, KAT["documents"]["west 1"]["H"])
     assert taking(second, first, KAT["registry"]) == ("taken", "")
     assert taking(first, second, KAT["registry"])[0] == "older"
@@ -237,8 +237,8 @@ def test_the_known_pages_are_read_with_every_event() -> None:
     for name in ("north 1", "west 1", "west 2", "south 1", "west 2, other history"):
         read = page.open_page(octets_of(name), KAT["registry"], POINTS.get)
         events = [event.read(value) for value in read.events]
-        assert all(isinstance(one, event.Event) for one in events)
-        acts |= {one.act for one in events if isinstance(one, event.Event)}
+        assert all(isinstance(item, event.Event) for item in events)
+        acts |= {item.act for item in events if isinstance(item, event.Event)}
     assert acts == set(event.FORMS)
 
 
@@ -283,7 +283,7 @@ def test_an_event_that_is_not_of_its_form_is_told_and_one_that_is_not_known_is_p
 
 
 def test_the_reset_of_the_known_answers_is_proven_and_no_other() -> None:
-    told = next(one for one in KAT["documents"]["west 2"]["payload"]["events"] if one["act"] == "reset")
+    told = next(item for item in KAT["documents"]["west 2"]["payload"]["events"] if item["act"] == "reset")
     good = event.read(told)
     assert isinstance(good, event.Event)
     assert event.reset_proven(good) == KAT["keys"]["node"]["fingerprint"]

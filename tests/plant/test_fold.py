@@ -47,11 +47,11 @@ def test_the_known_views_follow_from_their_pages(name: str) -> None:
             {"epoch": seen.holder[0], "says": {k: list(v) for k, v in seen.holder[1].items()}} if seen.holder else None
         )
         assert holder == due["holder"]
-        assert {station: list(one) for station, one in seen.written.items()} == due["written"]
+        assert {station: list(pair) for station, pair in seen.written.items()} == due["written"]
         assert sorted(map(list, seen.gave)) == due["gave"]
         assert sorted(map(list, seen.resets)) == due["resets"]
         assert (seen.name, seen.groups, seen.keeper_groups) == (due["name"], due["groups"], due["keeper_groups"])
-        assert {one: list(groups) for one, groups in seen.own_groups.items()} == due["own_groups"]
+        assert {name: list(groups) for name, groups in seen.own_groups.items()} == due["own_groups"]
         assert (list(seen.conflicts), seen.key_it) == (due["conflicts"], due["key_it"])
     two = [station for station, counts in reader.counting.items() if counts.two]
     assert two == given["view"]["two_histories"]
@@ -66,13 +66,13 @@ def add_without_statements(reader: Reader, octets: bytes) -> None:
     page = open_page(octets, KAT["registry"], reader.roster.point_of)
     reader.pages[page.station] = {(page.n, page.hash): page}
     reader.counting[page.station] = counting([(page.n, page.hash, page.previous)], last=None, accepted=None)
-    for one in map(event.read, page.events):
-        assert isinstance(one, event.Event)
-        if one.act != "revoked":
-            reader._take(page.station, (page.n, page.hash), one)
+    for event_read in map(event.read, page.events):
+        assert isinstance(event_read, event.Event)
+        if event_read.act != "revoked":
+            reader._take(page.station, (page.n, page.hash), event_read)
         else:
             with pytest.raises(TedsProvisionError):
-                open_revocation(one.members["statement"], reader.roster.point_of)
+                open_revocation(event_read.members["statement"], reader.roster.point_of)
 
 
 # -- which pages count -------------------------------------------------------------------------------------------------
@@ -125,25 +125,25 @@ def chatter(seed: int) -> list[Speaker]:
         speaker("keep", "keeper", "sign", "line", "base"), speaker("keep2", "keeper"), speaker("line", "line", "sign"),
         speaker("base", "base"), speaker("sign", "sign"), speaker("audit", "audit"),
     ]  # fmt: skip
-    for one in speakers:
+    for current in speakers:
         places: list[Place] = [(0, "")]
         for _ in range(chance.randrange(1, 5)):
-            told = [anything(one, chance, speakers) for _ in range(chance.randrange(5))]
+            told = [anything(current, chance, speakers) for _ in range(chance.randrange(5))]
             if chance.random() < 0.1:
                 told += told[:1]  # an id that stood before
             fork = chance.choice(places) if chance.random() < 0.1 else None
-            heads = {other.fingerprint: other.head for other in speakers if other.head[0] and other is not one}
-            places.append(one.page(*told, heads=heads, after=fork))
+            heads = {other.fingerprint: other.head for other in speakers if other.head[0] and other is not current}
+            places.append(current.page(*told, heads=heads, after=fork))
     return speakers
 
 
-def anything(one: Speaker, chance: random.Random, speakers: list[Speaker]) -> dict[str, Any]:
+def anything(current: Speaker, chance: random.Random, speakers: list[Speaker]) -> dict[str, Any]:
     uuid, epoch = chance.choice(NODES), chance.randrange(4)
     key, peer = chance.choice([PIN, OTHER]), chance.choice(speakers).fingerprint
     key_id, bundle = chance.choice(["0" * 16, "1" * 16]), f"11111111-2222-4333-8444-{chance.randrange(3):012}"
     handed = {"epoch": epoch, "key_id": key_id, "peer": peer, "mode": chance.choice(["copy", "move"]), "bundle": bundle}
     second, challenge = chance.randrange(100), bytes(32)
-    statement = seal_revocation(one.key, uuid=uuid, node=key, why="lost", created=NOW)
+    statement = seal_revocation(current.key, uuid=uuid, node=key, why="lost", created=NOW)
     say: list[tuple[str, bytes | None, dict[str, Any]]] = [
         ("pinned", uuid, {"fingerprint": key, "assurance": "tap"}),
         ("unpinned", uuid, {}),
@@ -164,15 +164,18 @@ def anything(one: Speaker, chance: random.Random, speakers: list[Speaker]) -> di
         ("lifted", None, {"of": event.hash_of_statement(statement.statement)}),
     ]  # fmt: skip
     act, node, members = chance.choice(say)
-    return one.event(act, node, second, **members)
+    return current.event(act, node, second, **members)
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_the_order_in_which_pages_arrive_changes_no_view(seed: int) -> None:
     speakers = chatter(seed)
-    pages = [octets for one in speakers for octets in one.pages]
+    pages = [octets for current in speakers for octets in current.pages]
     gone = speakers[seed % len(speakers)]
-    rosters = [roster_of(speakers), roster_of([one for one in speakers if one is not gone], [(gone, gone.head)])]
+    rosters = [
+        roster_of(speakers),
+        roster_of([current for current in speakers if current is not gone], [(gone, gone.head)]),
+    ]
     for roster in rosters:
         first = Reader(roster, pages)
         for again in range(4):
@@ -180,15 +183,15 @@ def test_the_order_in_which_pages_arrive_changes_no_view(seed: int) -> None:
             for uuid in NODES:
                 for own in (LocalState("f" * 64), LocalState("f" * 64, pin=PIN, met=True)):
                     assert other.view(uuid, own) == first.view(uuid, own)
-            for one in speakers:
+            for current in speakers:
                 for digest in (DIGEST, DIGEST2):
-                    assert other.signing(one.fingerprint, digest) == first.signing(one.fingerprint, digest)
+                    assert other.signing(current.fingerprint, digest) == first.signing(current.fingerprint, digest)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_claim_comes_back_from_the_store_as_it_was(seed: int) -> None:
     speakers = chatter(seed)
-    reader = Reader(roster_of(speakers), [octets for one in speakers for octets in one.pages])
+    reader = Reader(roster_of(speakers), [octets for current in speakers for octets in current.pages])
     for claims in reader.claims.values():
         for claim in claims.values():
             assert Claim.from_json(json.loads(json.dumps(claim.to_json()))) == claim
@@ -197,16 +200,18 @@ def test_a_claim_comes_back_from_the_store_as_it_was(seed: int) -> None:
 # -- who wins ----------------------------------------------------------------------------------------------------------
 
 
-def pinned(one: Speaker, key: str, uuid: bytes = A) -> dict[str, Any]:
-    return one.event("pinned", uuid, fingerprint=key, assurance="tap")
+def pinned(current: Speaker, key: str, uuid: bytes = A) -> dict[str, Any]:
+    return current.event("pinned", uuid, fingerprint=key, assurance="tap")
 
 
-def agreed(one: Speaker, epoch: int, key_id: str = "0" * 16, key: str = PIN) -> dict[str, Any]:
-    return one.event("agreed", A, fingerprint=key, epoch=epoch, key_id=key_id)
+def agreed(current: Speaker, epoch: int, key_id: str = "0" * 16, key: str = PIN) -> dict[str, Any]:
+    return current.event("agreed", A, fingerprint=key, epoch=epoch, key_id=key_id)
 
 
-def handed(one: Speaker, act: str, peer: Speaker, epoch: int, mode: str = "copy", bundle: int = 0) -> dict[str, Any]:
-    return one.event(
+def handed(
+    current: Speaker, act: str, peer: Speaker, epoch: int, mode: str = "copy", bundle: int = 0
+) -> dict[str, Any]:
+    return current.event(
         act, A, epoch=epoch, key_id="0" * 16, peer=peer.fingerprint, mode=mode,
         bundle=f"11111111-2222-4333-8444-{bundle:012}",
     )  # fmt: skip
@@ -223,7 +228,7 @@ def four() -> list[Speaker]:
 
 
 def pages_of(speakers: list[Speaker]) -> list[bytes]:
-    return [octets for one in speakers for octets in one.pages]
+    return [octets for current in speakers for octets in current.pages]
 
 
 def test_keepers_pin_for_everybody_while_they_agree(four: list[Speaker]) -> None:
@@ -314,7 +319,7 @@ def lies(liar: Speaker, victims: list[Speaker]) -> None:
         liar.event("written", A, epoch=4_000_000_000, sequence=4_000_000_000, teds_sha256=OTHER, profile="x",
                    profile_sha256=None, due=None),
         liar.event("reset", A, epoch=4_000_000_000, challenge="00" * 32, proof="00" * 64, point=NODE.point.hex()),
-        heads={one.fingerprint: (999, "ee" * 32) for one in victims},
+        heads={victim.fingerprint: (999, "ee" * 32) for victim in victims},
     )  # fmt: skip
     liar.page(liar.event("revoked", A, statement=statement.statement))
 
@@ -339,10 +344,10 @@ def test_no_liar_without_a_key_bans_unsigns_or_unpins_a_node(roles: str, four: l
     ):
         before, after = honest.view(A, own), lied.view(A, own)
         assert (after.pin, after.bans, after.key_it) == (before.pin, before.bans, True)
-        assert {one: after.held.get(one) for one in before.held} == dict(before.held)
+        assert {name: after.held.get(name) for name in before.held} == dict(before.held)
     assert lied.signing(line.fingerprint, DIGEST).result == "passed"
     assert lied.signing(base.fingerprint, DIGEST2).result == "failed", "a vouching of no keeper counts for nothing"
-    gone = roster_of([one for one in members if one is not line], [(line, line.head)], version=2)
+    gone = roster_of([member for member in members if member is not line], [(line, line.head)], version=2)
     if roles == "stranger":
         assert Reader(gone, pages_of(four)).signing(line.fingerprint, DIGEST).result == "passed"
         return

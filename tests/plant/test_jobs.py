@@ -75,8 +75,8 @@ def units(line: LineRun) -> list[tuple[int, int, int]]:
 def test_each_board_gets_one_unit_and_leaves_evidence(owner: Station) -> None:
     line = line_of(owner, name="angle {unit:03} {uuid8}")
     boards = [board(number) for number in range(3)]
-    for one in boards:
-        assert build(line, one).verified.verdict == "authentic"
+    for built_board in boards:
+        assert build(line, built_board).verified.verdict == "authentic"
     assert units(line) == [(1, 1, 1), (2, 1, 1), (3, 1, 1)]
     assert (line.passed, line.total) == (3, 3)
     assert line.job is not None
@@ -147,7 +147,7 @@ def test_a_job_that_comes_while_the_roster_has_expired_waits_for_the_renewed_one
     assert station.plant.line.jobs() == []
     plant.apply_pages.put_roster(station, roster_of(station, own, version=2, previous=expired.hash))
     take_received(station)
-    assert [one.id for one in station.plant.line.jobs()] == [job.id]
+    assert [job_row.id for job_row in station.plant.line.jobs()] == [job.id]
     assert parcels.received(station, "job") == []
     station.close()
 
@@ -261,8 +261,8 @@ def test_a_profile_that_is_edited_beside_a_job_makes_no_board_of_it(tmp_path: Pa
     own.parent.mkdir(exist_ok=True)
     own.write_bytes(find_profile(ANGLE).read_bytes())
     boards = [board(1), board(2)]
-    for one in boards:
-        (tmp_path / f"{one.uuid.hex()}.csv").write_text(f"# date: {NOW:%Y-%m-%d}\n{TABLE}")
+    for built_board in boards:
+        (tmp_path / f"{built_board.uuid.hex()}.csv").write_text(f"# date: {NOW:%Y-%m-%d}\n{TABLE}")
     any_date = CalibrationRule("any", max_age_days=30)
     line = line_of(owner, tmp_path, calibration=any_date, profile_sha256=digest_of_file(own))
     build(line, boards[0])

@@ -88,9 +88,9 @@ def test_no_page_of_a_liar_stops_a_reader_or_takes_anything(plants: Plant, name:
     north, west = plants.north, plants.stations[1]
     base = 1_000_000 * (1 + list(ATTACKS).index(name))
     change = dict(ATTACKS[name])
-    for one in change.get("events", ()):  # an id stands once in a chain: each attack brings its own
-        if isinstance(one, dict) and isinstance(one.get("id"), str):
-            one["id"] = f"{base + int(one['id'], 16):016x}"
+    for event in change.get("events", ()):  # an id stands once in a chain: each attack brings its own
+        if isinstance(event, dict) and isinstance(event.get("id"), str):
+            event["id"] = f"{base + int(event['id'], 16):016x}"
     n = lied(plants, west, change)
     plants.sync(north)
     record, roster = north.plant.joined, north.plant.roster
@@ -98,12 +98,12 @@ def test_no_page_of_a_liar_stops_a_reader_or_takes_anything(plants: Plant, name:
     assert roster is not None
     assert north.plant.tables.chain(west.fingerprint).counted[0] == n, "its chain goes on"
     shown = plant.status.status(north, record, roster)
-    assert {one.name for one in shown.standings} == {"north", "west"}
+    assert {standing.name for standing in shown.standings} == {"north", "west"}
     told = list(plant.status.log(north, of=west.fingerprint))
-    listed = {one["uuid"]: one for one in plant.status.nodes(north, roster)}
+    listed = {node["uuid"]: node for node in plant.status.nodes(north, roster)}
     assert listed[NODE.hex()]["says"]["pinned_by"]["north"] == KEY
     assert listed[NODE.hex()]["says"]["revoked"] == []
-    assert all("\x1b" not in str(one.event) for one in told)
+    assert all("\x1b" not in str(stated.event) for stated in told)
     entry = north.pins.entry(NODE)
     assert entry is not None
     assert (entry.fingerprint, entry.assurance) == (KEY, "tap")

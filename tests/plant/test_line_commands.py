@@ -75,9 +75,9 @@ def test_from_an_order_to_boards_with_proof(desk: Desk, owner: Station, tmp_path
     assert list(part["steps"])[-1] == "check"
     assert len((tmp_path / "attempts.csv").read_text().splitlines()) == 3
     assert "2 of 2 passed" in owner.run("job", "status", job["id"]).out
-    assert [one["passed"] for one in owner.ask("job", "list")["jobs"]] == [2]
+    assert [job["passed"] for job in owner.ask("job", "list")["jobs"]] == [2]
     assert owner.ask("job", "close", job["id"])["state"] == "closed"
-    assert {one["profile"] for one in owner.ask("nodes", "--profile", ANGLE)["nodes"]} == {ANGLE}
+    assert {node["profile"] for node in owner.ask("nodes", "--profile", ANGLE)["nodes"]} == {ANGLE}
     assert owner.log_is_whole()
 
 
@@ -230,8 +230,8 @@ def west(desk: Desk, owner: Station) -> Station:
         assert roster is not None
         members = (member(station, "owner", *ALL), member(made, "west", "line"))
         new = roster_of(station, *members, version=2, previous=roster.hash)
-        for one in (station, made):
-            join(one, new)
+        for any_station in (station, made):
+            join(any_station, new)
         made.close()
     return Station(desk, folder)
 
@@ -285,8 +285,8 @@ def test_an_office_whose_key_lies_in_a_token_signs_for_a_line(
     try:
         made = certified(desk.folder / "west", "west", station)
         roster = roster_of(station, member(station, "office", *ALL), member(made, "west", "line"))
-        for one in (station, made):
-            join(one, roster)
+        for any_station in (station, made):
+            join(any_station, roster)
         made.close()
     finally:
         station.close()

@@ -74,12 +74,12 @@ def killed_at(step: int, folder: Path, disk: Path, patch: pytest.MonkeyPatch) ->
 def opened(folder: Path, *names: str) -> Iterator[Homes]:
     homes = {name: Station.open(folder / name, ask=ask) for name in names}
     try:
-        for one in homes.values():
-            one.unlock()
+        for station in homes.values():
+            station.unlock()
         yield homes
     finally:
-        for one in homes.values():
-            one.close()
+        for station in homes.values():
+            station.close()
 
 
 def cut(
@@ -142,10 +142,12 @@ def cut_office(folder: Path, steps: range, patch: pytest.MonkeyPatch) -> int:
         tables = homes["north"].plant.line
         assert [row.unit for row in tables.units(job.id)] == [1, 2]
         for row in tables.units(job.id):
-            answered = [one.sequence for one in tables.sign_requests(job.id, row.uuid, "in")]
+            answered = [request.sequence for request in tables.sign_requests(job.id, row.uuid, "in")]
             assert len(set(answered)) == len(answered), "each request has a sequence of its own"
-            for one in tables.sign_requests(job.id, row.uuid, "in"):
-                assert answer(homes["north"], one.request) == one.answer, "the same request gets the same answer"
+            for request in tables.sign_requests(job.id, row.uuid, "in"):
+                assert answer(homes["north"], request.request) == request.answer, (
+                    "the same request gets the same answer"
+                )
         done += 1
     return done
 

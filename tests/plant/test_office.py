@@ -80,11 +80,11 @@ class Desk:
         take_job(self.office, document)
         return LineRun(self.line, take_job(self.line, document), calibrations=calibrations, office=self.at_hand)
 
-    def request(self, run: LineRun, one: Board) -> SignRequest:
+    def request(self, run: LineRun, built_board: Board) -> SignRequest:
         """A good request for a board, as its line makes it, which nobody answers."""
         self.at_hand.away = True
         with pytest.raises(OfficeSilentError):
-            build(run, one)
+            build(run, built_board)
         self.at_hand.away = False
         return self.at_hand.asked[-1]
 
@@ -107,12 +107,12 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
     plant.close()
 
 
-def proven(request: SignRequest, line: Station, one: Board, **changes: Any) -> SignRequest:
+def proven(request: SignRequest, line: Station, built_board: Board, **changes: Any) -> SignRequest:
     """The request changed, and the board asked again: what a station can do that has the board in its hands."""
     new = replace(request, **changes)
     blocks = new.image.unsigned_blocks()
     asked = challenge(new.nonce, line.point, new.uuid, new.epoch, new.sequence, blocks)
-    return replace(new, proof=one.key.sign(prove_message(new.uuid, asked)))
+    return replace(new, proof=built_board.key.sign(prove_message(new.uuid, asked)))
 
 
 def test_a_line_without_sign_makes_authentic_boards_by_its_office(desk: Desk) -> None:
@@ -425,7 +425,7 @@ def test_the_known_request_and_answer_are_read(desk: Desk) -> None:
     request = open_request(documents["sign-request"]["jws"].encode(), points.get)
     assert request.hash == documents["sign-request"]["H"]
     told = KAT["sign_request"]
-    values = {(int(one[:4], 16), int(one[4:6], 16)): bytes.fromhex(one[6:]) for one in told["values_108"]}
+    values = {(int(item[:4], 16), int(item[4:6], 16)): bytes.fromhex(item[6:]) for item in told["values_108"]}
     hashed = b"TEDS1 sign request\0" + request.nonce + request.line + request.uuid
     hashed += request.epoch.to_bytes(4, "big") + request.sequence.to_bytes(4, "big")
     hashed += b"".join(c.to_bytes(2, "big") + bytes([a]) + digest for (c, a), digest in values.items())

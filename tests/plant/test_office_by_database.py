@@ -91,9 +91,9 @@ def test_a_request_that_its_office_took_away_is_there_again_when_it_is_asked_aga
     at_line.registry()
     at_office.drop(parcel.id, north.fingerprint)
     at_line.send(parcel)
-    assert [one.id for one in at_office.new_parcels(north.fingerprint, ())] == [parcel.id]
+    assert [parcel.id for parcel in at_office.new_parcels(north.fingerprint, ())] == [parcel.id]
     at_line.send(parcel)
-    assert [one.id for one in at_office.new_parcels(north.fingerprint, ())] == [parcel.id]
+    assert [parcel.id for parcel in at_office.new_parcels(north.fingerprint, ())] == [parcel.id]
     at_office.close()
     at_line.close()
 
@@ -119,7 +119,7 @@ def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
     for _ in range(2):
         plant.sync(west, north)
     attempts = attempts_of(north, job.id)
-    assert [(one.uuid, one.unit, one.attempt, one.code) for one in attempts] == [
+    assert [(attempt.uuid, attempt.unit, attempt.attempt, attempt.code) for attempt in attempts] == [
         (first.uuid, 1, 1, "registry"),
         (first.uuid, 1, 2, None),
         (second.uuid, 2, 1, None),

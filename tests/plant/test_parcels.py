@@ -73,7 +73,7 @@ def test_nothing_goes_round_in_circles(plant: Plant) -> None:
         sync(plant, "west", "north", "south")
     assert [len(holds(plant[name], board.uuid)) for name in ROLES] == [1, 1, 1]
     assert plant.post.there == {}
-    sent = [one for name in ROLES for one in plant[name].handovers.all() if one.direction == "out"]
+    sent = [handover for name in ROLES for handover in plant[name].handovers.all() if handover.direction == "out"]
     assert len(sent) == 2
 
 

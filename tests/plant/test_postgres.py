@@ -95,7 +95,7 @@ def test_a_parcel_goes_to_its_receiver_and_is_taken_away(post: Registry, login: 
     post.send(name, to.fingerprint, b"sealed", later())
     [waiting] = receiver.look().parcels
     assert (waiting.id, waiting.sender, waiting.to, waiting.octets) == (name, login.fingerprint, to.fingerprint, 6)
-    assert [each.id for each in post.look().parcels] == [name]
+    assert [waiting_parcel.id for waiting_parcel in post.look().parcels] == [name]
     assert receiver.parcel(name) == b"sealed"
     receiver.remove([name])
     assert post.look().parcels == ()

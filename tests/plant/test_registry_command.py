@@ -57,7 +57,7 @@ def joined(desk: Desk) -> None:
         asked = desk.folder / f"{name}.request"
         told = desk.ask(name, "registry", "request", "--output", asked)
         assert str(told["role"]) == f"teds_{str(told['fingerprint'])[:16]}"
-        words = [word for one in roles for word in ("--role", one)]
+        words = [word for role in roles for word in ("--role", role)]
         desk.ask("north", "registry", "add", asked, *words, "--yes")
     desk.ask("north", "registry", "connect", "--files", desk.stick, "--yes")
     desk.sync("north")
@@ -70,14 +70,14 @@ def test_three_stations_join_and_see_the_same(desk: Desk) -> None:
     desk.ask("north", "whitelist", "add", UUID, "--fingerprint", KEY)
     desk.sync("north", "south", "west", "north", "south", "west")
     seen = [desk.ask(name, "registry", "status") for name in ("north", "south", "west")]
-    assert len({json.dumps(one["heads"]) for one in seen}) == 1
-    assert {one["roster"] for one in seen} == {3}
+    assert len({json.dumps(entry["heads"]) for entry in seen}) == 1
+    assert {entry["roster"] for entry in seen} == {3}
     listed = desk.ask("south", "whitelist", "list")["whitelist"]
     assert isinstance(listed, list)
-    assert [(one["uuid"], one["assurance"]) for one in listed] == [(UUID, "registry")]
+    assert [(item["uuid"], item["assurance"]) for item in listed] == [(UUID, "registry")]
     events = desk.ask("west", "registry", "log", UUID)["events"]
     assert isinstance(events, list)
-    assert [(one["act"], one["station"]) for one in events] == [("pinned", "north")]
+    assert [(event["act"], event["station"]) for event in events] == [("pinned", "north")]
     (node,) = desk.ask("west", "nodes", "--plant")["nodes"]  # type: ignore[misc]
     assert node["uuid"] == UUID
     assert node["says"]["pinned_by"] == {"north": KEY}
@@ -111,7 +111,7 @@ def test_members_are_trusted_and_the_roster_alone_says_so(desk: Desk) -> None:
     desk.sync("south")
     listed = desk.ask("south", "trust", "list")["trusted"]
     assert isinstance(listed, list)
-    assert {(one["name"], one["source"]) for one in listed} == {("north", "roster"), ("west", "roster")}
+    assert {(item["name"], item["source"]) for item in listed} == {("north", "roster"), ("west", "roster")}
 
 
 def test_a_roster_is_drafted_here_and_signed_where_the_ca_key_is(desk: Desk) -> None:
@@ -128,7 +128,7 @@ def test_a_roster_is_drafted_here_and_signed_where_the_ca_key_is(desk: Desk) -> 
 def test_the_doctor_sees_the_registry_and_none_where_none_was_joined(desk: Desk) -> None:
     def found(station: str) -> list[tuple[str, str]]:
         checks = json.loads(desk.run(station, "--json", "doctor").out)["checks"]
-        return [(one["result"], one["why"]) for one in checks if one["name"] == "registry"]
+        return [(check["result"], check["why"]) for check in checks if check["name"] == "registry"]
 
     assert found("south") == []
     joined(desk)
@@ -150,8 +150,8 @@ def test_the_doctor_says_whose_clock_is_wrong_until_that_station_dates_a_page_we
             n = 1 + max((number for number, *_ in store.page_times(chain.chain, 1)), default=0)
             store.add_page(chain.chain, PageRow(n, f"{n:064x}", "", created, "", b"", b"{}", bytes(64)))
         checks = json.loads(desk.run("south", "--json", "doctor").out)["checks"]
-        said = [one for one in checks if one["name"] == "registry" and "page" in one["why"]]
-        return [f"{one['why']} {one['fix']}" for one in said]
+        said = [check for check in checks if check["name"] == "registry" and "page" in check["why"]]
+        return [f"{item['why']} {item['fix']}" for item in said]
 
     assert found("9999-12-31T23:59:59Z") == [
         "west has dated its newest page 9999-12-31T23:59:59Z. Set the clock of west."
@@ -261,7 +261,7 @@ def test_a_node_that_only_others_met_is_found_by_its_first_digits_and_name(desk:
     assert asked
     for word in (UUID[:4], f"0x{UUID[:8].upper()}", "finger 1"):
         found = desk.ask("south", "registry", "log", word)["events"]
-        assert {one["uuid"] for one in found} == {UUID}, word  # type: ignore[attr-defined]
+        assert {item["uuid"] for item in found} == {UUID}, word  # type: ignore[attr-defined]
         assert desk.ask("south", "nodes", "--plant", word)["nodes"], word
     desk.ask("south", "registry", "log", "8d4e", code=3)
 
@@ -338,7 +338,7 @@ def test_a_person_accepts_one_of_two_histories_and_sees_it_first(desk: Desk, tmp
     desk.ask("copy", "registry", "sync", "--files", other)
     desk.sync("north")
     told = desk.ask("north", "registry", "sync", "--files", other, code=4)
-    assert [one["code"] for one in told["alarms"]] == ["two-histories"]  # type: ignore[attr-defined]
+    assert [alarm["code"] for alarm in told["alarms"]] == ["two-histories"]  # type: ignore[attr-defined]
     refused = desk.run("north", "registry", "accept", "west", "--yes")
     assert refused.code == 6
     assert "--page" in refused.err
@@ -349,8 +349,8 @@ def test_a_person_accepts_one_of_two_histories_and_sees_it_first(desk: Desk, tmp
     taken = desk.ask("north", "registry", "accept", "west", "--page", branch, "--yes")
     assert (taken["done"], taken["hash"]) == (1, plan["hash"])
     told = desk.ask("north", "registry", "log", "--station", "west")
-    said = [one for one in told["events"] if one["act"] == "pinned"]  # type: ignore[attr-defined]
-    assert sorted(one["counts"] for one in said) == [False, True], "of two first pages one counts"
+    said = [event for event in told["events"] if event["act"] == "pinned"]  # type: ignore[attr-defined]
+    assert sorted(item["counts"] for item in said) == [False, True], "of two first pages one counts"
     (node,) = desk.ask("north", "nodes", "--plant")["nodes"]  # type: ignore[misc]
     (pinned,) = node["says"]["pinned_by"].values()
     offered = desk.run("north", "registry", "accept", "west", "--page", "0" * 16, "--yes").err
@@ -389,7 +389,7 @@ def test_what_waits_in_pages_counts_as_unsent(desk: Desk) -> None:
         assert store.outbox(1) == []
     assert desk.ask("north", "registry", "status")["unsent"] == 1
     checks = json.loads(desk.run("north", "--json", "doctor").out)["checks"]
-    assert any(one["why"].startswith("1 events unsent") for one in checks if one["name"] == "registry")
+    assert any(check["why"].startswith("1 events unsent") for check in checks if check["name"] == "registry")
     pages.parent.unlink()
     (desk.folder / "away").rename(pages.parent)
     desk.ask("north", "registry", "sync")
@@ -418,7 +418,7 @@ def test_a_node_on_which_stations_do_not_agree_says_so_itself(desk: Desk) -> Non
     desk.ask("south", "whitelist", "add", UUID, "--fingerprint", "cd" * 32)
     desk.sync("north", "south")
     (node,) = desk.ask("south", "nodes", UUID)["nodes"]  # type: ignore[misc]
-    assert [one["name"] for one in node["conflicts"]] == ["other pin"]
+    assert [conflict["name"] for conflict in node["conflicts"]] == ["other pin"]
     assert "conflict     other pin: keepers pin" in desk.run("south", "nodes", UUID).out
     shown = desk.run("south", "nodes", "--plant", UUID).out
     assert "held by nobody\n" in shown

@@ -189,8 +189,8 @@ def test_forged_pages_and_a_wrong_author_are_passed_over_and_the_member_is_named
     later = loss.member("later", "base")
     loss.sync(loss.north, later)
     assert loss.pages_here(later, west) == loss.pages_here(loss.north, west)
-    alarms = [one for one in later.plant.tables.alarms() if one.code == FORGED]
-    assert [one.about for one in alarms] == [liar.fingerprint]
+    alarms = [alarm for alarm in later.plant.tables.alarms() if alarm.code == FORGED]
+    assert [alarm.about for alarm in alarms] == [liar.fingerprint]
     assert alarms[0].why == "liar handed in a page of west that west did not sign"
     loss.database.sql(f"delete from registry.found where by = '\\x{liar.fingerprint}'; delete from registry.handed")
     loss.database.sql(
@@ -198,7 +198,7 @@ def test_forged_pages_and_a_wrong_author_are_passed_over_and_the_member_is_named
         " from registry.found group by author, by"
     )
     loss.sync(later)
-    assert [one for one in later.plant.tables.alarms() if one.code == FORGED] == []
+    assert [alarm for alarm in later.plant.tables.alarms() if alarm.code == FORGED] == []
 
 
 def test_of_a_member_that_floods_with_forged_pages_only_the_first_few_are_read(loss: Loss) -> None:

@@ -65,7 +65,7 @@ def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(offi
     watch, told, changed = watching(south)
     watch.start()
     try:
-        until(lambda: any(one["state"] == "synced" for one in told), told)
+        until(lambda: any(entry["state"] == "synced" for entry in told), told)
         until(lambda: watch._listener is not None and watch._listener._connection is not None)
         time.sleep(0.2)
         board = board_of(north, os.urandom(10))
@@ -77,7 +77,7 @@ def test_what_another_station_pushes_arrives_without_waiting_for_the_minute(offi
         assert north.fingerprint in south.plant.tables.claims_of([board.uuid])[board.uuid]
         status = watch.status()
         assert status is not None
-        assert [one["name"] for one in status["stations"]] == ["north", "south"]
+        assert [station["name"] for station in status["stations"]] == ["north", "south"]
         assert (status["state"], status["unsent"]) == ("synced", 0)
         lines = text({"version": "1", "station": {"name": "south"}, "links": [], "measurements": [], "sinks": [],
                       "budget": {"used": 0}, "clients": 0}, status)  # fmt: skip
@@ -93,10 +93,10 @@ def test_a_registry_that_is_gone_is_told_once_and_stops_nothing(office: Office, 
     watch, told, _ = watching(south)
     watch.start()
     try:
-        until(lambda: any(one["state"] == "unreachable" for one in told), told)
+        until(lambda: any(entry["state"] == "unreachable" for entry in told), told)
         watch._wake.set()
         time.sleep(0.3)
-        assert [one["state"] for one in told] == ["unreachable"]
+        assert [entry["state"] for entry in told] == ["unreachable"]
     finally:
         watch.stop()
 
@@ -109,7 +109,7 @@ def test_an_alarm_is_told(office: Office) -> None:
     watch, told, _ = watching(south)
     watch.start()
     try:
-        until(lambda: any(one["state"] == "alarm" for one in told), told)
+        until(lambda: any(entry["state"] == "alarm" for entry in told), told)
     finally:
         watch.stop()
 
@@ -123,7 +123,7 @@ def test_a_removed_station_is_told_so_once_and_goes_on_by_itself(office: Office)
     watch, told, _ = watching(south)
     watch.start()
     try:
-        until(lambda: any(one["state"] == "removed" for one in told), told)
-        assert [one["state"] for one in told] == ["removed"]
+        until(lambda: any(entry["state"] == "removed" for entry in told), told)
+        assert [entry["state"] for entry in told] == ["removed"]
     finally:
         watch.stop()

@@ -42,10 +42,10 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     speakers = chatter(seed)
     gone = speakers[seed % len(speakers)]
     first = roster_of(speakers)
-    second = roster_of([one for one in speakers if one is not gone], [(gone, gone.head)], version=2)
+    second = roster_of([speaker for speaker in speakers if speaker is not gone], [(gone, gone.head)], version=2)
     held(station, first, monkeypatch)
     chance = random.Random(seed)
-    waiting = [open_page(octets, REGISTRY, first.point_of) for one in speakers for octets in one.pages]
+    waiting = [open_page(octets, REGISTRY, first.point_of) for speaker in speakers for octets in speaker.pages]
     half = len(waiting) // 2
     while waiting:  # a page comes when one before it is here, as a sync asks for them
         chance.shuffle(waiting)
@@ -64,7 +64,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
     apply_claims(station)
     roster = station.plant.roster
     assert roster is not None
-    oracle = Reader(roster, [octets for one in speakers for octets in one.pages])
+    oracle = Reader(roster, [octets for speaker in speakers for octets in speaker.pages])
     seen = merged_views(station, roster, NODES)
     from teds_provision.protocol.plant.fold import LocalState
 
@@ -77,12 +77,12 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
         assert {name for _, name, _ in station.plant.tables.conflicts(uuid)} == set(due.conflicts)
     rules = station.plant.signer_rules()
     assert rules is not None
-    for one in speakers:
+    for speaker in speakers:
         for digest in (DIGEST, DIGEST2):
-            found = rules.signing(CA.point, one.key.point, bytes.fromhex(digest))
-            assert found == oracle.signing(one.fingerprint, digest)
-    for one in speakers:  # said anew, nothing changes
-        recount(station, station.plant.tables.chain(one.fingerprint), roster)
+            found = rules.signing(CA.point, speaker.key.point, bytes.fromhex(digest))
+            assert found == oracle.signing(speaker.fingerprint, digest)
+    for speaker in speakers:  # said anew, nothing changes
+        recount(station, station.plant.tables.chain(speaker.fingerprint), roster)
     assert merged_views(station, roster, NODES) == seen
     assert plant.apply_pages.heads_digest(station)[1] == sum(
         counts.newest[0] > 0 for counts in oracle.counting.values()

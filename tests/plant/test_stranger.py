@@ -51,8 +51,8 @@ class Stranger:
     def roster(self, ca: bytes) -> dict[str, Any]:
         (row,) = self.office.database.sql("select jws from registry.roster order by version desc limit 1")
         found = self.opened(row[0], ca)
-        for one in found["members"]:
-            point = bytes.fromhex(one["point"])
+        for member in found["members"]:
+            point = bytes.fromhex(member["point"])
             self.keys[hashlib.sha256(point).hexdigest()] = point
         return found
 
@@ -82,16 +82,16 @@ def test_who_has_psql_and_jose_alone_comes_to_the_same_claims(office: Office, tm
 
     stranger = Stranger(office, tmp_path)
     roster = stranger.roster(office.north.identity.ca)
-    assert {one["name"] for one in roster["members"]} == {"north", "south"}
+    assert {member["name"] for member in roster["members"]} == {"north", "south"}
     pins: dict[tuple[str, str], str | None] = {}
     keys: dict[tuple[str, str], tuple[int, str]] = {}
     for station, events in stranger.events().items():
-        for one in events:
-            place = (one.get("uuid", ""), station)
-            if one["act"] in ("pinned", "unpinned"):
-                pins[place] = one.get("fingerprint")
-            elif one["act"] in ("agreed", "took"):
-                keys[place] = max(keys.get(place, (-1, "")), (one["epoch"], one["key_id"]))
+        for event in events:
+            place = (event.get("uuid", ""), station)
+            if event["act"] in ("pinned", "unpinned"):
+                pins[place] = event.get("fingerprint")
+            elif event["act"] in ("agreed", "took"):
+                keys[place] = max(keys.get(place, (-1, "")), (event["epoch"], event["key_id"]))
     claimed = south.plant.tables.claims_of([board.uuid for board in boards])
     for board in boards:
         for station, text in claimed[board.uuid].items():

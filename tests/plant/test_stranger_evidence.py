@@ -122,8 +122,8 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     if not isinstance(value, dict | list):
         yield path
-    for name, one in inner:
-        yield from leaves(one, (*path, name))
+    for name, option in inner:
+        yield from leaves(option, (*path, name))
 
 
 def change_at(statement: dict[str, Any], path: tuple[Any, ...]) -> None:
@@ -183,7 +183,7 @@ def changed_octets(document: bytes, key: PrivateKey, ca: bytes, places: range) -
 def known(payload: bytes) -> dict[str, Any]:
     """A statement without what the facts do not bind."""
     statement: dict[str, Any] = json.loads(payload)
-    statement["predicate"] = {name: one for name, one in statement["predicate"].items() if name in BOUND}
+    statement["predicate"] = {name: item for name, item in statement["predicate"].items() if name in BOUND}
     return statement
 
 

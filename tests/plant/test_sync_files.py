@@ -38,7 +38,7 @@ def pin(station: Station, uuid: bytes = UUID, key: str = KEY) -> None:
 
 
 def alarms(station: Station) -> list[str]:
-    return [one.code for one in station.plant.tables.alarms()]
+    return [alarm.code for alarm in station.plant.tables.alarms()]
 
 
 def test_what_one_station_says_reaches_all_and_all_see_the_same(plants: Plant) -> None:
@@ -309,7 +309,7 @@ def test_syncs_at_once_in_one_home_write_every_event_once(plants: Plant) -> None
     assert len(ends) == len(homes)
     assert set(ends) <= {"done", "locked"}
     plants.sync(plants.north)
-    said = [one.event["uuid"] for one in plant.status.log(plants.north)]
+    said = [stated.event["uuid"] for stated in plant.status.log(plants.north)]
     assert sorted(said) == [uuid.hex() for uuid in nodes]
     assert plants.north.plant.tables.unsent(plants.north.fingerprint) == 0
     assert alarms(plants.north) == []

@@ -48,9 +48,9 @@ class Office:
 
     def member(self, name: str, *roles: Any) -> Station:
         made = self.known(self.plant.member(name, *roles))
-        for one, other in ((made, self.north), (self.north, made)):
-            if other.fingerprint not in one.policy.station_points():
-                one.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+        for station, other in ((made, self.north), (self.north, made)):
+            if other.fingerprint not in station.policy.station_points():
+                station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
         return made
 
     def post(self, station: Station, **more: Any) -> PostgresTransport:
@@ -214,7 +214,7 @@ def test_what_the_database_allows_too_much_is_kept_for_the_status(office: Office
     assert plant_room.connecting.check_database(office.north, post) == ["login of west, which was removed"]
     shown = call(office.north.home, "--json", "registry", "status").json
     assert shown["open_doors"] == ["login of west, which was removed"]
-    removed = [one.fingerprint for one in office.north.plant.roster.removed]  # type: ignore[union-attr]
+    removed = [item.fingerprint for item in office.north.plant.roster.removed]  # type: ignore[union-attr]
     office.database.sql(registry_sql(office.database.registry, removed))
     assert plant_room.connecting.check_database(office.north, post) == []
     post.close()
@@ -239,7 +239,7 @@ def test_a_copy_of_a_home_at_work_beside_it_stops_both_until_a_person_decides(of
         office.sync(copy)
     office.sync(office.north)
     assert [alarm.code for alarm in office.north.plant.tables.alarms()] == []
-    events = [one.event for one in plant_room.status.log(office.north, of=south.fingerprint)]
-    said = {one["uuid"] for one in events if one["act"] == "pinned"}
+    events = [stated.event for stated in plant_room.status.log(office.north, of=south.fingerprint)]
+    said = {event["uuid"] for event in events if event["act"] == "pinned"}
     assert said == {bytes([n] * 10).hex() for n in (1, 2)}
     copy.close()

@@ -233,7 +233,11 @@ def test_pages_follow_each_other_and_the_same_again_is_done(hall: Hall) -> None:
         with pytest.raises(psycopg.Error) as gap:
             append(connection, 3, digest(first), second)
         assert append(connection, 2, digest(first), second) == 2
-    assert [each.value.sqlstate for each in (other, unfollowing, gap)] == ["TE002", "TE002", "TE003"]
+    assert [exception_info.value.sqlstate for exception_info in (other, unfollowing, gap)] == [
+        "TE002",
+        "TE002",
+        "TE003",
+    ]
 
 
 def test_a_page_is_appended_at_read_committed_only(hall: Hall) -> None:
@@ -297,8 +301,8 @@ def test_no_login_has_more_than_six_connections(hall: Hall) -> None:
         with pytest.raises(psycopg.OperationalError, match="too many connections"):
             login.connect()
     finally:
-        for each in held:
-            each.close()
+        for connection in held:
+            connection.close()
 
 
 @pytest.mark.parametrize(

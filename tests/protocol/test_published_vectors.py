@@ -246,7 +246,7 @@ def test_the_node_gives_the_published_reason_at_the_commit() -> None:
 
 def trust_store(document: Entry, names: list[str]) -> dict[str, bytes]:
     points = [bytes.fromhex(document["keys"][name]["P"]) for name in names]
-    return {fingerprint(each): each for each in points}
+    return {fingerprint(point): point for point in points}
 
 
 @vn.cases("handover")
@@ -263,7 +263,7 @@ def test_bundles_open_or_are_refused_as_published(document: Entry, entry: Entry)
         return
     told = entry["payload"]
     assert (opened.bundle.id, opened.bundle.mode) == (told["id"], told["mode"])
-    assert [each.uuid.hex() for each in opened.bundle.nodes] == [each["uuid"] for each in told["nodes"]]
+    assert [bundled_node.uuid.hex() for bundled_node in opened.bundle.nodes] == [node["uuid"] for node in told["nodes"]]
     assert opened.bundle.nodes[0].key.hex() == "346dc7ba01b285e9fedeb955a14398b8"
     assert opened.station_signature is not None
     receipt = open_receipt(entry["receipt_jws"].encode(), trust_store(document, [entry["recipient"]]).get)
@@ -317,5 +317,5 @@ def test_data_frames_open_by_plain_primitives(document: Entry, entry: Entry) -> 
         if len(frame["data"]) < 16:  # in these entries the last frame of every message is a short one
             runs = range(1, 4)
             opened = [vn.open_message(k_m, run, message) for k_m in keys[link] for run in runs]
-            (plain,) = [each for each in opened if each is not None]
+            (plain,) = [item for item in opened if item is not None]
             assert plain[0] == 0

@@ -46,7 +46,7 @@ class Crowd:
 
     def __init__(self, spec: str) -> None:
         group, _, query = spec.partition(":")[2].partition("?")
-        port = int(dict(one.split("=") for one in query.split("&"))["port"])
+        port = int(dict(name.split("=") for name in query.split("&"))["port"])
         self.made = self.answers = 0
         self._wire = Wire(group, port, 1, True, lambda *_: None, self._other)
 
@@ -188,7 +188,7 @@ class Soak:
         fill(self.shown)
         soon(lambda: self.sink()["state"] == "waiting", "the full disk is told")
         assert self.fresh(), "measuring goes on beside a full disk"
-        kept = {Path(one).name for one in self.sink()["files"][-2:]}
+        kept = {Path(file).name for file in self.sink()["files"][-2:]}
         for part in self.shown.rglob("*"):
             if part.is_file() and part.name not in kept:  # the operator makes room
                 part.unlink()

@@ -66,11 +66,11 @@ def test_a_board_with_a_good_datasheet_is_in_service_after_a_tap_and_one_yes(sta
     assert done.verified.verdict == "authentic"
     assert done.image.unsigned_blocks() == factory(), "not an octet of it changed"
     assert (shown.name, shown.errors, shown.warnings) == ("joint", (), ())
-    assert [(one.number, one.name) for one in shown.channels] == [(1, "angle")]
+    assert [(channel.number, channel.name) for channel in shown.channels] == [(1, "angle")]
     assert station.nodes.resolve("joint") == UUID
     again, asked = adopted(station, node)
     assert not asked
-    assert {one.result for one in again.steps if one.name in ("build", "sign", "write")} == {NOTHING}
+    assert {step.result for step in again.steps if step.name in ("build", "sign", "write")} == {NOTHING}
 
 
 def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> None:

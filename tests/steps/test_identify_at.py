@@ -74,8 +74,8 @@ def test_the_nodes_of_a_bus_are_asked_side_by_side(station: Station, tmp_path: P
     """One after the other, each that is mute held up all the others for 40 s."""
     with bus(tmp_path, 4, threading.Barrier(4)) as (spec, uuids):
         came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), Told()))
-    assert [one.uuid.hex() for one in came] == uuids
-    assert all(one.result is not None for one in came)
+    assert [arrival.uuid.hex() for arrival in came] == uuids
+    assert all(arrival.result is not None for arrival in came)
 
 
 def test_a_node_that_starts_meanwhile_is_found_while_somebody_listens(station: Station, tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_node_that_starts_meanwhile_is_found_while_somebody_listens(station: S
         finally:
             starts.join()
             late.stop()
-    assert {one.uuid.hex() for one in came} == {early, bytes(range(10)).hex()}
+    assert {arrival.uuid.hex() for arrival in came} == {early, bytes(range(10)).hex()}
     assert time.monotonic() - began >= 6
 
 
@@ -100,6 +100,6 @@ def test_a_node_without_a_proof_is_told_of_beside_the_others(station: Station, t
     told = Told()
     with bus(tmp_path, 1, threading.Barrier(1), without=1) as (spec, (good, bad)):
         came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), told))
-    assert [one.uuid.hex() for one in came] == [good]
-    (notice,) = [one for one in told.notices if one.kind == "unfinished"]
+    assert [arrival.uuid.hex() for arrival in came] == [good]
+    (notice,) = [notice for notice in told.notices if notice.kind == "unfinished"]
     assert bad in notice.text

@@ -207,7 +207,7 @@ def test_an_epoch_older_than_one_that_was_seen_is_caught_without_a_session_too(s
     for image, expected in ((old, "failed"), (new, "passed")):
         checks = {check.name: check for check in verify_image(station, image, known=replace(known, sequence=1))}
         assert (checks["key epoch"].result, checks["sequence"].result) == (expected, "passed")
-    (check,) = [one for one in verify_image(station, old, known=known) if one.name == "key epoch"]
+    (check,) = [check for check in verify_image(station, old, known=known) if check.name == "key epoch"]
     assert check.why == "signed for epoch 1, older than the 2 that this station saw"
 
 

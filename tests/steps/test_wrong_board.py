@@ -136,11 +136,11 @@ def test_every_pair_of_types_that_differ_is_told_apart_and_each_fits_itself(stat
     names = [ANGLE, GRIPPER, FORCE, "temperature-sensor"]
     made = {name: load_profile(name) for name in names}
     built = {name: dict(made[name].build(bytes(10)).blocks) for name in names}
-    for one in names:
+    for text in names:
         for other in names:
-            found = differences(built[one], made[other])
-            assert bool(found) == (one != other), (one, other, found)
-            assert bool(differences(built[one], Image(bytes(10), built[other]))) == (one != other)
+            found = differences(built[text], made[other])
+            assert bool(found) == (text != other), (text, other, found)
+            assert bool(differences(built[text], Image(bytes(10), built[other]))) == (text != other)
 
 
 def test_a_raw_unit_says_nothing_where_a_calibration_is_wanted(tmp_path: Path) -> None:

@@ -230,16 +230,16 @@ def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watch
     store.is_known(board.uuid)
     store.resolve(board.uuid.hex()[:8])
     store.named("finger-1")
-    asked = {one for one in watched.statements if one.startswith(("SELECT", "UPDATE", "DELETE"))}
+    asked = {statement for statement in watched.statements if statement.startswith(("SELECT", "UPDATE", "DELETE"))}
     assert len(asked) > 20
-    plans = {one: [row[3] for row in store._database.execute(f"EXPLAIN QUERY PLAN {one}")] for one in asked}
+    plans = {name: [row[3] for row in store._database.execute(f"EXPLAIN QUERY PLAN {name}")] for name in asked}
     one_row = {"SCAN trust", "SCAN station", "SCAN plant", "SCAN CONSTANT ROW"}  # or as many as there are stations
     whole = {
         asked_for
         for asked_for, plan in plans.items()
         if any(step.startswith("SCAN") and step not in one_row for step in plan)
     }
-    assert {one for one in whole if not one.endswith("FROM audit ORDER BY seq DESC LIMIT 1")} == set()
+    assert {name for name in whole if not name.endswith("FROM audit ORDER BY seq DESC LIMIT 1")} == set()
 
 
 def test_what_a_run_asks_of_the_store_comes_after_the_steps_that_it_takes_behind_its_back(watched: Watched) -> None:

@@ -36,9 +36,9 @@ def test_with_a_group_go_its_measurements(store: Store) -> None:
     store.put_measurement(wanted)
     store.put_measurement(KeptMeasurement("m2", uuids=(ONE, TWO), kind="event", trigger=True))
     assert store.measurement("m1") == wanted
-    assert [one.id for one in store.measurements()] == ["m1", "m2"]
+    assert [measurement.id for measurement in store.measurements()] == ["m1", "m2"]
     assert store.remove_group("hand")
-    assert [one.id for one in store.measurements()] == ["m2"]
+    assert [measurement.id for measurement in store.measurements()] == ["m2"]
     assert not store.remove_group("hand")
 
 

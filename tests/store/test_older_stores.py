@@ -74,11 +74,13 @@ def test_a_measurement_of_an_earlier_schema_gets_an_owner(tmp_path: Path) -> Non
         connection.execute("PRAGMA user_version=12")
         connection.commit()
     with closing(Store.open(home)) as store:
-        kept = {one.id: one for one in store.measurements()}
+        kept = {measurement.id: measurement for measurement in store.measurements()}
         measurements = Measurements(store, Groups(store, home, None), home)  # type: ignore[arg-type]
         continued = measurements.settings_to_continue("arm")
-        assert [one.id for one in measurements.all()] == ["kept"], "the next reader removes that of a dead command"
-    assert {name: one.owner for name, one in kept.items()} == {"kept": "ncap", "cut": "command"}
+        assert [measurement.id for measurement in measurements.all()] == ["kept"], (
+            "the next reader removes that of a dead command"
+        )
+    assert {name: measurement.owner for name, measurement in kept.items()} == {"kept": "ncap", "cut": "command"}
     assert (kept["kept"].channels, kept["kept"].sinks, kept["kept"].lasting) == ((2,), ("ros2",), True)
     assert continued is not None
     assert (continued.owner, continued.id, continued.channels) == ("command", "", (2,))

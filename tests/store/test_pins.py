@@ -27,5 +27,5 @@ def test_a_flood_of_wrong_keys_does_not_fill_the_audit_log(tmp_path: Path, monke
             now[0] = at
             with pytest.raises(KeyMismatchError):
                 station.pins.check(UUID, SoftwareKey.generate().point)
-        entries = [one.detail for one in station.audit_log.entries() if one.outcome == "other key"]
-    assert [one.get("unrecorded", 0) for one in entries] == [0, 2]
+        entries = [entry.detail for entry in station.audit_log.entries() if entry.outcome == "other key"]
+    assert [entry.get("unrecorded", 0) for entry in entries] == [0, 2]

@@ -88,30 +88,30 @@ class Liar(Node):
             return b"\0\0\0\1" + out[4:]
         return out[:5] if self.lies("reads one octet") else out
 
-    def clock(self, one: Session, payload: bytes) -> bytes:
-        out = super().clock(one, payload)
+    def clock(self, session: Session, payload: bytes) -> bytes:
+        out = super().clock(session, payload)
         if self.lies("clock at the end of time"):
             return struct.pack(">QQQIHI", 2**64 - 2, 2**64 - 1, 2**64 - 1, 2**32 - 1, 65535, 2**32 - 2)
         return out[:24] + b"\xff" * 6 + out[30:] if self.lies("clock without precision") else out
 
-    def subscribe(self, one: Session, payload: bytes) -> bytes:
-        out = super().subscribe(one, payload)
-        stream = one.streams[payload[0]]
+    def subscribe(self, session: Session, payload: bytes) -> bytes:
+        out = super().subscribe(session, payload)
+        stream = session.streams[payload[0]]
         run = {"run 0": 0, "run again": 1, "run far ahead": 65535}.get(self.fault, stream.run)
-        stream.key = one.keys.run(run)
+        stream.key = session.keys.run(run)
         out = run.to_bytes(2, "big") + out[2:]
         if self.lies("no length"):
             return out[:2] + bytes(2) + out[4:]
         return out[:4] + b"\xff" * 8 if self.lies("starts at the end of time") else out
 
-    def stop(self, one: Session, payload: bytes) -> bytes:
-        out = super().stop(one, payload)
+    def stop(self, session: Session, payload: bytes) -> bytes:
+        out = super().stop(session, payload)
         if self.lies("stops before it began"):
             return bytes(4)
         return b"\xff" * 4 if self.lies("stops at the end of time") else out
 
-    def operation(self, one: Session, payload: bytes) -> bytes:
-        out = super().operation(one, payload)
+    def operation(self, session: Session, payload: bytes) -> bytes:
+        out = super().operation(session, payload)
         if self.lies("mode of half a channel"):
             return out[:-1]
         if self.lies("mode of channels that are not there"):
@@ -120,15 +120,15 @@ class Liar(Node):
             return out[:1] + b"".join(bytes([out[n], out[n + 1] & ~16, out[n + 2]]) for n in range(1, len(out), 3))
         return out
 
-    def power(self, one: Session, payload: bytes) -> bytes:
-        return b"\xff" if self.lies("power of one octet") else super().power(one, payload)
+    def power(self, session: Session, payload: bytes) -> bytes:
+        return b"\xff" if self.lies("power of one octet") else super().power(session, payload)
 
-    def sample(self, one: Session, payload: bytes) -> bytes:
-        out = super().sample(one, payload)
+    def sample(self, session: Session, payload: bytes) -> bytes:
+        out = super().sample(session, payload)
         return out + b"\0" if self.lies("sample too long") else out[:-1] if self.lies("sample too short") else out
 
-    def value_of(self, one: Session, channel: int, payload: bytes) -> bytes:
-        out = super().value_of(one, channel, payload)
+    def value_of(self, session: Session, channel: int, payload: bytes) -> bytes:
+        out = super().value_of(session, channel, payload)
         return out + b"\0" if self.lies("sample too long") else out[:-1] if self.lies("sample too short") else out
 
     def answer(self, peer: int, frame: bytes, session: Session | None = None) -> bytes:
@@ -146,21 +146,21 @@ class Liar(Node):
         if self.lies("replies twice"):
             super().take(peer, body, fd)
 
-    def due(self, one: Session, number: int, stream: Stream, now: int) -> None:
+    def due(self, session: Session, number: int, stream: Stream, now: int) -> None:
         before = stream.counter
-        super().due(one, number, stream, now)
+        super().due(session, number, stream, now)
         if stream.counter == before:
             return
         if self.lies("counter far ahead") and stream.counter == 20:
             stream.counter = 2**32 - 4
             stream.start = now - stream.counter * stream.n * stream.period
         if stream.counter >= 2**32 - 1:
-            del one.streams[number]
+            del session.streams[number]
 
-    def send_data(self, one: Session, number: int, octets: bytes, stream: Stream) -> None:
-        super().send_data(one, number, octets, stream)
+    def send_data(self, session: Session, number: int, octets: bytes, stream: Stream) -> None:
+        super().send_data(session, number, octets, stream)
         if self.lies("every message twice"):
-            super().send_data(one, number, octets, stream)
+            super().send_data(session, number, octets, stream)
 
     def loop(self) -> None:
         self.announce()

@@ -97,7 +97,7 @@ class Node:
         self.sessions: dict[int, Session] = {}
         self.half: dict[int, Session] = {}
         self.stored: dict[int, tuple[bytes, bytes]] = {}
-        self.points = {n: bytes(one["octets"]) for n, one in self.channels.items() if one["kind"] == ACTUATOR}
+        self.points = {n: bytes(item["octets"]) for n, item in self.channels.items() if item["kind"] == ACTUATOR}
         self.safe = dict.fromkeys(self.points, True)
         self.stopped = dict.fromkeys(self.points, False)
         self.fresh: Session | None = None
@@ -202,32 +202,32 @@ class Node:
         return en + keys.tag(self.key, es, en)
 
     def sealed(self, peer: int, payload: bytes) -> bytes:
-        tried = [one for one in (self.sessions.get(peer), self.half.get(peer)) if one is not None]
+        tried = [item for item in (self.sessions.get(peer), self.half.get(peer)) if item is not None]
         need(tried, 2)
         need(len(payload) >= 36, 4)
-        for one in tried:
+        for session in tried:
             try:
-                counter, inner = unseal(one.keys.down, payload)
+                counter, inner = unseal(session.keys.down, payload)
             except (InvalidTag, ValueError):
                 continue
-            need(counter > one.last, 13)
-            if one is self.half.get(peer):
+            need(counter > session.last, 13)
+            if session is self.half.get(peer):
                 if peer in self.sessions:
                     self.end(self.sessions[peer])
                 self.sessions[peer] = self.half.pop(peer)
-            one.last, one.heard = counter, self.tick()
-            return seal(one.keys.up, counter, self.answer(peer, inner, one))
+            session.last, session.heard = counter, self.tick()
+            return seal(session.keys.up, counter, self.answer(peer, inner, session))
         raise No(12)
 
     # -- inner commands ------------------------------------------------------------------------------------------------
 
-    def inner(self, one: Session, channel: int, class_: int, function: int, payload: bytes) -> bytes:
+    def inner(self, session: Session, channel: int, class_: int, function: int, payload: bytes) -> bytes:
         does = {
             (4, 1): self.operate, (4, 2): self.idle, (3, 1): self.value_of, (3, 2): self.set_one,
             (1, 5): self.self_test,
         }.get((class_, function))  # fmt: skip
         if does is not None:
-            return does(one, channel, payload)
+            return does(session, channel, payload)
         need(class_ == 128, 1)
         named = {
             5: self.close, 12: self.sample, 13: self.set_many, 14: self.subscribe, 15: self.stop, 16: self.clock,
@@ -235,24 +235,24 @@ class Node:
         }.get(function)  # fmt: skip
         need(named is not None, 1)
         assert named is not None
-        return named(one, payload)
+        return named(session, payload)
 
-    def close(self, one: Session, _payload: bytes) -> bytes:
-        self.end(one)
+    def close(self, session: Session, _payload: bytes) -> bytes:
+        self.end(session)
         return b""
 
-    def end(self, one: Session) -> None:
+    def end(self, session: Session) -> None:
         """The session is over: its claims and streams with it."""
-        self.let_go(one, list(one.claims))
-        self.sessions = {peer: other for peer, other in self.sessions.items() if other is not one}
+        self.let_go(session, list(session.claims))
+        self.sessions = {peer: other for peer, other in self.sessions.items() if other is not session}
 
-    def let_go(self, one: Session, channels: list[int]) -> None:
+    def let_go(self, session: Session, channels: list[int]) -> None:
         for channel in channels:
-            if one.claims.pop(channel, None) is not None and channel in self.points:
+            if session.claims.pop(channel, None) is not None and channel in self.points:
                 self.make_safe(channel)
-        one.streams = {n: s for n, s in one.streams.items() if set(s.channels) <= one.claims.keys()}
-        if one.drive is not None and not set(one.drive[0]) <= one.claims.keys():
-            one.drive = None
+        session.streams = {n: s for n, s in session.streams.items() if set(s.channels) <= session.claims.keys()}
+        if session.drive is not None and not set(session.drive[0]) <= session.claims.keys():
+            session.drive = None
 
     def make_safe(self, channel: int) -> None:
         self.safe[channel], self.points[channel] = True, bytes(len(self.points[channel]))
@@ -263,7 +263,7 @@ class Node:
             json.dumps({"channel": channel, "raw": self.points[channel].hex(), "safe": self.safe[channel]}), flush=True
         )
 
-    def operate(self, one: Session, channel: int, payload: bytes) -> bytes:
+    def operate(self, session: Session, channel: int, payload: bytes) -> bytes:
         sensors = [n for n, facts in self.channels.items() if facts["kind"] != ACTUATOR]
         need(channel in self.channels or (channel == 0 and sensors), 1)
         actuator = channel in self.points
@@ -273,18 +273,18 @@ class Node:
         need(1 <= lease <= 60 and (not actuator or 20 <= dead_man <= 10_000), 19)
         if actuator:
             for other in self.sessions.values():
-                need(channel not in other.claims, 2 if other is one else 17)
-            one.dead_men[channel] = dead_man * 10**6
+                need(channel not in other.claims, 2 if other is session else 17)
+            session.dead_men[channel] = dead_man * 10**6
             self.stopped[channel] = False
             self.make_safe(channel)
         for n in [channel] if channel else sensors:
-            one.claims[n] = self.tick() if actuator else 0
-        one.lease = lease
+            session.claims[n] = self.tick() if actuator else 0
+        session.lease = lease
         return b""
 
-    def idle(self, one: Session, channel: int, payload: bytes) -> bytes:
+    def idle(self, session: Session, channel: int, payload: bytes) -> bytes:
         need(not payload, 4)
-        self.let_go(one, [channel] if channel else list(one.claims))
+        self.let_go(session, [channel] if channel else list(session.claims))
         return b""
 
     def raw(self, channel: int, tick: int) -> bytes:
@@ -292,38 +292,38 @@ class Node:
         octets = self.channels[channel]["octets"]
         return (tick // 10**6 % 2 ** (8 * octets)).to_bytes(octets, "big")
 
-    def value_of(self, one: Session, channel: int, payload: bytes) -> bytes:
+    def value_of(self, session: Session, channel: int, payload: bytes) -> bytes:
         need(len(payload) == 4, 4)
-        need(channel in one.claims, 2)
+        need(channel in session.claims, 2)
         need(payload == bytes(4), 19)
         return payload + (self.points[channel] if channel in self.points else self.raw(channel, self.tick()))
 
-    def sample(self, one: Session, payload: bytes) -> bytes:
+    def sample(self, session: Session, payload: bytes) -> bytes:
         need(0 < len(payload) <= 64 and len(set(payload)) == len(payload) and 0 not in payload, 4)
-        need(set(payload) <= one.claims.keys(), 2)
+        need(set(payload) <= session.claims.keys(), 2)
         need(not set(payload) & self.points.keys(), 3)
         tick = self.tick()
         return tick.to_bytes(8, "big") + b"\0" + b"".join(self.raw(n, tick) for n in payload)
 
-    def set_one(self, one: Session, channel: int, payload: bytes) -> bytes:
+    def set_one(self, session: Session, channel: int, payload: bytes) -> bytes:
         need(channel not in self.points or len(payload) == 4 + len(self.points[channel]), 4)
-        need(channel in one.claims, 2)
+        need(channel in session.claims, 2)
         need(channel in self.points, 3)
         need(payload[:4] == bytes(4) and self.bears(channel, payload[4:]), 19)
-        self.apply(one, {channel: payload[4:]})
+        self.apply(session, {channel: payload[4:]})
         return b""
 
     def bears(self, channel: int, octets: bytes) -> bool:
         low, high = self.channels[channel]["bears"]
         return bool(low <= int.from_bytes(octets, "big") <= high)
 
-    def apply(self, one: Session, values: dict[int, bytes]) -> None:
+    def apply(self, session: Session, values: dict[int, bytes]) -> None:
         for channel, octets in values.items():
             self.points[channel], self.safe[channel] = octets, False
-            one.claims[channel] = self.tick()
+            session.claims[channel] = self.tick()
             self.tell(channel)
 
-    def set_many(self, one: Session, payload: bytes) -> bytes:
+    def set_many(self, session: Session, payload: bytes) -> bytes:
         values: dict[int, bytes] = {}
         while payload:
             need(payload[0] in self.channels, 2)
@@ -332,9 +332,9 @@ class Node:
             need(payload[0] not in values and len(payload) > size, 4)
             values[payload[0]], payload = payload[1 : 1 + size], payload[1 + size :]
         need(values, 4)
-        need(values.keys() <= one.claims.keys(), 2)
+        need(values.keys() <= session.claims.keys(), 2)
         need(all(self.bears(n, octets) for n, octets in values.items()), 19)
-        self.apply(one, values)
+        self.apply(session, values)
         return b""
 
     def self_test(self, _one: Session, _channel: int, payload: bytes) -> bytes:
@@ -346,30 +346,30 @@ class Node:
         need(not payload, 4)
         return struct.pack(">BBHhb", 0, 0xFF, 0xFFFF, 0x7FFF, 0x7F)
 
-    def operation(self, one: Session, payload: bytes) -> bytes:
+    def operation(self, session: Session, payload: bytes) -> bytes:
         need(not payload, 4)
         out = b""
         for n, facts in sorted(self.channels.items()):
-            others = [other for other in self.sessions.values() if other is not one and n in other.claims]
-            state = 1 * (n in self.points) | 2 * (n in one.claims) | 4 * bool(others) | 8 * (facts["kind"] == EVENT)
+            others = [other for other in self.sessions.values() if other is not session and n in other.claims]
+            state = 1 * (n in self.points) | 2 * (n in session.claims) | 4 * bool(others) | 8 * (facts["kind"] == EVENT)
             state |= 16 * self.safe.get(n, False) | 32 * self.stopped.get(n, False)
-            by = max([other.station for other in others] + [one.station] * (n in one.claims), default=0)
+            by = max([other.station for other in others] + [session.station] * (n in session.claims), default=0)
             out += bytes([n, state, by])
         return bytes([any(other.claims for other in self.sessions.values())]) + out
 
-    def clock(self, one: Session, payload: bytes) -> bytes:
+    def clock(self, session: Session, payload: bytes) -> bytes:
         need(not payload, 4)
         now = self.tick()
         lie = 10**9 if self.fault == "clock jumps" and now > 4 * 10**9 else 0
         sent = now - 10**8 if self.fault == "clock runs back" else now + lie
-        return struct.pack(">QQQIHI", now + lie, sent, one.mark, STEP, DRIFT, one.driven % 2**32)
+        return struct.pack(">QQQIHI", now + lie, sent, session.mark, STEP, DRIFT, session.driven % 2**32)
 
-    def arm(self, one: Session, payload: bytes) -> bytes:
+    def arm(self, session: Session, payload: bytes) -> bytes:
         need(len(payload) == 18, 4)
         need(payload[16] <= 60 and payload[17] <= 2, 19)
-        one.armed.pop(payload[17], None)
+        session.armed.pop(payload[17], None)
         if payload[16]:
-            one.armed[payload[17]] = (payload[:16], self.tick() + payload[16] * 10**9)
+            session.armed[payload[17]] = (payload[:16], self.tick() + payload[16] * 10**9)
         return b""
 
     def triggered(self, station: int, token: bytes, at: float) -> None:
@@ -393,13 +393,13 @@ class Node:
 
     # -- streams -------------------------------------------------------------------------------------------------------
 
-    def subscribe(self, one: Session, payload: bytes) -> bytes:
+    def subscribe(self, session: Session, payload: bytes) -> bytes:
         need(len(payload) > 21, 4)
         number, kind, n, gap, period, start = struct.unpack(">BBBHQQ", payload[:21])
         channels, pattern, kind = list(payload[21:]), bool(kind & 128), kind & 127
         need(number <= 3 and kind <= 2 and n and len(channels) <= 16 and len(set(channels)) == len(channels), 4)
         need(0 not in channels and (kind != 1 or (n == 1 and len(channels) == 1)), 4)
-        need(set(channels) <= one.claims.keys(), 2)
+        need(set(channels) <= session.claims.keys(), 2)
         need(not set(channels) & self.points.keys(), 3)
         need(all((self.channels[c]["kind"] == EVENT) == (kind == 1) or kind == 2 for c in channels), 19)
         need(max(self.channels[c]["shortest"] for c in channels) <= period <= 10**12, 19)
@@ -409,35 +409,35 @@ class Node:
         need(count * max(gap, 1) * 10**9 <= 10**6 * n * period, 21)
         now = self.tick()
         need(start in (0, 2**64 - 1) or now < start <= now + 60 * 10**9, 20)
-        one.runs += 1
+        session.runs += 1
         began = start or now + 5 * 10**6
-        one.streams[number] = Stream(
-            kind, n, gap, period, None if start == 2**64 - 1 else began, channels, one.runs, one.keys.run(one.runs),
-            length, pattern,
+        session.streams[number] = Stream(
+            kind, n, gap, period, None if start == 2**64 - 1 else began, channels, session.runs,
+            session.keys.run(session.runs), length, pattern,
         )  # fmt: skip
-        self.fresh = one
+        self.fresh = session
         extra = {"another length": (1, 0), "another start": (0, 5 * 10**9)}.get(self.fault, (0, 0))
-        return struct.pack(">HHQ", one.runs, length + extra[0], (began + extra[1]) % 2**64)
+        return struct.pack(">HHQ", session.runs, length + extra[0], (began + extra[1]) % 2**64)
 
-    def stop(self, one: Session, payload: bytes) -> bytes:
+    def stop(self, session: Session, payload: bytes) -> bytes:
         need(len(payload) == 1, 4)
-        need(payload[0] in one.streams, 2)
-        return one.streams.pop(payload[0]).counter.to_bytes(4, "big")
+        need(payload[0] in session.streams, 2)
+        return session.streams.pop(payload[0]).counter.to_bytes(4, "big")
 
     def pump(self) -> None:
         """Send what is due, and end what has run out."""
         now = self.tick()
-        for one in list(self.sessions.values()):
-            late = [n for n, since in one.claims.items() if n in self.points and now - since >= one.dead_men[n]]
+        for session in list(self.sessions.values()):
+            late = [n for n, since in session.claims.items() if n in self.points and now - since >= session.dead_men[n]]
             self.stopped |= dict.fromkeys(late, True)
-            self.let_go(one, late)
-            if now - one.heard > one.lease * 10**9:
-                self.let_go(one, list(one.claims))
-            for number, stream in list(one.streams.items()):
+            self.let_go(session, late)
+            if now - session.heard > session.lease * 10**9:
+                self.let_go(session, list(session.claims))
+            for number, stream in list(session.streams.items()):
                 if stream.start is not None:
-                    self.due(one, number, stream, now)
+                    self.due(session, number, stream, now)
 
-    def due(self, one: Session, number: int, stream: Stream, now: int) -> None:
+    def due(self, session: Session, number: int, stream: Stream, now: int) -> None:
         assert stream.start is not None
         first = stream.start + stream.counter * stream.n * stream.period
         last = first + (stream.n - 1) * stream.period
@@ -455,33 +455,33 @@ class Node:
         octets = message(stream.key, stream.counter, body)
         if self.fault == "wrong tag" and stream.counter % 2:
             octets = octets[:-1] + bytes([octets[-1] ^ 1])
-        self.send_data(one, number, octets, stream)
+        self.send_data(session, number, octets, stream)
         stream.counter += 1
 
-    def send_data(self, one: Session, number: int, octets: bytes, stream: Stream) -> None:
+    def send_data(self, session: Session, number: int, octets: bytes, stream: Stream) -> None:
         for segment, data in pieces(octets, self.fd):
             if self.fault == "a segment is missing" and stream.counter % 3 == 1 and segment == 1:
                 continue
-            identifier = 0x1CFF0000 | ((one.station & 7) * 32 + number * 8 + segment) << 8 | self.address
+            identifier = 0x1CFF0000 | ((session.station & 7) * 32 + number * 8 + segment) << 8 | self.address
             self.wire.put(identifier, data, self.fd)
             time.sleep(stream.gap / 10**6)
         if self.fault == "replay" and stream.counter == 5:
             self.kept = octets
         if self.fault == "replay" and stream.counter > 5 and stream.counter % 4 == 0:
             for segment, data in pieces(self.kept, self.fd):
-                identifier = 0x1CFF0000 | ((one.station & 7) * 32 + number * 8 + segment) << 8 | self.address
+                identifier = 0x1CFF0000 | ((session.station & 7) * 32 + number * 8 + segment) << 8 | self.address
                 self.wire.put(identifier, data, self.fd)
 
     # -- Drive ---------------------------------------------------------------------------------------------------------
 
-    def begin_drive(self, one: Session, payload: bytes) -> bytes:
+    def begin_drive(self, session: Session, payload: bytes) -> bytes:
         need(0 < len(payload) <= 16 and len(set(payload)) == len(payload) and 0 not in payload, 4)
-        need(set(payload) <= one.claims.keys(), 2)
+        need(set(payload) <= session.claims.keys(), 2)
         need(set(payload) <= self.points.keys(), 3)
-        one.runs += 1
+        session.runs += 1
         length = 16 + sum(len(self.points[n]) for n in payload)
-        one.drive, one.driven = (list(payload), one.keys.run(one.runs, drive=True), length), -1
-        return struct.pack(">HH", one.runs, length)
+        session.drive, session.driven = (list(payload), session.keys.run(session.runs, drive=True), length), -1
+        return struct.pack(">HH", session.runs, length)
 
     def drive_frame(self, station: int, data: bytes) -> None:
         one = self.sessions.get(station)

@@ -27,12 +27,12 @@ def identified(hall: Hall) -> list[str]:
     can = hall.desk.links.can
     outcome = hall.station.start("--json", "identify", "--via", "can", "--can", can).end(120)
     assert outcome.code == 0, outcome
-    return [one["uuid"] for one in outcome.json.get("nodes", [outcome.json])]
+    return [node["uuid"] for node in outcome.json.get("nodes", [outcome.json])]
 
 
 def test_a_node_that_answers_nothing_but_identify_hides_nobody(hall: Hall) -> None:
     with Attacker(*of_spec(hall.desk.links.can), silent_strangers(range(1, 2))):
-        assert set(identified(hall)) == {one.uuid for one in hall.nodes.values()}
+        assert set(identified(hall)) == {placed.uuid for placed in hall.nodes.values()}
 
 
 def test_a_copied_uuid_hides_no_other_node(hall: Hall) -> None:

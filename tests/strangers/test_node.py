@@ -52,14 +52,14 @@ class Stranger:
         file.release()
         sheet = Sheet.from_image(Image(flash.uuid, dict(flash.blocks)))
         channels = {
-            one.number: {
-                "kind": KINDS[ChannelKind(one.kind)],
-                "octets": one.sample.octets,
-                "shortest": int(one.period * 1e9 * (1 - 1e-6)) if one.period > 0 else 1,
+            channel.number: {
+                "kind": KINDS[ChannelKind(channel.kind)],
+                "octets": channel.sample.octets,
+                "shortest": int(channel.period * 1e9 * (1 - 1e-6)) if channel.period > 0 else 1,
                 "bears": [0, 4095],
             }
-            for one in sheet.channels
-            if one.kind is not None and one.sample is not None
+            for channel in sheet.channels
+            if channel.kind is not None and channel.sample is not None
         }
         group, port = of_spec(self.hall.desk.links.can)
         given = {

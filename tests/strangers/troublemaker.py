@@ -31,7 +31,7 @@ class Troublemaker(Node):
 
     def __init__(self, given: dict[str, Any]) -> None:
         super().__init__(given)
-        self.others = [bytes.fromhex(one) for one in given.get("others", ())]
+        self.others = [bytes.fromhex(other) for other in given.get("others", ())]
         self.sent = 0
         self.stopped_streams: list[tuple[Session, int, Stream, int]] = []
         self.trouble = TROUBLES.get(self.fault)
@@ -46,40 +46,40 @@ class Troublemaker(Node):
                 out += self.raw(channel, first + i * (stream.period if spread is None else spread))
         return out
 
-    def send_data(self, one: Session, number: int, octets: bytes, stream: Stream) -> None:
+    def send_data(self, session: Session, number: int, octets: bytes, stream: Stream) -> None:
         self.sent += 1
         if self.trouble is None:
-            self.put(one, number, octets, stream)
+            self.put(session, number, octets, stream)
         else:
-            self.trouble(self, (one, number, stream, octets))
+            self.trouble(self, (session, number, stream, octets))
 
-    def put(self, one: Session, number: int, octets: bytes, stream: Stream) -> None:
-        super().send_data(one, number, octets, stream)
+    def put(self, session: Session, number: int, octets: bytes, stream: Stream) -> None:
+        super().send_data(session, number, octets, stream)
 
     def resealed(self, sent: Sent, counter: int, plain: bytes) -> None:
         """Another counter or plaintext under the key of the run."""
         one, number, stream, _ = sent
         self.put(one, number, message(stream.key, counter, plain), stream)
 
-    def stop(self, one: Session, payload: bytes) -> bytes:
-        stream = one.streams.get(payload[0]) if payload else None
-        out = super().stop(one, payload)
+    def stop(self, session: Session, payload: bytes) -> bytes:
+        stream = session.streams.get(payload[0]) if payload else None
+        out = super().stop(session, payload)
         if stream is not None and self.fault == "goes on after Stop":
-            self.stopped_streams.append((one, payload[0], stream, self.tick() + SECOND))
+            self.stopped_streams.append((session, payload[0], stream, self.tick() + SECOND))
         return out
 
-    def subscribe(self, one: Session, payload: bytes) -> bytes:
-        out = super().subscribe(one, payload)
+    def subscribe(self, session: Session, payload: bytes) -> bytes:
+        out = super().subscribe(session, payload)
         if self.fault == "data before the reply":
-            stream = one.streams[payload[0]]
+            stream = session.streams[payload[0]]
             for counter in range(3):
-                self.put(one, payload[0], message(stream.key, counter, bytes(stream.length - 12)), stream)
+                self.put(session, payload[0], message(stream.key, counter, bytes(stream.length - 12)), stream)
         return out
 
-    def clock(self, one: Session, payload: bytes) -> bytes:
+    def clock(self, session: Session, payload: bytes) -> bytes:
         if self.fault == "Clock is refused later" and self.sent > LATER:
             raise No(22)
-        return super().clock(one, payload)
+        return super().clock(session, payload)
 
     def hello(self, payload: bytes) -> bytes:
         out = super().hello(payload)
@@ -91,9 +91,9 @@ class Troublemaker(Node):
             self.wire.turn(0.01)
             self.pump()
             now = self.tick()
-            for one, number, stream, until in self.stopped_streams:
+            for session, number, stream, until in self.stopped_streams:
                 if now < until:
-                    self.due(one, number, stream, now)
+                    self.due(session, number, stream, now)
             if self.fault == "announces itself as others":
                 for uuid in self.others:
                     crc = zlib.crc32(uuid).to_bytes(4, "big")

@@ -56,7 +56,7 @@ def power_on() -> dict[str, Any]:
         said = sh("bluetoothctl", "power", "on")
         found = adapters()
         if found and found[0].powered:
-            return {"adapters": [[each.name, each.powered, each.central] for each in found]}
+            return {"adapters": [[adapter.name, adapter.powered, adapter.central] for adapter in found]}
         time.sleep(1)
     return {"error": f"the adapter does not come up: {said}"}
 

@@ -96,7 +96,7 @@ def in_memory(*used: Path) -> list[str]:
     A checkout in the temporary folder of the system would be hidden by it. The files of the host are never written to
     in either case: what is written goes into the memory above them.
     """
-    return [place for place in ("/dev/shm", "/tmp", "/run") if not any(one.is_relative_to(place) for one in used)]
+    return [place for place in ("/dev/shm", "/tmp", "/run") if not any(path.is_relative_to(place) for path in used)]
 
 
 def _in_order(names: tuple[str, ...]) -> list[str]:
@@ -108,7 +108,7 @@ def _in_order(names: tuple[str, ...]) -> list[str]:
     order: list[str] = []
     for name in names:
         path, before = needs[name.replace("-", "_")]
-        order += [each for each in (*reversed(before), path) if each not in order]
+        order += [name for name in (*reversed(before), path) if name not in order]
     return order
 
 

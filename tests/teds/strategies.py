@@ -74,7 +74,7 @@ def texts(draw: st.DrawFn) -> list[tuple[str, Any]]:
             "Compress": st.integers(0, 1),
         }
     )
-    return [("Text", each) for each in draw(st.lists(entry, min_size=1, max_size=4))]
+    return [("Text", item) for item in draw(st.lists(entry, min_size=1, max_size=4))]
 
 
 def some_fields(access_code: int, edition: int) -> st.SearchStrategy[list[tuple[str, Any]]]:

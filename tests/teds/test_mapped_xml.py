@@ -30,11 +30,11 @@ def test_the_examples_become_types_with_limits_in_their_units(
     mapping = (EXAMPLES / f"{name}-map.toml").read_text()
     text = profile_from_xml((EXAMPLES / f"{name}.xml").read_bytes(), mapping, name=name)
     profile = parse_profile(text, name)
-    found = {one.number: (one.name, one.unit.text) for one in profile.channels}
+    found = {channel.number: (channel.name, channel.unit.text) for channel in profile.channels}
     assert found == {number: wanted[:2] for number, wanted in channels.items()}
-    for one in profile.channels:
-        ends = (one.fields["LowLimit"], one.fields["HiLimit"])
-        assert ends == pytest.approx(channels[one.number][2:], rel=1e-6)
+    for channel in profile.channels:
+        ends = (channel.fields["LowLimit"], channel.fields["HiLimit"])
+        assert ends == pytest.approx(channels[channel.number][2:], rel=1e-6)
 
 
 @pytest.mark.parametrize(

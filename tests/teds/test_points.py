@@ -65,7 +65,7 @@ def test_a_file_of_another_node_or_of_other_columns_or_units_is_left_alone() -> 
 @given(st.lists(st.tuples(st.floats(0, 65535), st.floats(-360, 360)), min_size=1, max_size=8))
 def test_what_was_captured_is_what_is_read(pairs: list[tuple[float, float]]) -> None:
     read = points_of(grown(*pairs), "x")
-    assert [(one["raw"], one["value"]) for one in read] == [
+    assert [(event["raw"], event["value"]) for event in read] == [
         (pytest.approx(raw, rel=1e-7, abs=1e-30), pytest.approx(value, rel=1e-7, abs=1e-30)) for raw, value in pairs
     ]
 

@@ -38,17 +38,17 @@ def sheet(unit: str = "N") -> Sheet:
 def test_side_by_side_is_one_by_one(unit: str, raw: list[list[int]]) -> None:
     known = sheet(unit)
     channels = [ChannelInterpreter(known, number) for number in range(1, 13)]
-    usable = [not one.problem for one in channels]
+    usable = [not interpreter.problem for interpreter in channels]
     many = ManyChannels.side_by_side(channels, usable)
     assert many is not None
     octets = np.array(raw, dtype=">u2").view(np.uint8).reshape(len(raw), 24)
     raws = many.raw(octets.tobytes())
     np.testing.assert_array_equal(raws, raw)
     value, valid = many.values(raws)
-    for column, one in enumerate(channels):
-        alone = one.values(one.reader.raw(octets[:, 2 * column : 2 * column + 2]))
+    for column, interpreter in enumerate(channels):
+        alone = interpreter.values(interpreter.reader.raw(octets[:, 2 * column : 2 * column + 2]))
         np.testing.assert_array_equal(valid[:, column], alone.valid)
-        np.testing.assert_array_equal(value[:, column], alone.value * one.unit.scale + one.unit.offset)
+        np.testing.assert_array_equal(value[:, column], alone.value * interpreter.unit.scale + interpreter.unit.offset)
 
 
 @given(st.lists(st.lists(st.integers(0, 65535), min_size=3, max_size=3), min_size=1, max_size=6), st.floats(-500, 500))
@@ -69,10 +69,10 @@ def test_angles_wrap_side_by_side_with_what_does_not(raw: list[list[int]], zero:
     assert many is not None
     octets = np.array(raw, dtype=">u2").view(np.uint8).reshape(len(raw), 6)
     value, valid = many.values(many.raw(octets.tobytes()))
-    for column, one in enumerate(channels):
-        alone = one.values(one.reader.raw(octets[:, 2 * column : 2 * column + 2]))
+    for column, interpreter in enumerate(channels):
+        alone = interpreter.values(interpreter.reader.raw(octets[:, 2 * column : 2 * column + 2]))
         np.testing.assert_array_equal(valid[:, column], alone.valid)
-        np.testing.assert_array_equal(value[:, column], alone.value * one.unit.scale + one.unit.offset)
+        np.testing.assert_array_equal(value[:, column], alone.value * interpreter.unit.scale + interpreter.unit.offset)
     assert valid[:, 0].all()
 
 
@@ -102,17 +102,17 @@ def test_every_value_that_a_channel_can_have_is_calibrated_beforehand(number: in
 @settings(max_examples=30)
 def test_channels_of_8_bits_are_looked_up_each_in_its_own(raw: list[list[int]], last: bool) -> None:
     known = sheet()
-    small = [replace(one, sample=SampleForm(0, 1)) for one in known.channels[:4]]
+    small = [replace(channel, sample=SampleForm(0, 1)) for channel in known.channels[:4]]
     channels = [ChannelInterpreter(replace(known, channels=tuple(small)), number) for number in range(1, 5)]
     many = ManyChannels.side_by_side(channels, [True, True, True, last])
     assert many is not None
     octets = np.array(raw, dtype=np.uint8)
     value, valid = many.values(many.raw(octets.tobytes()))
-    for column, one in enumerate(channels):
-        alone = one.values(one.reader.raw(octets[:, column : column + 1]))
+    for column, interpreter in enumerate(channels):
+        alone = interpreter.values(interpreter.reader.raw(octets[:, column : column + 1]))
         usable = last or column < 3
         np.testing.assert_array_equal(valid[:, column], alone.valid & usable)
-        np.testing.assert_array_equal(value[:, column], one.unit.to_si(alone.value) if usable else np.nan)
+        np.testing.assert_array_equal(value[:, column], interpreter.unit.to_si(alone.value) if usable else np.nan)
 
 
 def test_channels_of_other_forms_stay_alone() -> None:

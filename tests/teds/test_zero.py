@@ -76,7 +76,7 @@ def test_only_the_offset_and_its_date_move() -> None:
     after = with_zero_offset(before, -12.5, AT)
     found = from_decoded(teds.decode(after), channel=1)
     assert found == replace(from_decoded(teds.decode(before), channel=1), zero_offset=-12.5, zeroed=AT)
-    assert not [one for one in teds.decode(after).findings if one.severity == "error"]
+    assert not [finding for finding in teds.decode(after).findings if finding.severity == "error"]
     assert evaluate(found, 0.0).value == -12.5
     assert with_zero_offset(with_zero_offset(before, 3.0, AT), -12.5, AT) == after
     assert composed(found) == after, "and it is what a build would write"

@@ -311,5 +311,7 @@ def test_nobody_to_ask_makes_nothing(tmp_path: Path) -> None:
 
 def test_keys_made_here_are_different_every_time() -> None:
     made = [Material.generate() for _ in range(5)]
-    points = {SoftwareKey.from_secret(secret).point for one in made for secret in (one.identity, one.ca or b"")}
+    points = {
+        SoftwareKey.from_secret(secret).point for material in made for secret in (material.identity, material.ca or b"")
+    }
     assert len(points) == 10

@@ -176,7 +176,7 @@ def require_whole(world: World) -> None:
     held = {record.uuid for record in station.keys.all()}
     assert held == set(NODES if "restore" in done else NODES[:3])
     for uuid in held:
-        assert [one.key for one in station.keys.unwrapped(uuid)] == [uuid + b"first!"]
+        assert [node_key.key for node_key in station.keys.unwrapped(uuid)] == [uuid + b"first!"]
     ca = [name for name in done if name in ("drop", "import", "restore")]
     if "drop" in ca or "import" in ca:
         there = [name for name in ca if name != "restore"][-1] == "import"
@@ -308,8 +308,8 @@ def test_a_key_that_was_read_before_a_rewrap_and_opened_after_it_is_found(world:
     corrected = station.keys.correct_epoch(old[NODES[0]], 5)
     again = opened(world.home, PASSPHRASE)
     assert again.keys.unwrap(corrected) == NODES[0] + b"first!"
-    for one in (station, fresh, again):
-        one.close()
+    for any_station in (station, fresh, again):
+        any_station.close()
 
 
 @contextmanager

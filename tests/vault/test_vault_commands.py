@@ -300,8 +300,8 @@ def test_master_keys_come_only_from_a_process_that_knows_one_of_this_store(home:
     fresh.vault.accept(MasterKeys({1: bytes(32)}))
     assert fresh.accept_masters(other.vault.master_keys()), "they open the key of the seals"
     assert keys(fresh) == before
-    for one in (station, other, fresh):
-        one.close()
+    for any_station in (station, other, fresh):
+        any_station.close()
 
 
 def test_three_processes_that_wait_for_the_store_lose_no_key(home: Path) -> None:

@@ -60,7 +60,11 @@ class RememberedNodes:
 
     def remember_node(self, address: str, identity: Identity) -> None:
         """A node was met; an address at which it was before is forgotten."""
-        others = {at: one for at, one in self._known.items() if at != address and one.uuid != identity.uuid}
+        others = {
+            at: known_identity
+            for at, known_identity in self._known.items()
+            if at != address and known_identity.uuid != identity.uuid
+        }
         self._changed = self._changed or self._known.get(address) is None or len(others) + 1 != len(self._known)
         self._known = {**others, address: identity}
 
@@ -154,7 +158,9 @@ class BlePort:
 
     def link(self, number: int, notice: NoticeSink | None = None) -> BleLink:
         """The line over the connection of this number; raises NoNodeError where there is none."""
-        connection = next((each for each in self._connections.values() if each.number == number), None)
+        connection = next(
+            (ble_connection for ble_connection in self._connections.values() if ble_connection.number == number), None
+        )
         if connection is None:
             raise NoNodeError("That node is no longer known here.")
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice or _silently)
@@ -181,8 +187,8 @@ class BlePort:
         where = f"at {self.spec.address} " if self.spec.address else ""
         notice(Notice("waiting", f"Looking for the node {where}over BLE ({self.spec.text}).", seconds))
         told: set[bytes] = set()
-        for each in self._candidates(wanted, time.monotonic() + seconds):
-            contact = self._ask(each, wanted, notice, told)
+        for candidate in self._candidates(wanted, time.monotonic() + seconds):
+            contact = self._ask(candidate, wanted, notice, told)
             if contact is not None:
                 return contact
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
@@ -204,18 +210,18 @@ class BlePort:
         found: dict[str, Contact] = {}
         asked: dict[str, float] = {}
         while (left := until - time.monotonic()) > 0:
-            for each in [self.spec.address] if self.spec.address else self._all_new(left, asked, found, enough):
-                in_use = self._is_up(each)
-                contact = self._ask(each, _anyone, notice, told)
-                asked[each] = time.monotonic()
+            for address in [self.spec.address] if self.spec.address else self._all_new(left, asked, found, enough):
+                in_use = self._is_up(address)
+                contact = self._ask(address, _anyone, notice, told)
+                asked[address] = time.monotonic()
                 if contact is not None:
                     if not in_use:  # there may be twenty: each is connected again when its turn comes
                         contact.link.close()
-                    found[each] = contact
+                    found[address] = contact
             if found and (self.spec.address or time.monotonic() >= enough):
                 break
         if found:
-            return [found[each] for each in sorted(found)]
+            return [found[address] for address in sorted(found)]
         raise NoNodeError(
             f"No node advertises within {seconds:g} s.",
             hint="A node advertises for 60 s after a tap, and as long as it has a key.",
@@ -363,7 +369,11 @@ class BlePort:
     def _make_room(self) -> bool:
         """End a connection on which nothing is under way; False where there is none."""
         with self._lock:
-            idle = [each for each in self._connections.values() if each.is_up and not (each.asking or each.streaming)]
+            idle = [
+                ble_connection
+                for ble_connection in self._connections.values()
+                if ble_connection.is_up and not (ble_connection.asking or ble_connection.streaming)
+            ]
         if not idle:
             return False
         self._loop.run(idle[0].down())

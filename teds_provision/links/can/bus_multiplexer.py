@@ -551,8 +551,8 @@ class BusMultiplexer:
             listeners, asked, lines = self._listeners, self._asked, list(self._lines.values())
         for listener in listeners:
             listener.wake()
-        for one in asked:
-            one.news.put(-1)
+        for pending_broadcast in asked:
+            pending_broadcast.news.put(-1)
         for line in lines:
             line.events.put(ReplyEvent("failed"))
             line.flows.put(b"")

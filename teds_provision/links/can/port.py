@@ -177,10 +177,10 @@ class CanPort:
         notice(Notice("waiting", f"Asking every node on {self.spec.text}.", seconds))
         found, told = FunctionalAnswers(), set[str]()
 
-        def once(each: Notice) -> None:
-            if each.text not in told:
-                told.add(each.text)
-                notice(each)
+        def once(shown: Notice) -> None:
+            if shown.text not in told:
+                told.add(shown.text)
+                notice(shown)
 
         while self.spec.node is None and (left := until - time.monotonic()) > 0:
             silence = max(SILENCE_SECONDS, min(_BUSY_SECONDS, enough - time.monotonic()))

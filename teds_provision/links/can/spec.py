@@ -54,7 +54,7 @@ class CanSpec:
     @property
     def sources(self) -> tuple[int, ...]:
         """The source addresses that it may be used under, the first choice first: where one was named, that alone."""
-        others = [one for one in range(FIRST_STATION, LAST_STATION + 1) if one != self.source]
+        others = [address for address in range(FIRST_STATION, LAST_STATION + 1) if address != self.source]
         return (self.source,) if self.source_named else (self.source, *others)
 
     @property

@@ -79,12 +79,12 @@ def _runs(part: NDArray[Any], rows: Rows) -> list[NDArray[Any]]:
 
 def stacked(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Raw values of a block: of one type where they can be without loss, else Python's objects."""
-    kinds = {one.dtype.kind for one in columns}
-    if len(kinds) == 1 or (kinds == {"i", "f"} and all(_are_floats(one) for one in columns)):
+    kinds = {column.dtype.kind for column in columns}
+    if len(kinds) == 1 or (kinds == {"i", "f"} and all(_are_floats(column) for column in columns)):
         return np.column_stack(columns)
     found = np.empty((len(columns[0]), len(columns)), dtype=object)
-    for place, one in enumerate(columns):
-        found[:, place] = one.tolist()
+    for place, column in enumerate(columns):
+        found[:, place] = column.tolist()
     return found
 
 
@@ -162,7 +162,7 @@ def _follows(run: list[Block], block: Block) -> bool:
 def _joined(run: list[Block]) -> Block:
     if len(run) == 1:
         return run[0]
-    parts: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in run]) for name in _BY_ROW}
+    parts: dict[str, Any] = {name: np.concatenate([getattr(block, name) for block in run]) for name in _BY_ROW}
     return replace(run[0], **parts)
 
 

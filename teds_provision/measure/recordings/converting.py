@@ -93,7 +93,7 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
     try:
         for entry in entries:
             if isinstance(entry, tuple):
-                changed = {one.key: one for one in entry if known.get(one.key) != one}
+                changed = {facts.key: facts for facts in entry if known.get(facts.key) != facts}
                 if changed:
                     known |= changed
                     writer.finish()
@@ -103,8 +103,8 @@ def _as_parquet(path: Path, entries: Iterator[Entry], recording: Recording, *, w
         writer.finish()
     finally:
         writer.close()
-    for one in made:
-        file = os.open(one, os.O_RDONLY | os.O_CLOEXEC)
+    for made_path in made:
+        file = os.open(made_path, os.O_RDONLY | os.O_CLOEXEC)
         try:
             os.fsync(file)
         finally:
@@ -126,8 +126,8 @@ def _counted(recording: Recording, summary: RecordingSummary) -> Iterator[Entry]
 
 def _gridded(entries: Iterator[Entry], recording: Recording) -> Iterator[Entry]:
     """The same as rows of one grid, of every sensor. A row is made when no stream can bring a value before it."""
-    facts = [one for _, one in sorted(recording.facts.items()) if one.kind != "actuator"]
-    periods = {one.key: one.period for one in facts if one.period}
+    facts = [facts for _, facts in sorted(recording.facts.items()) if facts.kind != "actuator"]
+    periods = {channel_facts.key: channel_facts.period for channel_facts in facts if channel_facts.period}
     grid = Grid(recording.station.group or "all", facts, patience=0.0)
     waiting, newest = list[Block](), dict[tuple[str, int], tuple[float, float]]()
     for entry in entries:
@@ -148,15 +148,15 @@ def _gridded(entries: Iterator[Entry], recording: Recording) -> Iterator[Entry]:
 def _rows_until(until: float, waiting: list[Block], grid: Grid) -> tuple[list[Block], list[GroupRows]]:
     """The blocks that are left, and the rows that are due; times without any value are left out."""
     made: list[GroupRows] = []
-    while waiting and (begin := min(float(one.time[0]) for one in waiting)) <= until:
-        end = min(until, begin + _BURST * grid.period, max(float(one.time[-1]) for one in waiting))
+    while waiting and (begin := min(float(block.time[0]) for block in waiting)) <= until:
+        end = min(until, begin + _BURST * grid.period, max(float(block.time[-1]) for block in waiting))
         left = []
-        for one in waiting:
-            count = int(np.searchsorted(one.time, end, "right"))
+        for block in waiting:
+            count = int(np.searchsorted(block.time, end, "right"))
             if count:
-                grid.add_block(part_of(one, slice(None, count)))
-            if count < len(one.time):
-                left.append(part_of(one, slice(count, None)))
+                grid.add_block(part_of(block, slice(None, count)))
+            if count < len(block.time):
+                left.append(part_of(block, slice(count, None)))
         waiting = left
         if (rows := grid.rows(end)) is not None:
             made.append(rows)
@@ -188,7 +188,7 @@ def _sweep(target: Path) -> None:
     """Remove what a killed conversion to this name left: a folder of such a name, ours, locked by nobody."""
     name = re.compile(re.escape(f".{target.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
     with suppress(OSError):
-        for found in [one for one in os.listdir(target.parent) if name.fullmatch(one)]:
+        for found in [file_name for file_name in os.listdir(target.parent) if name.fullmatch(file_name)]:
             folder = target.with_name(found)
             held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:

@@ -118,15 +118,15 @@ class JsonLines(Recording):
         try:
             uuid, index = str(first["uuid"]), int(first["index"])
             time = np.array(first["time"], dtype=np.float64)
-            value = np.column_stack([np.array(one["value"], dtype=np.float64) for one in lines])
-            raw = stacked([_raw(one["raw"]) for one in lines])
+            value = np.column_stack([np.array(line["value"], dtype=np.float64) for line in lines])
+            raw = stacked([_raw(line["raw"]) for line in lines])
             error = first.get("clock_error")
             error = None if error is None else float(error)
         except (KeyError, TypeError, ValueError, OverflowError):
             raise self._bad("the values in or above the line are not those of a recording") from None
         if time.ndim != 1 or not value.shape == raw.shape == (len(time), len(lines)) or len(uuid) > MOST.text:
             raise self._bad("the lists in or above the line are not of one length")
-        channels = tuple(channel_number(one["channel"], f"{self.path}:{self._line}") for one in lines)
+        channels = tuple(channel_number(line["channel"], f"{self.path}:{self._line}") for line in lines)
         streams = numbers.setdefault(uuid, {})
         stream = streams.setdefault(channels, len(streams))
         valid = np.isfinite(value)
@@ -141,18 +141,18 @@ def _goes_with(lines: list[dict[str, Any]], event: dict[str, Any]) -> bool:
     return (
         event.get("event") == "data"
         and all(event.get(name) == first.get(name) for name in ("uuid", "index", "time"))
-        and all(event.get("channel") != one.get("channel") for one in lines)
+        and all(event.get("channel") != line.get("channel") for line in lines)
     )
 
 
 def _raw(values: list[Any]) -> NDArray[Any]:
-    kinds = {type(one) for one in values}
+    kinds = {type(value) for value in values}
     if kinds <= {int}:
         return integers(values)
     if kinds <= {int, float, type(None)}:
         return np.array(values, dtype=np.float64)
     found = np.empty(len(values), dtype=object)
-    found[:] = [bytes.fromhex(one) if isinstance(one, str) else one for one in values]
+    found[:] = [bytes.fromhex(value) if isinstance(value, str) else value for value in values]
     return found
 
 
@@ -164,9 +164,9 @@ def report_of(words: dict[str, Any]) -> NodeReport | None:
     counts = {name: words.get(name) for name in _COUNTS}
     error, time, reasons = words.get("clock_error"), words.get("time"), words.get("invalid_why")
     why: list[InvalidValues] = []
-    for one in reasons[: MOST.text] if isinstance(reasons, list) else ():
-        if isinstance(one, dict) and isinstance(one.get("channel"), int) and isinstance(one.get("count"), int):
-            why.append(InvalidValues(one["channel"], str(one.get("why"))[: MOST.text], one["count"]))
+    for reason in reasons[: MOST.text] if isinstance(reasons, list) else ():
+        if isinstance(reason, dict) and isinstance(reason.get("channel"), int) and isinstance(reason.get("count"), int):
+            why.append(InvalidValues(reason["channel"], str(reason.get("why"))[: MOST.text], reason["count"]))
     return NodeReport(
         uuid,
         state,

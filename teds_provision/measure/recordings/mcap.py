@@ -209,11 +209,11 @@ class McapRecording(Recording):
             raise self._bad(f"the metadata of {name} do not list its channels")
         uuid = words.get("uuid", "")
         where = f"{self.path}: the metadata of {name}"
-        known = tuple(facts_of({"uuid": uuid, **one} if isinstance(one, dict) else one, where) for one in listed)
+        known = tuple(facts_of({"uuid": uuid, **item} if isinstance(item, dict) else item, where) for item in listed)
         found = _STREAM.search(name)
         stream = int(found[1]) if found else 0
-        facts = tuple(one for one, words in zip(known, listed, strict=True) if "uuid" in words)
-        return number, _Topic(name, kind, uuid, stream, tuple(one.number for one in known), facts)
+        facts = tuple(facts for facts, words in zip(known, listed, strict=True) if "uuid" in words)
+        return number, _Topic(name, kind, uuid, stream, tuple(facts.number for facts in known), facts)
 
     def _blocks(
         self, waiting: dict[tuple[int, int], list[bytes]], topics: dict[int, _Topic], joined: BlockJoiner
@@ -230,7 +230,7 @@ class McapRecording(Recording):
         if integral is None:
             raise self._bad(f"a message of {topic.topic} does not have {columns} channels")
         form = layout(columns, integral)
-        rows = np.frombuffer(b"".join([bytes(HEAD.size) + one for one in contents]), dtype=form)
+        rows = np.frombuffer(b"".join([bytes(HEAD.size) + content for content in contents]), dtype=form)
         counts = rows["raws" if integral else "floats"]
         if (rows["cdr"] != LITTLE_ENDIAN).any() or (rows["values"] != columns).any() or (counts != columns).any():
             raise self._bad(f"a message of {topic.topic} is damaged")
@@ -242,7 +242,7 @@ class McapRecording(Recording):
 
     def _block(self, topic: _Topic, rows: NDArray[Any], error: float, *, test: bool) -> Block:
         raw = np.ascontiguousarray(rows["raw"])
-        if raw.dtype.kind == "i" and any(raw_kind(one.sample_form) == "uint64" for one in topic.facts):
+        if raw.dtype.kind == "i" and any(raw_kind(facts.sample_form) == "uint64" for facts in topic.facts):
             raw = raw.view(np.uint64)
         value = np.ascontiguousarray(rows["value"])
         time = rows["times"][:, 0].astype(np.float64) / 1e9

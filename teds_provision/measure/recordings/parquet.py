@@ -50,8 +50,11 @@ class ParquetWriter:
 
     def __init__(self, path: Path, facts: Sequence[ChannelFacts], station: StationFacts, *, wide: bool) -> None:
         pa = self._pa = library()
-        self._known = [one for _, one in sorted({one.key: one for one in facts}.items())]
-        self._places = {one.key: place for place, one in enumerate(self._known)}
+        self._known = [
+            channel_facts
+            for _, channel_facts in sorted({channel_facts.key: channel_facts for channel_facts in facts}.items())
+        ]
+        self._places = {facts.key: place for place, facts in enumerate(self._known)}
         self._wide = wide
         columns: list[tuple[str, Any]] = [("time", pa.float64())]
         if not wide:
@@ -60,7 +63,7 @@ class ParquetWriter:
         columns += [(printable(name), pa.float64()) for name in heads_of(self._known)]
         if not wide:
             forms = zip(names_of(self._known), self._known, strict=True)
-            columns += [(printable(f"{name} raw"), self._raw_type(one.sample_form)) for name, one in forms]
+            columns += [(printable(f"{name} raw"), self._raw_type(facts.sample_form)) for name, facts in forms]
         head = {
             "format": _FORMAT,
             "station": station.name,
@@ -69,7 +72,7 @@ class ParquetWriter:
             "clock": station.clock,
             "test_pattern": station.test_pattern,
             "wide": wide,
-            "channels": [facts_as_json(one) for one in self._known],
+            "channels": [facts_as_json(facts) for facts in self._known],
         }
         self._schema = pa.schema(columns, metadata={_KEY: json.dumps(head)})
         self._writer = pa.parquet.ParquetWriter(path, self._schema, compression="zstd", compression_level=1)
@@ -89,7 +92,7 @@ class ParquetWriter:
             if self._rows * len(self._schema) >= _CELLS:
                 self._flush()
         elif isinstance(entry, NodeReport):
-            self._log = [one for one in self._log if one.get("uuid") != entry.uuid] + [status_line(entry)]
+            self._log = [event for event in self._log if event.get("uuid") != entry.uuid] + [status_line(entry)]
         elif isinstance(entry, Note):
             self._log.append({"event": "note", "time": entry.at, "why": entry.text})
 
@@ -111,32 +114,34 @@ class ParquetWriter:
         values: list[NDArray[Any]] = [np.full(count, np.nan) for _ in range(width)]
         raws: list[list[tuple[int, int, NDArray[Any]]]] = [[] for _ in range(width)]
         at = 0
-        for one in waiting:
-            end = at + len(one.time)
-            keys = one.channels if isinstance(one, GroupRows) else [(one.uuid, number) for number in one.channels]
+        for part in waiting:
+            end = at + len(part.time)
+            keys = part.channels if isinstance(part, GroupRows) else [(part.uuid, number) for number in part.channels]
             for column, key in enumerate(keys):
                 place = self._places[key]
-                values[place][at:end] = one.value[:, column]
-                if isinstance(one, Block):
-                    raws[place].append((at, end, one.raw[:, column]))
+                values[place][at:end] = part.value[:, column]
+                if isinstance(part, Block):
+                    raws[place].append((at, end, part.raw[:, column]))
             at = end
-        order = np.argsort(np.concatenate([one.time for one in waiting]), kind="stable")
-        arrays = [self._pa.array(np.concatenate([one.time for one in waiting])[order])]
-        blocks = [one for one in waiting if isinstance(one, Block)]
+        order = np.argsort(np.concatenate([part.time for part in waiting]), kind="stable")
+        arrays = [self._pa.array(np.concatenate([part.time for part in waiting])[order])]
+        blocks = [part for part in waiting if isinstance(part, Block)]
         if not self._wide:
             arrays += self._beside(blocks, order)
-        arrays += [self._pa.array(one[order], mask=np.isnan(one)[order]) for one in values]
+        arrays += [self._pa.array(value[order], mask=np.isnan(value)[order]) for value in values]
         if not self._wide:
             arrays += [self._raw(place, pieces, count, order) for place, pieces in enumerate(raws)]
         self._writer.write_table(self._pa.Table.from_arrays(arrays, schema=self._schema))
 
     def _beside(self, blocks: Sequence[Block], order: NDArray[Any]) -> list[Any]:
-        pa, lengths = self._pa, [len(one.time) for one in blocks]
-        uuids = np.repeat(np.array([one.uuid for one in blocks], dtype=object), lengths)
-        index = np.concatenate([np.arange(one.index, one.index + n) for one, n in zip(blocks, lengths, strict=True)])
-        tick = np.concatenate([one.tick for one in blocks])
-        error = np.repeat([np.nan if one.clock_error is None else one.clock_error for one in blocks], lengths)
-        notes = np.repeat(np.array([self._note(one) for one in blocks], dtype=object), lengths)
+        pa, lengths = self._pa, [len(block.time) for block in blocks]
+        uuids = np.repeat(np.array([block.uuid for block in blocks], dtype=object), lengths)
+        index = np.concatenate(
+            [np.arange(block.index, block.index + n) for block, n in zip(blocks, lengths, strict=True)]
+        )
+        tick = np.concatenate([block.tick for block in blocks])
+        error = np.repeat([np.nan if block.clock_error is None else block.clock_error for block in blocks], lengths)
+        notes = np.repeat(np.array([self._note(block) for block in blocks], dtype=object), lengths)
         return [
             pa.array(uuids[order], pa.string()),
             pa.array(index[order], pa.int64()),
@@ -158,7 +163,9 @@ class ParquetWriter:
         try:
             for at, end, column in pieces:
                 if dtype is None:
-                    found[at:end] = [one.hex() if isinstance(one, bytes) else str(one) for one in column.tolist()]
+                    found[at:end] = [
+                        value.hex() if isinstance(value, bytes) else str(value) for value in column.tolist()
+                    ]
                 elif column.dtype.kind == "O":
                     found[at:end] = np.array(column.tolist(), dtype=dtype)
                 else:
@@ -196,9 +203,9 @@ class ParquetRecording(Recording):
         listed = words["channels"] if isinstance(words.get("channels"), list) else []
         if len(listed) > MOST.channels:
             raise self._bad(f"it names more than {MOST.channels} channels")
-        self._known = [facts_of(one, str(path)) for one in listed]
-        for one in self._known:
-            self.know(one)
+        self._known = [facts_of(item, str(path)) for item in listed]
+        for facts in self._known:
+            self.know(facts)
         if self.wide:
             self.form = "Parquet, wide"
 
@@ -249,19 +256,19 @@ class ParquetRecording(Recording):
     def _grid(self, batch: Any) -> GroupRows:
         time, *columns = [_floats(batch.column(place)) for place in range(batch.num_columns)]
         value = np.column_stack(columns) if columns else np.empty((len(time), 0))
-        keys = tuple(one.key for one in self._known)
+        keys = tuple(facts.key for facts in self._known)
         return GroupRows(self.station.group or "all", keys, time, value, np.full_like(value, np.nan))
 
     def _blocks(self, batch: Any, streams: Streams) -> Iterator[Block]:
         width = len(self._known)
         uuids = batch.column(1).to_pylist()
         for uuid in dict.fromkeys(uuids):
-            rows = np.flatnonzero(np.array([one == uuid for one in uuids]))
+            rows = np.flatnonzero(np.array([uuid_text == uuid for uuid_text in uuids]))
             mine = batch if len(rows) == len(uuids) else batch.take(self._pa.array(rows))
             at = 6 + width
             places = [
-                k for k, one in enumerate(self._known)
-                if one.uuid == uuid and mine.column(at + k).null_count < mine.num_rows
+                k for k, facts in enumerate(self._known)
+                if facts.uuid == uuid and mine.column(at + k).null_count < mine.num_rows
             ]  # fmt: skip
             raws = [mine.column(at + k) for k in places]
             yield from streams.blocks(
@@ -272,10 +279,10 @@ class ParquetRecording(Recording):
                     mine.column(2).to_numpy(zero_copy_only=False).astype(np.int64),
                     mine.column(3).fill_null(0).to_numpy(zero_copy_only=False).astype(np.uint64),
                     _floats(mine.column(4)),
-                    np.array([one == "test pattern" for one in mine.column(5).to_pylist()]),
+                    np.array([flag == "test pattern" for flag in mine.column(5).to_pylist()]),
                     [_floats(mine.column(6 + k)) for k in places],
-                    [_exact(one) for one in raws],
-                    np.array([one.is_valid().to_numpy(zero_copy_only=False) for one in raws]).T.reshape(
+                    [_exact(raw) for raw in raws],
+                    np.array([raw.is_valid().to_numpy(zero_copy_only=False) for raw in raws]).T.reshape(
                         len(rows), len(places)
                     ),
                 )
@@ -295,7 +302,7 @@ def _exact(column: Any) -> NDArray[Any]:
     if kind == "double":
         return _floats(column)
     found = np.empty(len(column), dtype=object)
-    found[:] = [_long(one) if one else b"" for one in column.to_pylist()]
+    found[:] = [_long(value) if value else b"" for value in column.to_pylist()]
     return found
 
 

@@ -177,7 +177,7 @@ def _fact(name: str, value: Any, where: str) -> Any:
     if (name in _FLAGS and isinstance(value, bool)) or (name == "kind" and value in get_args(Kind)):
         return value
     if name == "vector" and isinstance(value, list) and len(value) <= MOST.text:
-        return tuple(channel_number(one, where) for one in value)
+        return tuple(channel_number(element, where) for element in value)
     if name == "number":
         return channel_number(value, where)
     raise BadDataError(f"{where}: {name} of a channel is {_short(value)}.")

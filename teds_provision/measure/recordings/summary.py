@@ -72,7 +72,7 @@ class RecordingSummary:
         elif isinstance(entry, Note):
             self.notes = [*self.notes, entry][:NOTES]
         else:
-            self.facts.update((one.key, one) for one in entry if len(self.facts) < MOST.channels)
+            self.facts.update((facts.key, facts) for facts in entry if len(self.facts) < MOST.channels)
 
     def _seen_of(self, key: tuple[str, int]) -> ChannelStatistics:
         return self.channels.setdefault(key, ChannelStatistics())
@@ -96,10 +96,10 @@ class RecordingSummary:
         null where it reported nothing; times are ISO 8601.
         """
         seen = self.channels.values()
-        reports = [self._of_this_file(one) for one in self.reports.values()]
-        lost = sum(one.lost for one in reports) if reports else None
-        first = min((one.first for one in seen), default=math.inf)
-        last = max((one.last for one in seen), default=-math.inf)
+        reports = [self._of_this_file(report) for report in self.reports.values()]
+        lost = sum(node.lost for node in reports) if reports else None
+        first = min((statistics.first for statistics in seen), default=math.inf)
+        last = max((statistics.last for statistics in seen), default=-math.inf)
         return {
             "file": str(recording.path),
             "format": recording.form,
@@ -113,17 +113,17 @@ class RecordingSummary:
             "from": iso(first) if math.isfinite(first) else None,
             "until": iso(last) if math.isfinite(last) else None,
             "messages": self.messages,
-            "samples": sum(one.samples for one in seen),
-            "invalid": sum(one.invalid for one in seen),
+            "samples": sum(statistics.samples for statistics in seen),
+            "invalid": sum(statistics.invalid for statistics in seen),
             "lost": lost,
             "missing": self.missing,
             "channels": [self._channel(key, recording) for key in sorted({*recording.facts, *self.channels})],
             "nodes": [
-                {"uuid": one.uuid, "state": one.state, "why": one.why, "samples": one.samples, "lost": one.lost,
-                 "late": one.late, "bad": one.bad, "invalid": one.invalid}
-                for one in reports
+                {"uuid": node.uuid, "state": node.state, "why": node.why, "samples": node.samples, "lost": node.lost,
+                 "late": node.late, "bad": node.bad, "invalid": node.invalid}
+                for node in reports
             ],
-            "notes": [{"time": iso(one.at), "why": one.text} for one in self.notes],
+            "notes": [{"time": iso(note.at), "why": note.text} for note in self.notes],
         }  # fmt: skip
 
     def _of_this_file(self, last: NodeReport) -> NodeReport:

@@ -128,8 +128,10 @@ class TextRecording(Recording):
         state = _STATE.match(timed[2])
         if state is None:
             return Note(unix_of(timed[1]), timed[2][: MOST.text])
-        samples, lost, late, bad, invalid = (int(one) for one in state.groups()[2:7])
-        named: dict[str, State] = {one: one for one in ("waiting", "running", "lost", "refused", "ended")}
+        samples, lost, late, bad, invalid = (int(count) for count in state.groups()[2:7])
+        named: dict[str, State] = {
+            state_name: state_name for state_name in ("waiting", "running", "lost", "refused", "ended")
+        }
         why = state[8].rpartition("; ")[2] if "; " in state[8] else ""
         return NodeReport(
             state[1], named[state[2]], why[: MOST.text], samples, lost, late, bad, invalid, time=unix_of(timed[1])
@@ -157,15 +159,15 @@ class TextRecording(Recording):
             raise self._bad(f"one of the {len(lines)} rows from here on has a cell that is no number") from None
 
     def _grid(self, table: list[list[str]]) -> GroupRows:
-        columns = [np.fromiter(map(_number, one), np.float64, len(table)) for one in zip(*table, strict=True)]
+        columns = [np.fromiter(map(_number, cells), np.float64, len(table)) for cells in zip(*table, strict=True)]
         value = np.column_stack(columns[1:]) if columns[1:] else np.empty((len(table), 0))
-        keys = tuple(one.key for one in self._known)
+        keys = tuple(facts.key for facts in self._known)
         return GroupRows(self.station.group or "all", keys, columns[0], value, np.full_like(value, np.nan))
 
     def _of_node(self, uuid: str, table: list[list[str]]) -> Rows:
         columns, count, width = list(zip(*table, strict=True)), len(table), len(self._known)
         at = len(_BEFORE) + width
-        places = [k for k, one in enumerate(self._known) if one.uuid == uuid and any(columns[at + k])]
+        places = [k for k, facts in enumerate(self._known) if facts.uuid == uuid and any(columns[at + k])]
         raws = [columns[at + k] for k in places]
         values = [columns[len(_BEFORE) + k] for k in places]
         index = np.array(list(map(int, columns[2])), dtype=np.int64)
@@ -177,9 +179,9 @@ class TextRecording(Recording):
             np.zeros(count, dtype=np.uint64),
             np.fromiter(map(_number, columns[3]), np.float64, count),
             np.array([note == "test pattern" for note in columns[4]]),
-            [np.fromiter(map(_number, one), np.float64, count) for one in values],
-            [_raw(one, self._known[k].sample_form) for k, one in zip(places, raws, strict=True)],
-            np.array([[bool(cell) for cell in one] for one in raws]).T.reshape(count, len(places)),
+            [np.fromiter(map(_number, value), np.float64, count) for value in values],
+            [_raw(column, self._known[k].sample_form) for k, column in zip(places, raws, strict=True)],
+            np.array([[bool(cell) for cell in raw] for raw in raws]).T.reshape(count, len(places)),
         )
 
 

@@ -50,7 +50,7 @@ class StreamTotals:
         self.bad += counts.bad + counts.junk + counts.future + counts.back + counts.unasked + heard.wrong_pattern
         self.bad += heard.assembly.wrong
         self.invalid_why = added(self.invalid_why, heard.interpreter.invalid)
-        self.invalid = sum(one.count for one in self.invalid_why)
+        self.invalid = sum(invalid.count for invalid in self.invalid_why)
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
 
     def with_run(self, heard: ReceivedStream | None) -> StreamTotals:
@@ -64,8 +64,8 @@ class StreamTotals:
 def added(*parts: Sequence[InvalidValues]) -> tuple[InvalidValues, ...]:
     """Counts of the same channel and reason put together."""
     counts: Counter[tuple[int, str]] = Counter()
-    for one in chain.from_iterable(parts):
-        counts[one.channel, one.why] += one.count
+    for invalid in chain.from_iterable(parts):
+        counts[invalid.channel, invalid.why] += invalid.count
     return tuple(InvalidValues(channel, why, count) for (channel, why), count in counts.items())
 
 
@@ -176,7 +176,7 @@ class NodeStreams:
     def first_sample(self) -> float:
         """When the last of its streams takes its first sample (monotonic seconds); 0.0 where none has a start."""
         with self.mapping:
-            starts = [one.receiver.start for one in list(self.running.values())]
+            starts = [stream.receiver.start for stream in list(self.running.values())]
             return max((self.clock.host_of(start) for start in starts if start is not None), default=0.0)
 
     def summed(self) -> list[StreamTotals]:
@@ -188,22 +188,22 @@ class NodeStreams:
     def _steady(self) -> list[ReceivedStream]:
         """Streams whose messages come all the time: events may be silent for ever, and so may what waits."""
         return [
-            one
-            for one in self.running.values()
-            if one.receiver.plan.subscribe.kind != StreamKind.EVENT and one.receiver.start is not None
+            stream
+            for stream in self.running.values()
+            if stream.receiver.plan.subscribe.kind != StreamKind.EVENT and stream.receiver.start is not None
         ]
 
     def every(self) -> float | None:
         """Seconds in which a message comes for sure while the node is there; None where nobody can say."""
-        return min((3 * one.receiver.plan.span / 1e9 for one in self._steady()), default=None)
+        return min((3 * stream.receiver.plan.span / 1e9 for stream in self._steady()), default=None)
 
     def heard_since(self, moment: float) -> bool:
         """Whether a good message came after ``moment`` (time.monotonic)."""
-        return any(one.heard > moment for one in self.running.values())
+        return any(stream.heard > moment for stream in self.running.values())
 
     def silent(self, now: float) -> float:
         """Seconds of silence where that is too long, else 0.0."""
-        for one in self._steady():
-            if now - one.heard > SILENT + 3 * one.receiver.plan.span / 1e9:
-                return now - one.heard
+        for stream in self._steady():
+            if now - stream.heard > SILENT + 3 * stream.receiver.plan.span / 1e9:
+                return now - stream.heard
         return 0.0

@@ -138,7 +138,7 @@ class FileSink(ThreadedSink):
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         self.station = station
-        self.facts = {one.key: one for one in facts}
+        self.facts = {channel_facts.key: channel_facts for channel_facts in facts}
         try:
             self._part = self._next_part()
         except OSError as error:
@@ -146,8 +146,8 @@ class FileSink(ThreadedSink):
 
     def _learn(self, facts: tuple[ChannelFacts, ...]) -> tuple[ChannelFacts, ...]:
         """Keep the facts; gives those that are new or other than before."""
-        changed = tuple(one for one in facts if self.facts.get(one.key) != one)
-        self.facts.update((one.key, one) for one in changed)
+        changed = tuple(channel_facts for channel_facts in facts if self.facts.get(channel_facts.key) != channel_facts)
+        self.facts.update((facts.key, facts) for facts in changed)
         return changed
 
     def _next_part(self) -> Part:

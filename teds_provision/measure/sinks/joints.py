@@ -51,11 +51,11 @@ class Joint:
 def joints_of(facts: Iterable[ChannelFacts], topics: Topics) -> list[Joint]:
     """The joints of some nodes, by name."""
     nodes: dict[str, list[ChannelFacts]] = {}
-    for one in facts:
-        if _kind(one) is not None and not (one.unsigned or one.unverified):
-            nodes.setdefault(one.uuid, []).append(one)
+    for channel_facts in facts:
+        if _kind(channel_facts) is not None and not (channel_facts.unsigned or channel_facts.unverified):
+            nodes.setdefault(channel_facts.uuid, []).append(channel_facts)
     found = [joint for uuid, channels in nodes.items() for joint in _of_node(uuid, channels, topics)]
-    return sorted(found, key=lambda one: one.name)
+    return sorted(found, key=lambda joint: joint.name)
 
 
 def _kind(facts: ChannelFacts) -> Interface | None:
@@ -63,23 +63,23 @@ def _kind(facts: ChannelFacts) -> Interface | None:
 
 
 def _of_node(uuid: str, channels: Sequence[ChannelFacts], topics: Topics) -> list[Joint]:
-    by_number = sorted(channels, key=lambda one: one.number)
-    actuators = [one for one in by_number if one.kind == "actuator"]
+    by_number = sorted(channels, key=lambda facts: facts.number)
+    actuators = [facts for facts in by_number if facts.kind == "actuator"]
     sensors: dict[Interface, list[int]] = {}
-    for one in by_number:
-        kind = _kind(one)
-        if one.kind == "sensor" and kind is not None:
-            sensors.setdefault(kind, []).append(one.number)
+    for facts in by_number:
+        kind = _kind(facts)
+        if facts.kind == "sensor" and kind is not None:
+            sensors.setdefault(kind, []).append(facts.number)
     found = []
-    for place, one in enumerate(actuators):
-        command = _kind(one)
+    for place, facts in enumerate(actuators):
+        command = _kind(facts)
         assert command is not None
         name = topics.node(uuid)
         if len(actuators) > 1:
-            name = f"{name}_{topics.channel(*one.key).rpartition('/')[2]}"
+            name = f"{name}_{topics.channel(*facts.key).rpartition('/')[2]}"
         # Sensors belong to actuators one by one, in their order; of more or fewer nobody knows whose they are.
         state = {kind: own[place] for kind, own in sensors.items() if len(own) == len(actuators)}
-        found.append(Joint(name, uuid, one.number, command, state))
+        found.append(Joint(name, uuid, facts.number, command, state))
     return found
 
 
@@ -91,7 +91,7 @@ def state_of(
     A joint without a position is left out: the hardware interface takes one for each name. Velocities and efforts are
     there for all joints or for none, as the message demands.
     """
-    known = [(one.name, values) for one in joints if "position" in (values := one.values(newest))]
+    known = [(joint.name, values) for joint in joints if "position" in (values := joint.values(newest))]
     velocity = [values["velocity"] for _, values in known if "velocity" in values]
     effort = [values["effort"] for _, values in known if "effort" in values]
     return (

@@ -60,8 +60,8 @@ def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> I
             "unit": known.unit,
             "index": block.index,
             "time": times,
-            "raw": [plain(one) for one in block.raw[:, column].tolist()],
-            "value": [plain(one) if good else None for one, good in zip(values, valid, strict=True)],
+            "raw": [plain(value) for value in block.raw[:, column].tolist()],
+            "value": [plain(value) if good else None for value, good in zip(values, valid, strict=True)],
             "uncertainty": known.uncertainty,
             "valid": valid,
             "clock_error": block.clock_error,
@@ -89,9 +89,9 @@ def row_lines(rows: GroupRows, facts: Mapping[tuple[str, int], ChannelFacts]) ->
             "name": known.name,
             "unit": known.unit,
             "time": times,
-            "value": [plain(one) for one in values],
+            "value": [plain(value) for value in values],
             "uncertainty": known.uncertainty,
-            "valid": [math.isfinite(one) for one in values],
+            "valid": [math.isfinite(value) for value in values],
         }
 
 
@@ -107,7 +107,7 @@ def status_line(report: NodeReport) -> dict[str, Any]:
         "late": report.late,
         "bad": report.bad,
         "invalid": report.invalid,
-        "invalid_why": [dataclasses.asdict(one) for one in report.invalid_why],
+        "invalid_why": [dataclasses.asdict(invalid) for invalid in report.invalid_why],
         "clock_error": report.clock_error,
         "time": report.time,
     }

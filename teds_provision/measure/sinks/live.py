@@ -159,7 +159,7 @@ class TopicSink(ThreadedSink):
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         self._station = station
         self._topics = Topics(station)
-        self._facts = {one.key: one for one in facts}
+        self._facts = {channel_facts.key: channel_facts for channel_facts in facts}
         self._topics.learn(facts)
 
     def _begin(self) -> None:
@@ -189,8 +189,8 @@ class TopicSink(ThreadedSink):
         if isinstance(item, NodeReport):
             self._reports[item.uuid] = item
             return []
-        changed = [one for one in item if self._facts.get(one.key) != one]
-        self._facts.update((one.key, one) for one in changed)
+        changed = [facts for facts in item if self._facts.get(facts.key) != facts]
+        self._facts.update((facts.key, facts) for facts in changed)
         before = {uuid: self._topics.of_node(uuid, "teds") for uuid in self._described}
         self._topics.learn(changed)
         for uuid, topic in before.items():
@@ -204,7 +204,7 @@ class TopicSink(ThreadedSink):
 
     def _announce(self, facts: Sequence[ChannelFacts]) -> None:
         """Metadata, parameters and command topics of channels; again when a way to the consumers opened anew."""
-        whole = {one.uuid for one in facts} if self._station.each_node else {self._station.group}
+        whole = {channel_facts.uuid for channel_facts in facts} if self._station.each_node else {self._station.group}
         for array in () if self._station.test_pattern else map(self._array_topic, sorted(whole)):
             for topic in (array, f"{array}/age"):
                 self._advertise(topic, JOINT_STATE)
@@ -213,17 +213,19 @@ class TopicSink(ThreadedSink):
             self._advertise(self._topics.of_station(STATES), JOINT_STATE)
             if self._commands is not None:
                 self._listen_joints(self._topics.of_station(COMMANDS))
-        by_node: dict[str, list[ChannelFacts]] = {one.uuid: [] for one in facts}
-        for one in self._facts.values():
-            if one.uuid in by_node:
-                by_node[one.uuid].append(one)
+        by_node: dict[str, list[ChannelFacts]] = {channel_facts.uuid: [] for channel_facts in facts}
+        for channel_facts in self._facts.values():
+            if channel_facts.uuid in by_node:
+                by_node[channel_facts.uuid].append(channel_facts)
         for uuid, channels in by_node.items():
             self._described.add(uuid)
             self._latched(self._topics.of_node(uuid, "teds"), json.dumps(self._metadata(uuid, channels)))
-            for one in channels:
-                self._parameter(self._topics.channel(*one.key), facts_as_json(one))
-                if one.kind == "actuator" and self._commands is not None:
-                    self._listen(f"{self._topics.channel(*one.key)}/cmd", one.uuid, one.number)
+            for channel_facts in channels:
+                self._parameter(self._topics.channel(*channel_facts.key), facts_as_json(channel_facts))
+                if channel_facts.kind == "actuator" and self._commands is not None:
+                    self._listen(
+                        f"{self._topics.channel(*channel_facts.key)}/cmd", channel_facts.uuid, channel_facts.number
+                    )
 
     def _metadata(self, uuid: str, channels: Sequence[ChannelFacts]) -> dict[str, Any]:
         """What a consumer has to know of a node's values, as plain data."""
@@ -234,8 +236,8 @@ class TopicSink(ThreadedSink):
             "test_pattern": self._station.test_pattern,
             "variance": VARIANCE_NOTE,
             "channels": [
-                {**facts_as_json(replace(one, frame=self._frame(one))), "topic": self._topics.channel(*one.key)}
-                for one in channels
+                {**facts_as_json(replace(facts, frame=self._frame(facts))), "topic": self._topics.channel(*facts.key)}
+                for facts in channels
             ],
         }
 
@@ -279,17 +281,22 @@ class TopicSink(ThreadedSink):
             if not is_range(facts):
                 topic = self._topics.channel(block.uuid, facts.number)
                 channels.append((column, topic, meaning_of(facts), self._frame(facts), variance_of(facts)))
-        frames = {one.number: self._frame(one) for one in known}
+        frames = {facts.number: self._frame(facts) for facts in known}
         compounds = [
-            (self._compound_topic(block.uuid, one), one, frames[one.parts[0][1]]) for one in compounds_of(known)
+            (self._compound_topic(block.uuid, compound), compound, frames[compound.parts[0][1]])
+            for compound in compounds_of(known)
         ]
         return _Scalars(channels, compounds)
 
     def _frame(self, facts: ChannelFacts) -> str:
         return facts.frame.replace("{node}", self._topics.node(facts.uuid))
 
-    def _compound_topic(self, uuid: str, one: Compound) -> str:
-        return self._topics.of_node(uuid, one.name) if one.name else self._topics.channel(uuid, one.parts[0][1])
+    def _compound_topic(self, uuid: str, compound: Compound) -> str:
+        return (
+            self._topics.of_node(uuid, compound.name)
+            if compound.name
+            else self._topics.channel(uuid, compound.parts[0][1])
+        )
 
     def _array_topic(self, whole: str) -> str:
         """Of a group, or of a node (its UUID) where each has its own."""
@@ -318,7 +325,9 @@ class TopicSink(ThreadedSink):
 
     def _joint_states(self, stamp: float, values: Mapping[tuple[str, int], float]) -> None:
         self._newest |= values
-        mine = [one for one in self._joints if any((one.uuid, number) in values for number in one.state.values())]
+        mine = [
+            joint for joint in self._joints if any((joint.uuid, number) in values for number in joint.state.values())
+        ]
         names, *states = state_of(mine, self._newest)
         if names:
             self._array(self._topics.of_station(STATES), stamp, names, *states)
@@ -327,7 +336,7 @@ class TopicSink(ThreadedSink):
     def _joint_command(self, names: Sequence[str], *values: Sequence[float]) -> None:
         """Set points of joints came: positions, velocities, efforts; from any thread. Unknown names are refused."""
         given = dict(zip(INTERFACES, values, strict=True))
-        joints = {one.name: one for one in self._joints}
+        joints = {joint.name: joint for joint in self._joints}
         for place, name in enumerate(names):
             joint = joints.get(name)
             if joint is not None and place < len(given[joint.command]):
@@ -351,18 +360,18 @@ class TopicSink(ThreadedSink):
 
     def _statuses(self, rate: float) -> list[DiagnosticEntry]:
         found = [self._status(report) for report in self._reports.values()]
-        for uuid in sorted({one.uuid for one in self._facts.values() if one.unsigned}):
+        for uuid in sorted({facts.uuid for facts in self._facts.values() if facts.unsigned}):
             name = f"{self._topics.node(uuid)}: datasheet"
             found.append(DiagnosticEntry(WARN, name, "unsigned: raw values only, not published on any topic", uuid))
-        for uuid in sorted({one.uuid for one in self._facts.values() if one.unverified}):
+        for uuid in sorted({facts.uuid for facts in self._facts.values() if facts.unverified}):
             name = f"{self._topics.node(uuid)}: datasheet"
             found.append(
                 DiagnosticEntry(WARN, name, "unverified: values are calibrated by an unsigned datasheet", uuid)
             )
-        for one in self._facts.values():
-            if one.overdue:
-                name = f"{self._topics.node(one.uuid)}: calibration of {one.label}"
-                found.append(DiagnosticEntry(WARN, name, f"due since {one.due}", one.uuid))
+        for facts in self._facts.values():
+            if facts.overdue:
+                name = f"{self._topics.node(facts.uuid)}: calibration of {facts.label}"
+                found.append(DiagnosticEntry(WARN, name, f"due since {facts.due}", facts.uuid))
         stats = self.stats
         values = (("messages per second", f"{rate:.0f}"), ("dropped values", str(stats.dropped)))
         level = WARN if rate > BUDGET or stats.dropped else OK

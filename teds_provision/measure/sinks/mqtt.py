@@ -189,10 +189,13 @@ class MqttSink(ThreadedSink):
 
     def _learn(self, facts: tuple[ChannelFacts, ...]) -> None:
         """Facts that are new or have changed are announced, and those of a node whose topics have another name now."""
-        changed = [one.key for one in facts if self._facts.get(one.key) != one]
-        self._facts.update((one.key, one) for one in facts)
+        changed = [channel_facts.key for channel_facts in facts if self._facts.get(channel_facts.key) != channel_facts]
+        self._facts.update((channel_facts.key, channel_facts) for channel_facts in facts)
         self._topics.learn(facts)
-        self._units.update((one.key, display_unit(one.units) if one.units else None) for one in facts)
+        self._units.update(
+            (channel_facts.key, display_unit(channel_facts.units) if channel_facts.units else None)
+            for channel_facts in facts
+        )
         names = {uuid: self._topics.node(uuid) for uuid, _ in self._facts}
         renamed = {uuid for uuid, name in self._parts_of_topics.items() if names[uuid] != name}
         taken = set(names.values())
@@ -239,25 +242,25 @@ class MqttSink(ThreadedSink):
                 return
             del self._owed_entities[key]
 
-    def _discover(self, one: ChannelFacts) -> bool:
+    def _discover(self, facts: ChannelFacts) -> bool:
         """Announce a channel; False where it has to be done again."""
-        if one.unsigned:  # raw values alone, which are none of anything: no sensor to show
+        if facts.unsigned:  # raw values alone, which are none of anything: no sensor to show
             return True
-        node = f"{self._topics.station}/{self._topics.node(one.uuid)}"
-        marked = " (unverified)" if one.unverified else ""
+        node = f"{self._topics.station}/{self._topics.node(facts.uuid)}"
+        marked = " (unverified)" if facts.unverified else ""
         device = {
-            "identifiers": [one.uuid],
-            "name": f"{one.node or one.uuid}{marked}",
+            "identifiers": [facts.uuid],
+            "name": f"{facts.node or facts.uuid}{marked}",
             "manufacturer": "IEEE 1451 transducer",
             "sw_version": f"teds-provision {__version__}",
         }
-        unit = self._units.get(one.key)
-        sign = short_unit(unit.text) if unit else one.unit
+        unit = self._units.get(facts.key)
+        sign = short_unit(unit.text) if unit else facts.unit
         words = {
-            "name": f"{one.label}{marked}",
-            "unique_id": f"{one.uuid}_{one.number}",
+            "name": f"{facts.label}{marked}",
+            "unique_id": f"{facts.uuid}_{facts.number}",
             "state_topic": node,
-            "value_template": f"{{{{ value_json.{self._field(one)} }}}}",
+            "value_template": f"{{{{ value_json.{self._field(facts)} }}}}",
             "availability": [{"topic": self._status}, {"topic": f"{node}/state", "value_template": RUNS}],
             "availability_mode": "all",
             "state_class": "measurement",
@@ -265,7 +268,7 @@ class MqttSink(ThreadedSink):
             **({"unit_of_measurement": sign} if sign else {}),
             **({"device_class": DEVICE_CLASSES[sign]} if sign in DEVICE_CLASSES else {}),
         }
-        return self._publish(f"{DISCOVERY}/sensor/{one.uuid}/{one.number}/config", words, qos=1, retain=True)
+        return self._publish(f"{DISCOVERY}/sensor/{facts.uuid}/{facts.number}/config", words, qos=1, retain=True)
 
     def _field(self, facts: ChannelFacts) -> str:
         """Name of a channel in the node's JSON; a slug, for a template of Home Assistant is a program."""

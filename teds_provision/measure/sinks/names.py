@@ -70,22 +70,22 @@ class Topics:
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
         """Facts of channels; a node that the station does not know gives way to those that it does."""
         strangers = len(self._strangers)
-        for one in facts:
-            if one.unverified:
-                self._name_unverified(one.uuid, slug(one.node))
+        for channel_facts in facts:
+            if channel_facts.unverified:
+                self._name_unverified(channel_facts.uuid, slug(channel_facts.node))
             else:
-                self._unverified.pop(one.uuid, None)
-                if one.uuid not in self._known:
-                    self._strangers[one.uuid] = slug(one.node)
-            if one.chosen is not None:
+                self._unverified.pop(channel_facts.uuid, None)
+                if channel_facts.uuid not in self._known:
+                    self._strangers[channel_facts.uuid] = slug(channel_facts.node)
+            if channel_facts.chosen is not None:
                 # Names that somebody chose while the node was not measured; nobody else's change by it
-                self._chosen = {key: name for key, name in self._chosen.items() if key[0] != one.uuid}
-                self._chosen |= {(one.uuid, number): name.strip("/") for number, name in one.chosen}
+                self._chosen = {key: name for key, name in self._chosen.items() if key[0] != channel_facts.uuid}
+                self._chosen |= {(channel_facts.uuid, number): name.strip("/") for number, name in channel_facts.chosen}
                 self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
-                self._made.pop(one.uuid, None)
-            channels = self._channels.setdefault(one.uuid, {})
-            channels.update({one.number: one.name, **dict(one.siblings)})
-            self._made.pop(one.uuid, None)
+                self._made.pop(channel_facts.uuid, None)
+            channels = self._channels.setdefault(channel_facts.uuid, {})
+            channels.update({channel_facts.number: channel_facts.name, **dict(channel_facts.siblings)})
+            self._made.pop(channel_facts.uuid, None)
         if len(self._strangers) != strangers:
             self._name_nodes()
 
@@ -95,7 +95,9 @@ class Topics:
         if self._unverified.get(uuid, "").startswith(own):
             return
         taken = {other for key, other in self._unverified.items() if key != uuid}
-        self._unverified[uuid] = next(one for one in (own, f"{own}_{uuid[:8]}", f"{own}_{uuid}") if one not in taken)
+        self._unverified[uuid] = next(
+            candidate for candidate in (own, f"{own}_{uuid[:8]}", f"{own}_{uuid}") if candidate not in taken
+        )
 
     def _name_nodes(self) -> None:
         taken = {name for (_, channel), name in self._chosen.items() if not channel} | _NOT_NODES
@@ -118,9 +120,9 @@ class Topics:
         that name, and a third node that is called so must not get it in the next one.
         """
         digits = name.rpartition("_")[2]
-        if len(digits) not in (8, 20) or not all(one in "0123456789abcdef" for one in digits):
+        if len(digits) not in (8, 20) or not all(digit in "0123456789abcdef" for digit in digits):
             return name
-        another = any(one.startswith(digits) for one in chain(self._known, self._strangers) if one != uuid)
+        another = any(other.startswith(digits) for other in chain(self._known, self._strangers) if other != uuid)
         return f"{name}_{uuid[:8]}" if another else name
 
     def node(self, uuid: str) -> str:
@@ -167,7 +169,8 @@ class Topics:
         name = name.strip("/")
         if not channel:
             other = next(
-                (one for one in {**self._known, **self._strangers} if one != uuid and self.node(one) == name), ""
+                (other for other in {**self._known, **self._strangers} if other != uuid and self.node(other) == name),
+                "",
             )
             if other or name in _NOT_NODES or name.partition("/")[0] == UNVERIFIED:
                 raise _taken(name, f"node {other}" if other else "something else")

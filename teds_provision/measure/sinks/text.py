@@ -91,7 +91,7 @@ class TextSink(FileSink):
 
     def _header(self) -> None:
         known = [self.facts[key] for key in sorted(self.facts)]
-        self._columns = {one.key: place for place, one in enumerate(known)}
+        self._columns = {facts.key: place for place, facts in enumerate(known)}
         self._templates = {}
         heads = heads_of(known)
         columns = ["time", "uuid", "index", "clock_error", "note", *heads, *(f"{name} raw" for name in names_of(known))]
@@ -106,8 +106,8 @@ class TextSink(FileSink):
         self._line(f"# started: {iso(station.started)}; part {len(self.files)}")
         if station.test_pattern:
             self._line("# TEST PATTERN: no line of this file is a measurement")
-        for one in known:
-            self._line("# channel: " + json.dumps(facts_as_json(one)))
+        for facts in known:
+            self._line("# channel: " + json.dumps(facts_as_json(facts)))
         self._line(self._comma.join(map(self._cell, columns)))
 
     def _cell(self, text: str) -> str:
@@ -171,9 +171,9 @@ class TextSink(FileSink):
 
 def note_of(facts: Sequence[ChannelFacts]) -> str:
     """What stands beside values that nobody vouches for, "" for others."""
-    if any(one.unverified for one in facts):
+    if any(channel_facts.unverified for channel_facts in facts):
         return "unverified datasheet"
-    return "unsigned datasheet" if any(one.unsigned for one in facts) else ""
+    return "unsigned datasheet" if any(channel_facts.unsigned for channel_facts in facts) else ""
 
 
 def counted(report: NodeReport) -> str:
@@ -187,22 +187,25 @@ def counted(report: NodeReport) -> str:
 def _raw_values(block: Block) -> list[list[Any]]:
     rows: list[list[Any]] = block.raw.tolist()
     if block.raw.dtype.kind == "O":  # beyond 64 bits, or octet strings
-        return [[one.hex() if isinstance(one, bytes) else one for one in row] for row in rows]
+        return [[cell.hex() if isinstance(cell, bytes) else cell for cell in row] for row in rows]
     return rows
 
 
 def names_of(known: Sequence[ChannelFacts]) -> list[str]:
     """``NODE/CHANNEL`` of each channel; those of one name get their UUID and number behind it."""
-    names = [f"{one.node or one.uuid}/{one.label}" for one in known]
+    names = [f"{facts.node or facts.uuid}/{facts.label}" for facts in known]
     count = Counter(names)
     return [
-        name if count[name] == 1 else f"{name} {one.uuid}:{one.number}" for name, one in zip(names, known, strict=True)
+        name if count[name] == 1 else f"{name} {facts.uuid}:{facts.number}"
+        for name, facts in zip(names, known, strict=True)
     ]
 
 
 def heads_of(known: Sequence[ChannelFacts]) -> list[str]:
     """Columns of values: the name of each channel, and its unit where it has one."""
-    return [f"{name} [{one.unit}]" if one.unit else name for name, one in zip(names_of(known), known, strict=True)]
+    return [
+        f"{name} [{facts.unit}]" if facts.unit else name for name, facts in zip(names_of(known), known, strict=True)
+    ]
 
 
 # JSON lines: the first says who measures what, then the events of ``measure --json``, one line each.
@@ -227,9 +230,9 @@ class JsonLinesSink(FileSink):
 
     def _channels(self, item: Item) -> None:
         if isinstance(item, tuple):
-            for one in item:
-                self.facts[one.key] = one
-                self._add(as_line({"event": "channel", **facts_as_json(one)}))
+            for facts in item:
+                self.facts[facts.key] = facts
+                self._add(as_line({"event": "channel", **facts_as_json(facts)}))
 
     def _process_item(self, item: Item) -> None:
         if isinstance(item, Block):

@@ -118,7 +118,7 @@ class Compound:
 
 def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
     """The messages that the channels of one stream of one node make together."""
-    sensors = {one.number: one for one in facts if one.kind == "sensor"}
+    sensors = {channel_facts.number: channel_facts for channel_facts in facts if channel_facts.kind == "sensor"}
     by_unit = _vectors(sensors)
     found = [_magnetic(axes) for axes in by_unit.get(_FIELD, [])]
     found += _imus(by_unit.get(_ACCELERATION, []), by_unit.get(_RATE, []))
@@ -127,19 +127,19 @@ def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
         Compound("geometry_msgs/WrenchStamped", "wrench", (*_paths("wrench.force", f), *_paths("wrench.torque", t)))
         for f, t in pairs
     ]
-    return [*_told_apart(found), *(_range(one) for one in sensors.values() if is_range(one))]
+    return [*_told_apart(found), *(_range(facts) for facts in sensors.values() if is_range(facts))]
 
 
 def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[ChannelFacts]]]:
     """Axes of each whole vector whose axes are of one unit, by that unit."""
     groups = {
-        one.vector: [sensors[n] for n in one.vector]
-        for one in sensors.values()
-        if len(one.vector) == len(AXES) and all(number in sensors for number in one.vector)
+        facts.vector: [sensors[n] for n in facts.vector]
+        for facts in sensors.values()
+        if len(facts.vector) == len(AXES) and all(number in sensors for number in facts.vector)
     }
     by_unit: dict[object, list[list[ChannelFacts]]] = {}
     for axes in groups.values():
-        if len({one.units for one in axes}) == 1:
+        if len({facts.units for facts in axes}) == 1:
             by_unit.setdefault(axes[0].units, []).append(axes)
     return by_unit
 
@@ -147,18 +147,18 @@ def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[Chan
 def is_range(facts: ChannelFacts) -> bool:
     """Whether a channel is a range finder: by its unit and what the profile or its name calls it."""
     words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
-    return facts.kind == "sensor" and facts.units == _LENGTH and any(one in words for one in _RANGE_WORDS)
+    return facts.kind == "sensor" and facts.units == _LENGTH and any(word in words for word in _RANGE_WORDS)
 
 
 def _paths(field_name: str, axes: list[ChannelFacts]) -> tuple[tuple[str, int], ...]:
-    return tuple((f"{field_name}.{axis}", one.number) for axis, one in zip(AXES, axes, strict=True))
+    return tuple((f"{field_name}.{axis}", facts.number) for axis, facts in zip(AXES, axes, strict=True))
 
 
 def _covariance(axes: list[ChannelFacts]) -> list[float]:
     """Row by row; only the diagonal is known."""
     found = [0.0] * 9
-    for k, one in enumerate(axes):
-        found[4 * k] = variance_of(one)
+    for k, facts in enumerate(axes):
+        found[4 * k] = variance_of(facts)
     return found
 
 
@@ -180,21 +180,23 @@ def _imus(accelerations: list[list[ChannelFacts]], rates: list[list[ChannelFacts
     return found
 
 
-def _range(one: ChannelFacts) -> Compound:
+def _range(facts: ChannelFacts) -> Compound:
     """The angle of its cone is not in a datasheet: 0."""
     fixed: dict[str, FieldValue] = {
         "radiation_type": _INFRARED,
-        "min_range": 0.0 if one.low is None else one.low,
-        "max_range": math.inf if one.high is None else one.high,
-        "variance": variance_of(one),
+        "min_range": 0.0 if facts.low is None else facts.low,
+        "max_range": math.inf if facts.high is None else facts.high,
+        "variance": variance_of(facts),
     }
-    return Compound("sensor_msgs/Range", "", (("range", one.number),), fixed)
+    return Compound("sensor_msgs/Range", "", (("range", facts.number),), fixed)
 
 
 def _told_apart(found: list[Compound]) -> list[Compound]:
     """Two of one kind get the number of their first channel behind the name."""
-    names = [one.name for one in found]
+    names = [compound.name for compound in found]
     return [
-        one if names.count(one.name) == 1 else Compound(one.type, f"{one.name}_{one.parts[0][1]}", one.parts, one.fixed)
-        for one in found
+        compound
+        if names.count(compound.name) == 1
+        else Compound(compound.type, f"{compound.name}_{compound.parts[0][1]}", compound.parts, compound.fixed)
+        for compound in found
     ]

@@ -96,7 +96,7 @@ class NodeDirectory:
         image = self._station.nodes.datasheet(bytes.fromhex(uuid))
         shown = shown_units(self._station, bytes.fromhex(uuid))
         sheet = Sheet.from_image(image).shown_in(shown) if image is not None else None
-        channels = [channel_facts(one) for one in sheet.channels] if sheet is not None else []
+        channels = [channel_facts(channel) for channel in sheet.channels] if sheet is not None else []
         with self._lock:
             self.changes += 1
             self._channels[uuid] = digest, channels
@@ -111,7 +111,7 @@ class NodeDirectory:
                 self._channels.pop(uuid, None)
             else:
                 known = sheet.shown_in(shown_units(self._station, bytes.fromhex(uuid)))
-                self._channels[uuid] = _READ_NOW, [channel_facts(one) for one in known.channels]
+                self._channels[uuid] = _READ_NOW, [channel_facts(channel) for channel in known.channels]
                 self._own_names[uuid] = sheet.meta.name
 
     # -- what links and measurements say -----------------------------------------------------------------------------
@@ -125,7 +125,11 @@ class NodeDirectory:
             for name, value in facts.items():
                 setattr(seen, name, value)
             if state == "left":
-                gone = [other for other, one in self._seen.items() if not one.present and other not in self._rows]
+                gone = [
+                    other
+                    for other, node_presence in self._seen.items()
+                    if not node_presence.present and other not in self._rows
+                ]
                 for stranger in gone[:-MOST_GONE]:
                     for kept in (self._seen, self._channels, self._own_names, self._texts):
                         kept.pop(stranger, None)
@@ -189,7 +193,7 @@ class NodeDirectory:
 
     def channel_names(self, uuid: str) -> list[tuple[int, str]]:
         """Number and name of every channel."""
-        return [(one["number"], one["name"]) for one in self._sheet(uuid)]
+        return [(channel["number"], channel["name"]) for channel in self._sheet(uuid)]
 
     def known(self, uuid: str) -> bool:
         """Whether there is anything to show of a node."""
@@ -218,7 +222,7 @@ class NodeDirectory:
             return known[1]
         node = for_reader(self.node(uuid)) if reader else self.node(uuid)
         text = json.dumps(node, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-        if all(one["last"] is None and one["actuator"] is None for one in node["channels"]):  # else it ages
+        if all(channel["last"] is None and channel["actuator"] is None for channel in node["channels"]):  # else it ages
             with self._lock:
                 self._texts.setdefault(uuid, {})[reader] = key, text
         return text
@@ -267,7 +271,7 @@ class NodeDirectory:
             out["name"] = out["name"] or called or None
         out["virtual"] = self.virtual(uuid)
         out["mode"] = "measuring" if seen.measurement else "idle" if seen.present else None
-        out["channels"] = [{**one, **self._now(uuid, one["number"])} for one in channels]
+        out["channels"] = [{**channel, **self._now(uuid, channel["number"])} for channel in channels]
         return out
 
     def _verdicts(self, uuid: str, seen: NodePresence) -> dict[str, Any]:
@@ -302,28 +306,28 @@ def for_reader(node: dict[str, Any]) -> dict[str, Any]:
     return node | {name: for_readers(node[name]) for name in ("problem", "measuring")}
 
 
-def channel_facts(one: Channel) -> dict[str, Any]:
+def channel_facts(channel: Channel) -> dict[str, Any]:
     """What the datasheet says of a channel: limits and uncertainty in its SI unit; ``rate`` in Hz.
 
     ``shown`` is the unit for people: its number is the SI value × ``factor`` + ``offset``.
     """
-    unit = one.shown
+    unit = channel.shown
     zero = unit.from_si(0.0)
     now = datetime.now(UTC)
     return {
-        "number": one.number,
-        "name": one.name,
-        "kind": one.kind.word if one.kind is not None else None,
-        "unit": one.si_unit,
+        "number": channel.number,
+        "name": channel.name,
+        "kind": channel.kind.word if channel.kind is not None else None,
+        "unit": channel.si_unit,
         "shown": {"unit": unit.text, "factor": _finite(unit.from_si(1.0) - zero), "offset": _finite(zero)},
-        "low": _finite(one.low),
-        "high": _finite(one.high),
-        "uncertainty": _finite(one.stated_uncertainty),
-        "rate": _finite(1 / one.period) if one.period > 0 else None,
-        "calibrated": one.calibrated_at.date().isoformat() if one.calibrated_at else None,
-        "due": one.due.date().isoformat() if one.due else None,
-        "overdue": one.overdue(now),
-        "problem": one.value_problem or None,
+        "low": _finite(channel.low),
+        "high": _finite(channel.high),
+        "uncertainty": _finite(channel.stated_uncertainty),
+        "rate": _finite(1 / channel.period) if channel.period > 0 else None,
+        "calibrated": channel.calibrated_at.date().isoformat() if channel.calibrated_at else None,
+        "due": channel.due.date().isoformat() if channel.due else None,
+        "overdue": channel.overdue(now),
+        "problem": channel.value_problem or None,
     }
 
 

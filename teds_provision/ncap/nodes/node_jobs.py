@@ -203,8 +203,8 @@ class NodeJobs:
             return False
         uuid, now = node.uuid.hex(), time.monotonic()
         with self._guard:
-            self._waiting = [one for one in self._waiting if one.until > now]
-            found = next((one for one in self._waiting if one.uuid in (uuid, None)), None)
+            self._waiting = [job for job in self._waiting if job.until > now]
+            found = next((job for job in self._waiting if job.uuid in (uuid, None)), None)
             if found is not None:
                 self._waiting.remove(found)
         if found is None:

@@ -283,7 +283,7 @@ class _RunReporter:
 
     def _step(self, name: str, result: str, detail: str) -> None:
         said = {"name": name, "result": result, "detail": detail}
-        self._run.steps = [one for one in self._run.steps if one["name"] != name] + [said]
+        self._run.steps = [step for step in self._run.steps if step["name"] != name] + [said]
         self._live.event("provision", uuid=self._run.uuid, state="running", step=name, result=result, detail=detail)
 
 

@@ -140,8 +140,8 @@ class Sheets:
                     self._station, node, blocks, SilentReporter(), accept_calibration=accept, retype=retype
                 )
             steps = [
-                {"name": one.name, "result": one.result, "seconds": one.seconds, "detail": one.detail}
-                for one in done.steps
+                {"name": step.name, "result": step.result, "seconds": step.seconds, "detail": step.detail}
+                for step in done.steps
             ]
             return {**_plan_json(done.plan), "steps": steps, "verdict": done.verified.verdict}
 
@@ -162,14 +162,14 @@ def parsed(content: str) -> dict[BlockId, bytes]:
 def _plan_json(plan: SheetPlan) -> dict[str, Any]:
     changes = [
         {
-            "channel": one.channel,
-            "access_code": one.access_code,
-            "field": one.field,
-            "before": one.before,
-            "after": one.after,
-            "text": one.text,
+            "channel": change.channel,
+            "access_code": change.access_code,
+            "field": change.field,
+            "before": change.before,
+            "after": change.after,
+            "text": change.text,
         }
-        for one in plan.changes
+        for change in plan.changes
     ]
     return {"changes": changes, "guard": [_warning(text) for text in plan.warnings]}
 

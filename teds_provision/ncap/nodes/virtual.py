@@ -100,23 +100,25 @@ class Virtuals:
     def all(self) -> list[dict[str, Any]]:
         """Every one."""
         with self._guard:
-            return [one.as_json() for one in self._all.values()]
+            return [virtual.as_json() for virtual in self._all.values()]
 
     def __contains__(self, uuid: object) -> bool:
         return uuid in self._all
 
     def start(self) -> None:
         """Start those that were made and do not run yet."""
-        for one in list(self._all.values()):
-            if not one.kept:
-                one.kept = True
-                threading.Thread(target=self._run, args=(one,), name=f"virtual {one.uuid[:8]}", daemon=True).start()
+        for virtual in list(self._all.values()):
+            if not virtual.kept:
+                virtual.kept = True
+                threading.Thread(
+                    target=self._run, args=(virtual,), name=f"virtual {virtual.uuid[:8]}", daemon=True
+                ).start()
 
     def stop(self) -> None:
         """End them all."""
         self._stop.set()
-        for one in list(self._all.values()):
-            _end(one.process)
+        for virtual in list(self._all.values()):
+            _end(virtual.process)
 
     # -- making and removing -----------------------------------------------------------------------------------------
 
@@ -225,11 +227,11 @@ class Virtuals:
             self._all.pop(uuid, None)
         return one
 
-    def end(self, one: Virtual) -> None:
+    def end(self, virtual: Virtual) -> None:
         """End the process of one that was forgotten, and its key with it."""
-        _end(one.process)
-        shutil.rmtree(one.folder, ignore_errors=True)
-        self._live.event("virtual", state="removed", uuid=one.uuid)
+        _end(virtual.process)
+        shutil.rmtree(virtual.folder, ignore_errors=True)
+        self._live.event("virtual", state="removed", uuid=virtual.uuid)
 
     def _virtual_of(self, uuid: str) -> Virtual:
         with self._guard:
@@ -240,16 +242,16 @@ class Virtuals:
 
     # -- the processes -----------------------------------------------------------------------------------------------
 
-    def _run(self, one: Virtual) -> None:
+    def _run(self, virtual: Virtual) -> None:
         """Run it, and again when it ended, until it is removed or the daemon ends."""
         pause = _AGAIN
-        log = one.folder / _LOG
-        while not self._stop.is_set() and one.uuid in self._all:
-            words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(one.folder)]
-            words += ["--can", self.bus, "--source", one.source]
+        log = virtual.folder / _LOG
+        while not self._stop.is_set() and virtual.uuid in self._all:
+            words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(virtual.folder)]
+            words += ["--can", self.bus, "--source", virtual.source]
             daemon = os.getpid()
             with log.open("wb") as errors:
-                process = one.process = subprocess.Popen(
+                process = virtual.process = subprocess.Popen(
                     words,
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
@@ -257,31 +259,31 @@ class Virtuals:
                     process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
                     preexec_fn=lambda: _die_with(daemon),  # noqa: PLW1509, B023 - two calls of the system, nothing else
                 )
-            if self._stop.is_set() or one.uuid not in self._all:
+            if self._stop.is_set() or virtual.uuid not in self._all:
                 _end(process)
-            if self._until_its_end(one, process):
+            if self._until_its_end(virtual, process):
                 pause = _AGAIN
-            if self._stop.is_set() or one.uuid not in self._all:
+            if self._stop.is_set() or virtual.uuid not in self._all:
                 return
             last = log.read_text(errors="replace").strip().splitlines()
-            self._publish_state(one, "ended", last[-1] if last else "")
+            self._publish_state(virtual, "ended", last[-1] if last else "")
             self._stop.wait(pause)
             pause = min(2 * pause, _LONGEST)
 
-    def _until_its_end(self, one: Virtual, process: subprocess.Popen[bytes]) -> bool:
+    def _until_its_end(self, virtual: Virtual, process: subprocess.Popen[bytes]) -> bool:
         """Read its lines until it ends; whether it ever was ready."""
         assert process.stdout is not None
         ready = False
         for line in process.stdout:
             if b'"ready"' in line:
                 ready = True
-                self._publish_state(one, "running")
+                self._publish_state(virtual, "running")
         process.wait()
         return ready
 
-    def _publish_state(self, one: Virtual, state: str, why: str = "") -> None:
-        one.state, one.why = state, why
-        self._live.event("virtual", uuid=one.uuid, state=state, why=why)
+    def _publish_state(self, virtual: Virtual, state: str, why: str = "") -> None:
+        virtual.state, virtual.why = state, why
+        self._live.event("virtual", uuid=virtual.uuid, state=state, why=why)
 
 
 def ideal_calibration(sheet: Sheet) -> str:

@@ -85,15 +85,15 @@ async def body_of(request: Request, shape: type[Shape]) -> Shape:
         found = schema.read(shape, await request.body())
     except schema.BadRequestError as error:
         raise RequestRefusedError(422, "bad-request", error.message, error.hint) from error
-    request.scope[ASKED] = {name: one for name, one in vars(found).items() if _is_short(one)}
+    request.scope[ASKED] = {name: value for name, value in vars(found).items() if _is_short(value)}
     return found
 
 
-def _is_short(one: object) -> bool:
+def _is_short(value: object) -> bool:
     """Whether a member is named in the log: no datasheet, no calibration."""
-    if isinstance(one, list | tuple):
-        return len(one) <= _MOST_IN_LOG and all(map(_is_short, one))
-    return isinstance(one, bool | int | float) or (isinstance(one, str) and len(one) <= _LONGEST_IN_LOG)
+    if isinstance(value, list | tuple):
+        return len(value) <= _MOST_IN_LOG and all(map(_is_short, value))
+    return isinstance(value, bool | int | float) or (isinstance(value, str) and len(value) <= _LONGEST_IN_LOG)
 
 
 async def reading(work: Callable[_Words, _Found], *words: _Words.args, **more: _Words.kwargs) -> _Found:

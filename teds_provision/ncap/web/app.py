@@ -76,7 +76,7 @@ def _noted(daemon: Daemon) -> Callable[[Request, Exception], Awaitable[Response]
 
     def note(request: Request, error: TedsProvisionError) -> None:
         members = request.scope.get(ASKED, {})
-        asked = {name: one for name, one in members.items() if name not in _OF_AN_ENTRY}
+        asked = {name: value for name, value in members.items() if name not in _OF_AN_ENTRY}
         node = str(request.path_params.get("uuid") or members.get("uuid", ""))
         uuid = bytes.fromhex(node) if _UUID.fullmatch(node) else None
         facts = {"method": request.method, "path": request.url.path[:_LONGEST_PATH], "why": error.message}
@@ -134,7 +134,7 @@ class LiveSlots:
         if len(own) >= self._of_one:
             return False
         if sum(map(len, self._taken.values())) >= self._most:
-            greedy = max(self._taken, key=lambda one: len(self._taken[one]))
+            greedy = max(self._taken, key=lambda token: len(self._taken[token]))
             if len(self._taken[greedy]) <= len(own) + 1:
                 return False
             out = self._taken[greedy][-1]

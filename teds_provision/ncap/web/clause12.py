@@ -47,7 +47,7 @@ class Clause12:
 
     async def _answer(self, request: Request) -> Response:
         path = request.path_params["path"].removesuffix(".htm")
-        name = next((one for one in self._resources if one.lower() == path.lower()), None)
+        name = next((path_known for path_known in self._resources if path_known.lower() == path.lower()), None)
         if name is None:
             raise NotFoundError(
                 "This clause 12 path is not supported.", hint=f"Supported: {', '.join(self._resources)}."
@@ -96,9 +96,9 @@ class Clause12:
         """One TEDS, its fields decoded."""
         uuid, channel, code = self._teds(given)
         found = self._daemon.sheets.as_json(uuid)
-        for one in found["teds"]:
-            if (one.get("channel") or 0, one.get("access_code")) == (channel, code):
-                fields = {field.get("name", ""): field.get("text", "") for field in one["fields"]}
+        for block in found["teds"]:
+            if (block.get("channel") or 0, block.get("access_code")) == (channel, code):
+                fields = {field.get("name", ""): field.get("text", "") for field in block["fields"]}
                 ids = {"timId": self._number(uuid), "channelId": channel, "tedsType": code}
                 return {**ids, "teds": json.dumps(fields, ensure_ascii=False)}
         raise NotFoundError(f"Node {uuid} has no TEDS {code} of channel {channel}.")
@@ -144,7 +144,7 @@ def _shown(name: str, fields: Fields, given: dict[str, str]) -> Response:
     if form == "json":
         return JSONResponse(fields)
     if form == "text":
-        return Response("".join(f"{printable(str(one))}\n" for one in fields.values()), media_type="text/plain")
+        return Response("".join(f"{printable(str(value))}\n" for value in fields.values()), media_type="text/plain")
     root = ElementTree.Element(f"{name}HTTPResponse")
     for key, value in fields.items():
         ElementTree.SubElement(root, key).text = printable(str(value))

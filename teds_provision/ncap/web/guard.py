@@ -104,9 +104,14 @@ class ServedNames:
 
 def front(hosts: tuple[str, ...], port: int, *, tls: bool) -> ServedNames:
     """The names of a server: loopback's always, and those that were allowed."""
-    names = {"127.0.0.1", "localhost", "[::1]", *(f"[{one}]" if one.count(":") > 1 else one.lower() for one in hosts)}
+    names = {
+        "127.0.0.1",
+        "localhost",
+        "[::1]",
+        *(f"[{host}]" if host.count(":") > 1 else host.lower() for host in hosts),
+    }
     usual = 443 if tls else 80
-    return ServedNames(frozenset({f"{one}:{port}" for one in names} | (names if port == usual else set())), port, tls)
+    return ServedNames(frozenset({f"{name}:{port}" for name in names} | (names if port == usual else set())), port, tls)
 
 
 @dataclass

@@ -99,7 +99,7 @@ def _registry(plant: dict[str, Any]) -> Iterator[Line]:
     if plant["age"] is not None:
         yield "teds_registry_age_seconds", {}, plant["age"]
     yield "teds_registry_unsent", {}, plant["unsent"]
-    yield "teds_registry_alarms", {}, sum(not one["seen"] for one in plant["alarms"])
+    yield "teds_registry_alarms", {}, sum(not alarm["seen"] for alarm in plant["alarms"])
 
 
 def _escaped(word: str) -> str:

@@ -158,19 +158,19 @@ class Resources:
         verdict = log.check(after)
         entries = [
             {
-                "seq": one.seq,
-                "time": datetime.fromisoformat(one.at).timestamp(),
-                "who": one.who,
-                "actor": one.actor,
-                "act": one.act,
-                "uuid": one.uuid.hex() if one.uuid is not None else None,
-                "subject": one.uuid.hex() if one.uuid is not None else "",
-                "outcome": one.outcome,
-                "detail": _sentence(one.outcome, one.detail),
-                "facts": one.detail,
-                "failed": is_failure(one.outcome),
+                "seq": entry.seq,
+                "time": datetime.fromisoformat(entry.at).timestamp(),
+                "who": entry.who,
+                "actor": entry.actor,
+                "act": entry.act,
+                "uuid": entry.uuid.hex() if entry.uuid is not None else None,
+                "subject": entry.uuid.hex() if entry.uuid is not None else "",
+                "outcome": entry.outcome,
+                "detail": _sentence(entry.outcome, entry.detail),
+                "facts": entry.detail,
+                "failed": is_failure(entry.outcome),
             }
-            for one in log.chosen(choice, after)
+            for entry in log.chosen(choice, after)
         ]
         return {"entries": entries, "intact": verdict.intact, "why": verdict.why}
 

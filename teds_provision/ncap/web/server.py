@@ -48,11 +48,15 @@ class HttpConnection(H11Protocol):
 
     def _make_room(self) -> None:
         """End the oldest connection that works for nobody."""
-        mine = [one for one in self.connections if isinstance(one, HttpConnection) and one is not self]
-        strangers = [one for one in mine if not one.is_known]
-        useless = strangers or [one for one in mine if one.is_silent]
+        mine = [
+            connection
+            for connection in self.connections
+            if isinstance(connection, HttpConnection) and connection is not self
+        ]
+        strangers = [http_connection for http_connection in mine if not http_connection.is_known]
+        useless = strangers or [http_connection for http_connection in mine if http_connection.is_silent]
         if useless:
-            min(useless, key=lambda one: one._began).end()
+            min(useless, key=lambda http_connection: http_connection._began).end()
         else:
             self.limit_concurrency = MOST  # all of them work for somebody: 503
 

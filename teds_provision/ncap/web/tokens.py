@@ -65,7 +65,7 @@ class Tokens:
         if not name.strip() or not name.isprintable() or len(name) > _LONGEST_NAME:
             raise UsageError(f"{name!r} is not a valid token name.", hint="Use up to 64 printable characters.")
         with self._changing() as tokens:
-            if any(one.name == name and one.kind == "script" for one in tokens):
+            if any(token.name == name and token.kind == "script" for token in tokens):
                 raise UsageError(f"Token {name!r} already exists.", hint=f"Remove it: ncap token remove {name}")
             token = secrets.token_urlsafe(32)
             tokens.append(Token(name, "script", digest_of(token), read_only, time.time()))
@@ -74,10 +74,10 @@ class Tokens:
     def remove(self, name: str) -> int:
         """Take tokens of this name away, at once also for who uses one now; raises NotFoundError."""
         with self._changing() as tokens:
-            kept = [one for one in tokens if one.name != name]
+            kept = [token for token in tokens if token.name != name]
             gone = len(tokens) - len(kept)
             if not gone:
-                known = ", ".join(dict.fromkeys(one.name for one in tokens)) or "none"
+                known = ", ".join(dict.fromkeys(token.name for token in tokens)) or "none"
                 raise NotFoundError(f"No token is named {name!r}.", hint=f"Known tokens: {known}.")
             tokens[:] = kept
         return gone
@@ -85,7 +85,7 @@ class Tokens:
     def all(self) -> list[Token]:
         """Every token that is good now."""
         now = time.time()
-        return [one for one in self._read() if not one.until or one.until > now]
+        return [token for token in self._read() if not token.until or token.until > now]
 
     # -- for the daemon ----------------------------------------------------------------------------------------------
 
@@ -107,7 +107,7 @@ class Tokens:
         cookie = secrets.token_urlsafe(32)
         now = time.time()
         with self._changing() as tokens:
-            browsers = [one for one in tokens if one.kind == "browser"]
+            browsers = [token for token in tokens if token.kind == "browser"]
             for old in browsers[: max(0, len(browsers) - _MOST_BROWSERS + 1)]:
                 tokens.remove(old)
             tokens.append(Token("browser", "browser", digest_of(cookie), read_only, now, now + BROWSER_SECONDS))
@@ -117,15 +117,15 @@ class Tokens:
         """The token that this is, None for none; compares in constant time."""
         digest, now = digest_of(token), time.time()
         found = None
-        for one in self._read():
-            if hmac.compare_digest(one.digest, digest) and (not one.until or one.until > now):
-                found = one
+        for known_token in self._read():
+            if hmac.compare_digest(known_token.digest, digest) and (not known_token.until or known_token.until > now):
+                found = known_token
         return found
 
     def is_good(self, digest: str) -> bool:
         """Whether the token of this digest is good still: neither removed nor over."""
         now = time.time()
-        return any(one.digest == digest and (not one.until or one.until > now) for one in self._read())
+        return any(token.digest == digest and (not token.until or token.until > now) for token in self._read())
 
     # -- the file ----------------------------------------------------------------------------------------------------
 
@@ -151,9 +151,9 @@ class Tokens:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             now = time.time()
-            tokens = [one for one in self._read() if not one.until or one.until > now]
+            tokens = [token for token in self._read() if not token.until or token.until > now]
             yield tokens
-            text = json.dumps({"format": "ncap-tokens/1", "tokens": [asdict(one) for one in tokens]}, indent=1)
+            text = json.dumps({"format": "ncap-tokens/1", "tokens": [asdict(token) for token in tokens]}, indent=1)
             write_whole(self._home / FILE, text.encode())
         finally:
             os.close(descriptor)

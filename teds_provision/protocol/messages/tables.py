@@ -322,7 +322,7 @@ def describe_command(command: Command) -> str:
     """A command in words: name, class and function, payload octets; "Prove (128.8), 31 octets"."""
     number = f"{command.command_class}.{command.function}"
     kind = Function if command.command_class == SECURITY else TedsFunction
-    if command.command_class in (COMMON, SECURITY) and command.function in {int(each) for each in kind}:
+    if command.command_class in (COMMON, SECURITY) and command.function in {int(code) for code in kind}:
         number = f"{kind(command.function).name.replace('_', ' ').capitalize()} ({number})"
     elif (spec := COMMANDS.get((command.command_class, command.function))) is not None:
         number = f"{spec.name} ({number})"
@@ -340,7 +340,11 @@ def describe_request(command: Command) -> str:
     """As :func:`describe_command`, and which TEDS a command is about: "Read (1.2), 5 octets: TEDS 5 of channel 1 …"."""
     text = describe_command(command)
     payload = command.payload
-    if command.command_class != COMMON or not payload or command.function not in {int(each) for each in TedsFunction}:
+    if (
+        command.command_class != COMMON
+        or not payload
+        or command.function not in {int(function) for function in TedsFunction}
+    ):
         return text
     where = f"{text}: TEDS {payload[0]} of channel {command.channel}"
     if command.function in (TedsFunction.READ, TedsFunction.WRITE) and len(payload) >= 5:
@@ -351,6 +355,6 @@ def describe_request(command: Command) -> str:
 def describe_answer(command: Command, reply: Reply) -> str:
     """A reply in words, with what it answers: "reply to Prove (128.8): success, 64 octets"."""
     text = f"reply to {describe_command(command).rpartition(',')[0]}: {describe_reply(reply)}"
-    if reply.reason is not None and reply.reason in {int(each) for each in Reason}:
+    if reply.reason is not None and reply.reason in {int(reason) for reason in Reason}:
         text += f" ({Reason(reply.reason).name.lower().replace('_', ' ')})"
     return text

@@ -173,7 +173,7 @@ class OperationRole:
         asked = OperateCommand.decode(number, inner.command.payload, actuator=acting)
         digest = hashlib.sha256(self._flash().security_teds()).digest()[:DIGEST_OCTETS]
         demand(asked.digest == digest, Reason.DIGEST_MISMATCH)
-        wanted = [number] if number else [one for one in sensors if not self._hardware.fault(one)]
+        wanted = [number] if number else [number for number in sensors if not self._hardware.fault(number)]
         wanted = list(filter(self._fits, wanted))
         demand(bool(wanted), Reason.DIGEST_MISMATCH)
         demand(FIRST_LEASE <= asked.lease <= LAST_LEASE, Reason.OUT_OF_RANGE)
@@ -234,10 +234,10 @@ class OperationRole:
         channels = channel_list(inner.command.payload, MOST_SAMPLE_CHANNELS)
         self._demand_claimed(inner.session, *channels)
         facts = [self._hardware.channels[channel] for channel in channels]
-        demand(9 + sum(each.octets for each in facts) <= self._max_message - READ_OVERHEAD, Reason.TOO_LARGE)
+        demand(9 + sum(channel.octets for channel in facts) <= self._max_message - READ_OVERHEAD, Reason.TOO_LARGE)
         self._demand_sound(*channels)
         tick = self._hardware.now()
-        values = [self._value(channel, each, tick) for channel, each in zip(channels, facts, strict=True)]
+        values = [self._value(channel, hardware, tick) for channel, hardware in zip(channels, facts, strict=True)]
         flags = 0 if all(valid for _, valid in values) else NOT_VALID
         return SampleReply(tick, flags, b"".join(octets for octets, _ in values)).encode()
 

@@ -62,7 +62,7 @@ def _branch(there: dict[int, dict[str, str]], anchor: Place) -> dict[int, dict[s
         kept[n] = {hash: there[n][hash]}
         n, hash = n - 1, there[n][hash]
     above = anchor[0] + 1
-    while descended := {one: before for one, before in there.get(above, {}).items() if before in kept[above - 1]}:
+    while descended := {hash_: before for hash_, before in there.get(above, {}).items() if before in kept[above - 1]}:
         kept[above] = descended
         above += 1
     return kept

@@ -104,7 +104,7 @@ class Claim:
             if name in kept:
                 setattr(claim, name, tuple(kept[name]))
         for name in ("gave", "refused", "resets"):
-            setattr(claim, name, {tuple(one) for one in kept.get(name, ())})
+            setattr(claim, name, {tuple(item) for item in kept.get(name, ())})
         claim.undone = set(kept.get("undone", ()))
         claim.groups = {group: (member, at) for group, (member, at) in kept.get("groups", {}).items()}
         return claim

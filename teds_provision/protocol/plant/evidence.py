@@ -86,7 +86,7 @@ class BoardFacts:
 
     def to_json(self) -> dict[str, Any]:
         """Member ``facts`` of the predicate."""
-        lists = {"blocks": [list(one) for one in self.blocks], "steps": [list(one) for one in self.steps]}
+        lists = {"blocks": [list(block) for block in self.blocks], "steps": [list(step) for step in self.steps]}
         return {**vars(self), **lists, "heads": None if self.heads is None else list(self.heads)}
 
     @property
@@ -288,17 +288,17 @@ def ready(evidence: Evidence) -> CheckedEvidence:
     return CheckedEvidence(evidence, shown, "", signed, asked)
 
 
-def check_signatures(one: CheckedEvidence) -> Signatures:
+def check_signatures(checked: CheckedEvidence) -> Signatures:
     """Check the signatures alone: of many documents in a row each costs half of what it costs between other work."""
-    evidence, shown = one.evidence, one.shown
+    evidence, shown = checked.evidence, checked.shown
     envelope = _signed_by(evidence.station, pae(evidence.payload), evidence.signature)
     if shown is None:
         return Signatures(envelope, False, None, None)
     node_key = verify(shown.node_key, node_key_message(evidence.uuid, shown.node_key), shown.node_key_signature)
     made: bool | None = None
     if evidence.verdict == PASSED and shown.station_key is not None and shown.signature is not None:
-        made = verify(shown.station_key, one.datasheet, shown.signature)
-    board = verify(evidence.node, one.board, evidence.proof) if evidence.proof else None
+        made = verify(shown.station_key, checked.datasheet, shown.signature)
+    board = verify(evidence.node, checked.board, evidence.proof) if evidence.proof else None
     return Signatures(envelope, node_key, made, board)
 
 
@@ -312,10 +312,10 @@ def faults(evidence: Evidence, ca: bytes) -> list[str]:
     return faults_of(one, check_signatures(one), ca)
 
 
-def faults_of(one: CheckedEvidence, signatures: Signatures, ca: bytes) -> list[str]:
+def faults_of(checked: CheckedEvidence, signatures: Signatures, ca: bytes) -> list[str]:
     """As :func:`faults`, where the signatures were checked already."""
-    words = _wrong_words(one.evidence)
-    return [*words, *_wrong_datasheet(one, signatures, ca), *_wrong_signatures(one.evidence, signatures, ca)]
+    words = _wrong_words(checked.evidence)
+    return [*words, *_wrong_datasheet(checked, signatures, ca), *_wrong_signatures(checked.evidence, signatures, ca)]
 
 
 def _wrong_words(evidence: Evidence) -> Iterator[str]:
@@ -329,10 +329,10 @@ def _wrong_words(evidence: Evidence) -> Iterator[str]:
         yield "the board did not sign it"
 
 
-def _wrong_datasheet(one: CheckedEvidence, signatures: Signatures, ca: bytes) -> Iterator[str]:
-    evidence, facts, shown = one.evidence, one.evidence.facts, one.shown
+def _wrong_datasheet(checked: CheckedEvidence, signatures: Signatures, ca: bytes) -> Iterator[str]:
+    evidence, facts, shown = checked.evidence, checked.evidence.facts, checked.shown
     if shown is None:
-        yield f"its Security TEDS is not canonical: {one.why}"
+        yield f"its Security TEDS is not canonical: {checked.why}"
         return
     if shown.node_key != evidence.node:
         yield "the Security TEDS names another node key (field 101)"
@@ -397,8 +397,8 @@ def _facts(members: Members, raw: dict[str, Any]) -> BoardFacts:
         calibration_sha256=_sha256_or_none(members, "calibration_sha256"),
         epoch=members.u32("epoch"),
         sequence=members.u32("sequence"),
-        blocks=tuple(_block(one) for one in members.list_of("blocks")),
-        steps=tuple(_step(one) for one in _short(members.list_of("steps"))),
+        blocks=tuple(_block(block) for block in members.list_of("blocks")),
+        steps=tuple(_step(step) for step in _short(members.list_of("steps"))),
         assurance=members.text("assurance"),
         tool=members.text("tool"),
         begun=_time(members, "begun"),
@@ -413,9 +413,9 @@ def _require_plain(value: object, depth: int = _DEPTH) -> None:
         return
     if not depth or kind not in (dict, list):
         raise BadDataError("The facts hold something else than texts, whole numbers, lists and null.")
-    for one in value.values() if isinstance(value, dict) else value:  # type: ignore[attr-defined]
-        if type(one) is not str:  # the most of them, without a call
-            _require_plain(one, depth - 1)
+    for member in value.values() if isinstance(value, dict) else value:  # type: ignore[attr-defined]
+        if type(member) is not str:  # the most of them, without a call
+            _require_plain(member, depth - 1)
 
 
 def _short(steps: list[Any]) -> list[Any]:
@@ -424,19 +424,19 @@ def _short(steps: list[Any]) -> list[Any]:
     return steps
 
 
-def _block(one: object) -> tuple[int, int, str]:
+def _block(value: object) -> tuple[int, int, str]:
     # Facts hold no true or false here (_require_plain); a match statement takes three times as long.
-    if type(one) is list and len(one) == 3:
-        channel, code, digest = one
+    if type(value) is list and len(value) == 3:
+        channel, code, digest = value
         small = type(channel) is int and type(code) is int and channel <= 0xFFFF and code <= 0xFF
         if small and type(digest) is str and _DIGEST.fullmatch(digest):
             return channel, code, digest
     raise BadDataError("A block of the facts is not [channel, access code, SHA-256].")
 
 
-def _step(one: object) -> tuple[str, str, int]:
-    if type(one) is list and len(one) == 3:
-        name, result, milliseconds = one
+def _step(value: object) -> tuple[str, str, int]:
+    if type(value) is list and len(value) == 3:
+        name, result, milliseconds = value
         texts = type(name) is str and type(result) is str and name.isprintable() and result.isprintable()
         if texts and type(milliseconds) is int:
             return name, result, milliseconds

@@ -106,7 +106,11 @@ def merge_claims(
         )
     own_word = own.met or own.holds or (own.pin is not None and own.assurance != "registry")
 
-    names = [(_weight(roster, one, claim.name[1]), claim.name[0]) for one, claim in counted.items() if claim.name]
+    names = [
+        (_weight(roster, fingerprint, claim.name[1]), claim.name[0])
+        for fingerprint, claim in counted.items()
+        if claim.name
+    ]
     return MergedClaims(
         pin=pin,
         pins=pins,
@@ -120,14 +124,14 @@ def merge_claims(
             for bundle, peer, epoch, key_id, mode in claim.given_keys()
         ),
         resets=resets,
-        bans=tuple(one for one in sorted(statements, key=lambda one: (one.said.created, one.hash))
-                   if bans(roster, one, own, liftings)),
+        bans=tuple(ban for ban in sorted(statements, key=lambda statement: (statement.said.created, statement.hash))
+                   if bans(roster, ban, own, liftings)),
         name=max(names)[1] if names else None,
         groups=_groups(roster, counted),
         conflicts=conflicts,
         key_it=TWO_KEYS not in conflicts or own_word,
         left=holdings.left,
-        keeper_groups=_groups(roster, {one: counted[one] for one in keepers}),
+        keeper_groups=_groups(roster, {keeper: counted[keeper] for keeper in keepers}),
         own_groups={
             station: tuple(sorted(group for group, (member, _) in claim.groups.items() if member))
             for station, claim in counted.items()
@@ -177,7 +181,7 @@ def _holdings(roster: Roster, claims: Mapping[str, Claim], reset_to: int) -> _Ho
 
 def _holders(roster: Roster, held: Mapping[str, Key]) -> tuple[int | None, dict[str, tuple[str, ...]]]:
     """The newest epoch that a station that works with nodes says it holds, and who holds which key of it."""
-    heard = {one: key for one, key in held.items() if roster.roles_of(one) & {"line", "base", "keeper"}}
+    heard = {holder: key for holder, key in held.items() if roster.roles_of(holder) & {"line", "base", "keeper"}}
     newest = max((epoch for epoch, _ in heard.values()), default=None)
     found: dict[str, tuple[str, ...]] = {}
     for station, (epoch, key_id) in heard.items():
@@ -206,29 +210,33 @@ def _pin_conflicts(
     return {}
 
 
-def bans(roster: Roster, one: BanStatement, own: LocalState, liftings: Mapping[str, Collection[str]]) -> bool:
+def bans(roster: Roster, statement: BanStatement, own: LocalState, liftings: Mapping[str, Collection[str]]) -> bool:
     """Whether a statement bans its node here.
 
     Its signer is a keeper, or by one's own store holds or was given the node's key; a removed one's word counts from
     its own pages alone, up to ``last``. Until a keeper lifts it, its signer, or here a person.
     """
-    signer = one.said.sender
-    if roster.member(signer) is None and (one.page_of != signer or not one.counts):
+    signer = statement.said.sender
+    if roster.member(signer) is None and (statement.page_of != signer or not statement.counts):
         return False
     if "keeper" not in roster.roles_of(signer) and signer != own.station and signer not in own.holders:
         return False
-    if own.pin is not None and one.said.fingerprint is not None and not same_key(own.pin, one.said.fingerprint):
+    if (
+        own.pin is not None
+        and statement.said.fingerprint is not None
+        and not same_key(own.pin, statement.said.fingerprint)
+    ):
         return False
-    lifted = any(lifter == signer or "keeper" in roster.roles_of(lifter) for lifter in liftings.get(one.hash, ()))
-    return not lifted and one.hash not in own.lifted
+    lifted = any(lifter == signer or "keeper" in roster.roles_of(lifter) for lifter in liftings.get(statement.hash, ()))
+    return not lifted and statement.hash not in own.lifted
 
 
 def _keys(named: Collection[str]) -> list[str]:
     """The different keys among fingerprints, some of which may be their first digits alone."""
     found: list[str] = []
-    for one in sorted(named, key=lambda digits: (-len(digits), digits)):
-        if not any(same_key(one, other) for other in found):
-            found.append(one)
+    for fingerprint in sorted(named, key=lambda digits: (-len(digits), digits)):
+        if not any(same_key(fingerprint, other) for other in found):
+            found.append(fingerprint)
     return found
 
 

@@ -172,7 +172,7 @@ def open_job(octets: bytes, find_key: Callable[[str], bytes | None]) -> Job:
         fields.one_of("assurance", ASSURANCES),
         _sign(fields),
         fields.flag("evidence"),
-        tuple(_block(fields, one) for one in fields.list_of("read_only", MOST_READ_ONLY)),
+        tuple(_block(fields, block) for block in fields.list_of("read_only", MOST_READ_ONLY)),
         None if name is None else _pattern(fields),
         document.hash,
         document.signer,
@@ -193,8 +193,8 @@ def _nodes(fields: Fields) -> tuple[int | None, dict[bytes, str]]:
         return nodes.number("count", 1), {}
     boards: dict[bytes, str] = {}
     listed = nodes.list_of("list", MOST_BOARDS)
-    for one in listed:
-        board = Fields(one, "A board of the job")
+    for item in listed:
+        board = Fields(item, "A board of the job")
         boards[bytes.fromhex(board.text_of_form("uuid", "uuid"))] = board.text_of_form("sha256", "fingerprint")
     if len(boards) != len(listed) or not boards:
         raise fields.bad("nodes", "lists no board, or one twice")

@@ -97,7 +97,7 @@ class Roster:
     def by_key(self) -> dict[str, Member | RemovedMember]:
         """Everybody whom it names, by fingerprint."""
         everybody: tuple[Member | RemovedMember, ...] = (*self.members, *self.removed)
-        return {one.fingerprint: one for one in everybody}
+        return {station.fingerprint: station for station in everybody}
 
     def member(self, fingerprint: str) -> Member | None:
         """A station that belongs now."""
@@ -135,10 +135,10 @@ class Roster:
             if member.name == text:
                 return member
         digits = text.lower()
-        found = [one for key, one in self.by_key.items() if len(digits) >= 16 and key.startswith(digits)]
+        found = [item for key, item in self.by_key.items() if len(digits) >= 16 and key.startswith(digits)]
         if len(found) == 1:
             return found[0]
-        left = [one for one in self.removed if one.name == text]
+        left = [removed for removed in self.removed if removed.name == text]
         return left[-1] if left else None
 
     def unsigned(self) -> dict[str, Any]:
@@ -257,7 +257,7 @@ def _removed(value: object) -> RemovedMember:
 def _share(value: object) -> Share:
     fields = Fields(value, "A share of the roster")
     what, to = fields.members.get("what"), fields.list_of("to", MOST_MEMBERS)
-    if not all(is_form("sha256", one) for one in to):
+    if not all(is_form("sha256", receiver) for receiver in to):
         raise fields.bad("to", "is no list of fingerprints")
     forget = "forget" in fields.members and fields.flag("forget")
     kind, named = next(iter(what.items())) if isinstance(what, dict) and len(what) == 1 else ("", None)
@@ -289,11 +289,11 @@ def taking(new: Roster, own: Roster | None, registry: str) -> tuple[Taking, str]
         return "older", f"version {own.version} is here"
     if new.version == own.version:
         return ("same", "") if new.hash == own.hash else ("two rosters", f"two rosters have version {new.version}")
-    left, there = {one.fingerprint for one in new.removed}, set(new.by_key)
-    back = [one.name for one in own.removed if one.fingerprint not in left]
+    left, there = {removed.fingerprint for removed in new.removed}, set(new.by_key)
+    back = [removed.name for removed in own.removed if removed.fingerprint not in left]
     if back:
         return "refused", f"{', '.join(back)} was removed, and a removed key never comes back"
-    lost = [one.name for one in own.members if one.fingerprint not in there]
+    lost = [member.name for member in own.members if member.fingerprint not in there]
     if lost:
         return "refused", f"{', '.join(lost)} is neither a member nor removed in it"
     if new.version == own.version + 1 and new.previous != own.hash:
@@ -304,7 +304,7 @@ def taking(new: Roster, own: Roster | None, registry: str) -> tuple[Taking, str]
 def best(rosters: Sequence[Roster], own: Roster | None, registry: str) -> list[tuple[Roster, Taking, str]]:
     """Rosters in the order in which they are to be taken, each judged by those before it."""
     judged = []
-    for roster in sorted(rosters, key=lambda one: (one.version, one.hash)):
+    for roster in sorted(rosters, key=lambda roster: (roster.version, roster.hash)):
         how, why = taking(roster, own, registry)
         judged.append((roster, how, why))
         if how.startswith("taken"):

@@ -21,7 +21,11 @@ SILENT: Final = timedelta(days=7)
 
 def receivers(roster: Roster, sender: str, share: Share) -> tuple[str, ...]:
     """Who gets copies by a share: its stations that are members with ``base``, but the sender."""
-    return tuple(one for one in share.to if one != sender and "base" in roster.roles_of(one) and roster.member(one))
+    return tuple(
+        receiver
+        for receiver in share.to
+        if receiver != sender and "base" in roster.roles_of(receiver) and roster.member(receiver)
+    )
 
 
 def shares_any(shares: Iterable[Share], view: MergedClaims, sender: str) -> bool:
@@ -110,7 +114,7 @@ def why_not(
 def _claims(view: MergedClaims, sender: str, node: str) -> bool:
     """Whether the sender names this node key, else somebody: as there is no conflict, nobody names another one."""
     named = [view.pins[sender]] if sender in view.pins else list(view.pins.values())
-    return any(same_key(one, node) for one in named)
+    return any(same_key(fingerprint, node) for fingerprint in named)
 
 
 def forgets(roster: Roster, me: str, fitting: Iterable[Share], taken: Collection[str]) -> bool:
@@ -118,5 +122,5 @@ def forgets(roster: Roster, me: str, fitting: Iterable[Share], taken: Collection
     shares = list(fitting)
     if not any(share.forget for share in shares) or any(me in share.to for share in shares):
         return False
-    wanted = {one for share in shares if share.forget for one in receivers(roster, me, share)}
+    wanted = {receiver for share in shares if share.forget for receiver in receivers(roster, me, share)}
     return bool(wanted) and wanted <= set(taken)

@@ -27,13 +27,13 @@ class SignerVerdict(NamedTuple):
     why: str = ""
 
 
-def limit_of(one: Member | RemovedMember) -> Place | None:
+def limit_of(member: Member | RemovedMember) -> Place | None:
     """Up to which page the ``signed`` events of somebody without ``sign`` count; None: it never had it."""
-    if isinstance(one, Member):
-        return one.signed
-    if "sign" in one.roles:
-        return one.last
-    return None if one.signed is None else min(one.signed, one.last, key=lambda place: place[0])
+    if isinstance(member, Member):
+        return member.signed
+    if "sign" in member.roles:
+        return member.last
+    return None if member.signed is None else min(member.signed, member.last, key=lambda place: place[0])
 
 
 def signing(

@@ -129,8 +129,8 @@ def open_request(octets: bytes, find_key: Callable[[str], bytes | None]) -> Sign
     name, uuid = document.members.get("name"), bytes.fromhex(fields.text_of_form("uuid", "uuid"))
     blocks: dict[BlockId, bytes] = {}
     listed = fields.list_of("image", MOST_BLOCKS)
-    for one in listed:
-        block, teds = _block(fields, one)
+    for item in listed:
+        block, teds = _block(fields, item)
         blocks[block] = teds
     if len(blocks) != len(listed) or SECURITY in blocks or not blocks:
         raise fields.bad("image", "is empty, names a TEDS twice, or holds the Security TEDS")

@@ -89,9 +89,9 @@ class Sessions:
         made = NodeSession(key, flash.uuid, station, self._one_time())
         held = self._links.setdefault(link, _LinkSessions())
         held.half_open, held.half_open_at = made, self._clock()
-        half_open = [each for each in self._links.values() if each.half_open is not None]
+        half_open = [link for link in self._links.values() if link.half_open is not None]
         if len(half_open) > self._room:
-            min(half_open, key=lambda each: each.half_open_at).half_open = None
+            min(half_open, key=lambda link: link.half_open_at).half_open = None
         return made.reply
 
     def any_on(self, link: str) -> bool:
@@ -169,10 +169,10 @@ class Sessions:
 
     def _make_room(self, held: _LinkSessions) -> bool:
         """Room for one more session: where there is none, that without a claim goes which was silent longest."""
-        others = [each for each in self._links.values() if each is not held]
-        for each in others:
-            self._drop_old(each)
-        living = [(each, each.session) for each in others if each.session is not None]
+        others = [link for link in self._links.values() if link is not held]
+        for other in others:
+            self._drop_old(other)
+        living = [(other, other.session) for other in others if other.session is not None]
         if len(living) < self._room:
             return True
         idle = [(session.good_at, number) for number, (_, session) in enumerate(living) if not self._claims(session)]

@@ -229,7 +229,7 @@ class PlantTables:
 
     def drop_events(self, ids: Iterable[str]) -> None:
         """Take events that stand in a page out of the outbox."""
-        self._database.execute_many("DELETE FROM outbox WHERE id = ?", [(one,) for one in ids])
+        self._database.execute_many("DELETE FROM outbox WHERE id = ?", [(event_id,) for event_id in ids])
 
     # -- chains and pages ------------------------------------------------------------------------------------------
 
@@ -327,7 +327,9 @@ class PlantTables:
 
     def add_ids(self, chain: int, ids: Iterable[int]) -> None:
         """Note the ids of events that were folded."""
-        self._database.execute_many("INSERT OR IGNORE INTO event_ids VALUES(?, ?)", ((chain, one) for one in ids))
+        self._database.execute_many(
+            "INSERT OR IGNORE INTO event_ids VALUES(?, ?)", ((chain, event_id) for event_id in ids)
+        )
 
     def claims_of_chain(self, chain: int, uuids: Sequence[bytes]) -> dict[bytes, str]:
         """Return what a station claims of these nodes, JSON."""

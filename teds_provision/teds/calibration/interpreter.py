@@ -231,7 +231,7 @@ class ChannelInterpreter:
         if math.isfinite(value) and low - ROUNDING * abs(low) <= value <= high + ROUNDING * abs(high):
             return ""
         unit = told or self.channel.shown
-        asked, *ends = (unit.from_si(self.unit.to_si(each)) for each in (value, low, high))
+        asked, *ends = (unit.from_si(self.unit.to_si(number)) for number in (value, low, high))
         text = f"{min(ends):.6g} to {max(ends):.6g} {unit.text}".strip()
         return f"{asked:.6g} {unit.text} exceeds the limits of channel {self.channel.number}, {text}."
 

@@ -53,9 +53,9 @@ def calibration_from_json(data: object, channel: int, units: Units) -> Calibrati
         scale, offset = _numbers(data["si"])
         inputs = tuple(
             CalibrationInput(
-                _u16(one["channel"]), _u16(one["degree"]), _numbers(one["boundaries"]), _numbers(one["offsets"])
+                _u16(given["channel"]), _u16(given["degree"]), _numbers(given["boundaries"]), _numbers(given["offsets"])
             )
-            for one in data["inputs"]
+            for given in data["inputs"]
         )
         date, interval = data.get("date"), data.get("interval")
         uncertainty = data.get("uncertainty")
@@ -84,7 +84,7 @@ def _u16(value: object) -> int:
 def _numbers(values: object) -> tuple[float, ...]:
     if not isinstance(values, list) or len(values) > MOST_NUMBERS:
         raise TypeError("no list of numbers")
-    found = tuple(float(one) for one in values if isinstance(one, int | float) and not isinstance(one, bool))
+    found = tuple(float(value) for value in values if isinstance(value, int | float) and not isinstance(value, bool))
     if len(found) != len(values) or not all(map(math.isfinite, found)):
         raise ValueError("no finite number")
     return found

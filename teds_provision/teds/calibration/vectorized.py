@@ -35,17 +35,23 @@ class ManyChannels:
     """Channels side by side; make one with :meth:`side_by_side`. Values are in SI units, NaN where not valid."""
 
     def __init__(self, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> None:
-        self._lay_curves([one.channel.calibration for one in channels])
-        self._scale = np.array([one.unit.scale for one in channels])
-        self._offset = np.array([one.unit.offset for one in channels])
-        self._same = np.array([one.shown_as_computed for one in channels])
+        self._lay_curves([interpreter.channel.calibration for interpreter in channels])
+        self._scale = np.array([interpreter.unit.scale for interpreter in channels])
+        self._offset = np.array([interpreter.unit.offset for interpreter in channels])
+        self._same = np.array([interpreter.shown_as_computed for interpreter in channels])
         self._converts = not self._same.all()
-        self._most = np.array([_most(one) for one in channels])
-        self._floor, self._ceiling = (np.array(ends) for ends in zip(*(one.accepted for one in channels), strict=True))
-        self._turns = np.array([math.isfinite(one.turn) for one in channels])
+        self._most = np.array([_most(interpreter) for interpreter in channels])
+        self._floor, self._ceiling = (
+            np.array(ends) for ends in zip(*(interpreter.accepted for interpreter in channels), strict=True)
+        )
+        self._turns = np.array([math.isfinite(interpreter.turn) for interpreter in channels])
         self._turning = bool(self._turns.any())
-        self._turn = np.array([one.turn if math.isfinite(one.turn) else 1.0 for one in channels])
-        self._begin, self._end = (np.array(ends) for ends in zip(*(one.wraps_into for one in channels), strict=True))
+        self._turn = np.array(
+            [interpreter.turn if math.isfinite(interpreter.turn) else 1.0 for interpreter in channels]
+        )
+        self._begin, self._end = (
+            np.array(ends) for ends in zip(*(interpreter.wraps_into for interpreter in channels), strict=True)
+        )
         self._usable = None if all(usable) else np.array(usable)
         self._width = channels[0].octets
         self._columns = np.arange(len(channels))
@@ -110,7 +116,7 @@ class ManyChannels:
     @classmethod
     def side_by_side(cls, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> ManyChannels | None:
         """Side by side, or None where they are not of one form; those that are not ``usable`` give no values."""
-        widths = {one.octets for one in channels}
+        widths = {interpreter.octets for interpreter in channels}
         if len(widths) != 1 or max(widths) > WORD:
             return None
         return cls(channels, usable) if all(map(_can_stand_beside, channels)) else None
@@ -176,15 +182,15 @@ class ManyChannels:
         return total, valid
 
 
-def _most(one: ChannelInterpreter) -> float:
+def _most(interpreter: ChannelInterpreter) -> float:
     """The largest raw value that counts."""
-    bound = one.reader.form.raw_range
+    bound = interpreter.reader.form.raw_range
     return math.inf if bound is None else bound[1]
 
 
-def _can_stand_beside(one: ChannelInterpreter) -> bool:
+def _can_stand_beside(interpreter: ChannelInterpreter) -> bool:
     """A sensor of unsigned integers with a curve over its own raw value, of not too many segments, or none."""
-    if one.reader.form.model != DataModel.UNSIGNED or one.channel.actuator or one.others:
+    if interpreter.reader.form.model != DataModel.UNSIGNED or interpreter.channel.actuator or interpreter.others:
         return False
-    curve = one.channel.calibration
+    curve = interpreter.channel.calibration
     return curve is None or (len(curve.inputs) == 1 and curve.inputs[0].segments <= _MOST_SEGMENTS)

@@ -99,10 +99,10 @@ def with_zero_offset(teds: bytes, offset: float, at: datetime) -> bytes:
     given = {"ZeroOffset": offset, "ZeroDate": instant(at)}
     new = [RawTuple(*composer.one(name, value, fields.by_name)[:2], 0) for name, value in given.items()]
     head, *kept = tuples(unframe(teds), width=width)
-    rest = [one for one in kept if one.type not in {entry.type for entry in new}]
+    rest = [raw for raw in kept if raw.type not in {entry.type for entry in new}]
     for entry in new:  # before the first of a higher type: a TEDS of ours stays in ascending order
-        at_place = next((n for n, one in enumerate(rest) if one.type > entry.type), len(rest))
+        at_place = next((n for n, raw in enumerate(rest) if raw.type > entry.type), len(rest))
         rest.insert(at_place, entry)
     return frame(
-        raw_tuple(head.type, head.value) + b"".join(raw_tuple(one.type, one.value, width=width) for one in rest)
+        raw_tuple(head.type, head.value) + b"".join(raw_tuple(raw.type, raw.value, width=width) for raw in rest)
     )

@@ -152,8 +152,8 @@ def _spread(pairs: list[tuple[str, object]], known: Mapping[str, FieldSpec]) -> 
     for name, value in pairs:
         spec = known.get(name)
         many = spec is not None and spec.repeats and isinstance(value, list | tuple)
-        if many and isinstance(value, list | tuple) and all(isinstance(each, Mapping | bytes) for each in value):
-            done += [(name, each) for each in value]
+        if many and isinstance(value, list | tuple) and all(isinstance(element, Mapping | bytes) for element in value):
+            done += [(name, element) for element in value]
         else:
             done.append((name, value))
     return done

@@ -72,7 +72,7 @@ def _selections(section: Section) -> dict[int, TomlTable]:
 
 def _laid_over(everywhere: TomlTable | None, selections: list[tuple[range, TomlTable]]) -> dict[int, TomlTable]:
     tables: dict[int, TomlTable] = {}
-    for numbers, table in sorted(selections, key=lambda one: -len(one[0])):
+    for numbers, table in sorted(selections, key=lambda pair: -len(pair[0])):
         for number in numbers:
             below = tables.get(number, everywhere)
             tables[number] = below.merged(table) if below else table

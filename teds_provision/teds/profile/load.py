@@ -197,7 +197,7 @@ def _base(name: str, where: SourcePlace, path: Path, folders: Sequence[Path], ch
         return _by_name(name, places, chain)
     except NotFoundError as error:
         if any((folder / f"{name}.toml").resolve() in chain for folder in places):
-            circle = " -> ".join([*(one.stem for one in chain), name])
+            circle = " -> ".join([*(path.stem for path in chain), name])
             raise BadDataError(f"{where}: extends: the profiles extend each other in a circle: {circle}.") from error
         raise BadDataError(f"{where}: extends: {error.message}", hint=error.hint) from error
 

@@ -166,7 +166,7 @@ class Everything:
             "reset": lambda number: self.virtual[number].reset_by_hand(),
             "stranger": self.stranger,
             "access": self.access,
-            "strangers_held": lambda: sum(not each.is_gone for each in self.strangers),
+            "strangers_held": lambda: sum(not stranger.is_gone for stranger in self.strangers),
             "address": lambda number: self.nodes[number]._address.address.text,
             "manners": self.manners,
             "counts": self.counts,

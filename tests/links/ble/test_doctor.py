@@ -33,8 +33,8 @@ def switch(there: System, kind: str, *, soft: int = 0, hard: int = 0) -> list[Fi
 
 
 def test_switches_are_read_from_the_kernel(tmp_path: Path) -> None:
-    assert [each.result for each in links.switches(system(tmp_path))] == ["skipped"]
-    assert [each.result for each in switch(system(tmp_path), "wlan", soft=1)] == ["ok"]
+    assert [finding.result for finding in links.switches(system(tmp_path))] == ["skipped"]
+    assert [finding.result for finding in switch(system(tmp_path), "wlan", soft=1)] == ["ok"]
     (soft,) = switch(system(tmp_path), "bluetooth", soft=1)
     assert (soft.result, soft.fix) == ("warning", "rfkill unblock bluetooth")
 

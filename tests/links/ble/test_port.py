@@ -151,7 +151,8 @@ def test_one_connect_at_a_time(air: Air, port: Ports) -> None:
     contacts = bluetooth.everyone(seconds=30, notice=quiet)
     replies: list[bytes] = []
     threads = [
-        threading.Thread(target=lambda each=each: replies.append(each.link.exchange(IDENTIFY))) for each in contacts
+        threading.Thread(target=lambda item=contact: replies.append(item.link.exchange(IDENTIFY)))
+        for contact in contacts
     ]
     for thread in threads:
         thread.start()

@@ -98,9 +98,9 @@ class LossyBus(can.BusABC):
         super().__init__(channel)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        for one in self._out.meet(msg):
-            self._echoes.sent(Frame(one.arbitration_id, bytes(one.data)))
-            self._under.send(one, timeout)
+        for message in self._out.meet(msg):
+            self._echoes.sent(Frame(message.arbitration_id, bytes(message.data)))
+            self._under.send(message, timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         self._ready += self._in.due()

@@ -344,7 +344,7 @@ def test_bit_times_lie_within_those_of_the_standard() -> None:
 
 def bits_of(fields: str) -> str:
     """Fields "value:width …" as bits, the highest first."""
-    return "".join(f"{int(value):0{width}b}" for value, width in (one.split(":") for one in fields.split()))
+    return "".join(f"{int(value):0{width}b}" for value, width in (name.split(":") for name in fields.split()))
 
 
 def stuff_bits_of(bits: str) -> int:
@@ -360,7 +360,7 @@ def stuff_bits_of(bits: str) -> int:
 @given(st.integers(0, (1 << 29) - 1), st.binary(max_size=8))
 def test_classic_frames_are_as_long_as_counted_bit_by_bit(identifier: int, data: bytes) -> None:
     base, extension = identifier >> 18, identifier & 0x3FFFF
-    fields = bits_of(f"0:1 {base}:11 3:2 {extension}:18 0:3 {len(data)}:4 " + " ".join(f"{one}:8" for one in data))
+    fields = bits_of(f"0:1 {base}:11 3:2 {extension}:18 0:3 {len(data)}:4 " + " ".join(f"{octet}:8" for octet in data))
     crc = 0
     for bit in fields:
         crc = (crc << 1 ^ (0x4599 if (crc >> 14 ^ int(bit)) & 1 else 0)) & 0x7FFF
@@ -375,7 +375,7 @@ def test_classic_frames_are_as_long_as_counted_bit_by_bit(identifier: int, data:
 def test_fd_frames_are_as_long_as_counted_bit_by_bit(identifier: int, data: bytes) -> None:
     slow = bits_of(f"0:1 {identifier >> 18}:11 3:2 {identifier & 0x3FFFF}:18 0:1 1:1 0:1 1:1")
     code = (*range(9), 12, 16, 20, 24, 32, 48, 64).index(len(data))
-    fast = bits_of(f"0:1 {code}:4 " + " ".join(f"{one}:8" for one in data))
+    fast = bits_of(f"0:1 {code}:4 " + " ".join(f"{octet}:8" for octet in data))
     stuffed = stuff_bits_of(slow)
     crc, fixed = (17, 6) if len(data) <= 16 else (21, 7)
     fast_bits = len(fast) + stuff_bits_of(slow + fast) - stuffed + 4 + crc + fixed

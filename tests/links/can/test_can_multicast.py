@@ -107,7 +107,7 @@ def test_our_own_frames_do_not_come_back(monkeypatch: pytest.MonkeyPatch, group:
     heard = [bus.receive(1.0) for _ in range(4)]  # each of its own that came wakes it, and is nothing
     if not any(heard):
         heard.append(bus.receive(PATIENCE))
-    assert [one for one in heard if one] == [frame]
+    assert [item for item in heard if item] == [frame]
     bus.close()
     other.close()
 

@@ -67,8 +67,8 @@ def test_several_threads_that_wait_all_get_theirs(group: str, other: Bus) -> Non
     queues: list[SimpleQueue[Frame]] = [SimpleQueue() for _ in range(6)]
     got: list[int] = []
 
-    def share(one: Frame) -> bool:
-        queues[one.data[0]].put(one)
+    def share(frame: Frame) -> bool:
+        queues[frame.data[0]].put(frame)
         return False
 
     def wait(number: int) -> None:

@@ -50,8 +50,8 @@ class Field:
     def close(self) -> None:
         self._stop.set()
         self._thread.join(60)
-        for one in (self._reader, *self._clients.values()):
-            one.close()
+        for sock in (self._reader, *self._clients.values()):
+            sock.close()
         self._selector.close()
 
     def _run(self) -> None:

@@ -84,10 +84,10 @@ def values(path: Path) -> dict[tuple[str, int], list[tuple[float, Any, float]]]:
                     entry.time.tolist(), entry.raw[:, column].tolist(), entry.value[:, column].tolist(), strict=True
                 )
                 found.setdefault(key, []).extend((round(t, 5), raw, value) for t, raw, value in pairs)
-    return {key: sorted(one, key=lambda each: each[0]) for key, one in found.items()}
+    return {key: sorted(index_, key=lambda pair: pair[0]) for key, index_ in found.items()}
 
 
-@pytest.mark.parametrize("begin", [one for one in FORMATS if one != ".parquet"])
+@pytest.mark.parametrize("begin", [name for name in FORMATS if name != ".parquet"])
 @pytest.mark.parametrize("end", FORMATS)
 def test_a_recording_in_another_format_says_the_same(tmp_path: Path, begin: str, end: str) -> None:
     first = recorded(tmp_path / f"run{begin}")
@@ -100,8 +100,10 @@ def test_a_recording_in_another_format_says_the_same(tmp_path: Path, begin: str,
         after = values(path)
         assert after.keys() == before.keys()
         for key, expected in before.items():
-            assert [one[:2] for one in after[key]] == [one[:2] for one in expected], "times and raw values are exact"
-            np.testing.assert_allclose([one[2] for one in after[key]], [one[2] for one in expected], rtol=1e-11)
+            assert [pair[:2] for pair in after[key]] == [pair[:2] for pair in expected], (
+                "times and raw values are exact"
+            )
+            np.testing.assert_allclose([pair[2] for pair in after[key]], [pair[2] for pair in expected], rtol=1e-11)
         facts, said, origin = open_recording(path), told(path), told(first)
         assert facts.facts[ARM, 1] == FACTS[0], "every fact of the datasheet, its calibration too"
         assert (facts.station.name, facts.station.group) == ("bench", "crane")
@@ -112,17 +114,17 @@ def test_a_recording_in_another_format_says_the_same(tmp_path: Path, begin: str,
 
 @given(blocks())
 @settings(max_examples=25)
-def test_any_block_survives_mcap_to_json_to_mcap(one: Block) -> None:
+def test_any_block_survives_mcap_to_json_to_mcap(data_block: Block) -> None:
     with TemporaryDirectory() as folder:
-        path = recorded(Path(folder) / "run.mcap", [one])
+        path = recorded(Path(folder) / "run.mcap", [data_block])
         convert(path, Path(folder) / "run.jsonl")
         convert(Path(folder) / "run.jsonl", Path(folder) / "again.mcap")
         first, last = values(path), values(Path(folder) / "again.mcap")
     assert first.keys() == last.keys()
     for key, expected in first.items():
         got = last[key]
-        np.testing.assert_array_equal([each[1] for each in got], [each[1] for each in expected])
-        np.testing.assert_array_equal([each[2] for each in got], [each[2] for each in expected])
+        np.testing.assert_array_equal([pair[1] for pair in got], [pair[1] for pair in expected])
+        np.testing.assert_array_equal([pair[2] for pair in got], [pair[2] for pair in expected])
 
 
 def test_foreign_readers_take_what_was_converted(tmp_path: Path) -> None:
@@ -187,4 +189,4 @@ def test_notes_of_the_recorder_go_along(tmp_path: Path) -> None:
     path = tmp_path / "noted.mcap"
     for end in (".jsonl", ".csv", ".parquet", ".mcap"):
         [path] = convert(path, tmp_path / f"next{end}").files
-        assert [one["why"] for one in told(path)["notes"]] == ["The disk was full."]
+        assert [note["why"] for note in told(path)["notes"]] == ["The disk was full."]

@@ -123,4 +123,4 @@ def test_a_damaged_mcap_is_refused_with_the_command_that_saves_the_rest(tmp_path
     with pytest.raises(BadDataError, match="chunk at octet") as caught:
         convert(path, tmp_path / "run.csv")
     assert "measure recover" in caught.value.hint
-    assert [one.name for one in tmp_path.iterdir()] == ["run.mcap"], "nothing half done is left"
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"], "nothing half done is left"

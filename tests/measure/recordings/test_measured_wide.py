@@ -47,8 +47,8 @@ def test_two_nodes_are_one_grid_which_pandas_reads(hall: Hall, tmp_path: Path) -
     assert len(both) > 10
     np.testing.assert_allclose(both["a/angle [rad]"], both["a/angle [rad] again"], rtol=1e-9)
     with AnyReader([whole]) as bag:
-        offered = {one.topic: one.ext.offered_qos_profiles for one in bag.connections}  # type: ignore[union-attr]
-        kinds = {one.topic: one.msgtype for one in bag.connections}
+        offered = {connection.topic: connection.ext.offered_qos_profiles for connection in bag.connections}  # type: ignore[union-attr]
+        kinds = {connection.topic: connection.msgtype for connection in bag.connections}
     [sheet], [stream] = offered["/bench/a/teds"], offered["/bench/a/stream_0"]
     assert (sheet.durability.name, sheet.depth) == ("TRANSIENT_LOCAL", 1)
     assert (stream.reliability.name, stream.durability.name) == ("RELIABLE", "VOLATILE")

@@ -34,7 +34,7 @@ for k in range(0, 1_000_000, 3):
 
 
 def rows_in(path: Path) -> int:
-    return sum(len(one.time) for one in open_recording(path).entries() if hasattr(one, "value"))
+    return sum(len(entry.time) for entry in open_recording(path).entries() if hasattr(entry, "value"))
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".mcap"])
@@ -76,10 +76,10 @@ def test_two_conversions_to_one_name_leave_one_whole_file(tmp_path: Path) -> Non
     source = recorded(tmp_path / "run.mcap", [block(index=k) for k in range(0, 30_000, 3)])
     words = [sys.executable, "-m", "teds_provision", "record", "convert", str(source), str(tmp_path / "to.csv")]
     both = [subprocess.Popen(words, env=unmeasured_environment(), stderr=subprocess.PIPE) for _ in range(2)]
-    codes = sorted((one.communicate()[0], one.returncode)[1] for one in both)
+    codes = sorted((process.communicate()[0], process.returncode)[1] for process in both)
     assert codes == [0, 2]
     assert rows_in(tmp_path / "to.csv") == 30_000
-    assert {one.name for one in tmp_path.iterdir()} == {"run.mcap", "to.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "to.csv"}
 
 
 def test_what_a_killed_conversion_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_what_a_killed_conversion_left_is_removed_by_the_next_one(tmp_path: Path
     one.wait()
     if not (tmp_path / "to.csv").exists():
         assert call(tmp_path / "home", "record", "convert", str(source), str(tmp_path / "to.csv")).code == 0
-    assert {one.name for one in tmp_path.iterdir()} == {"run.mcap", "to.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "to.csv"}
 
 
 def test_show_speaks_peoples_units_and_json_speaks_si(tmp_path: Path) -> None:
@@ -101,8 +101,8 @@ def test_show_speaks_peoples_units_and_json_speaks_si(tmp_path: Path) -> None:
     assert lines[1].endswith("arm/angle 5.72958 °")
     printed = call(tmp_path / "home", "--json", "record", "show", path, "--channel", "3").out
     *events, end = [json.loads(line) for line in printed.splitlines()]
-    assert {(one["event"], one["channel"], one["unit"]) for one in events} == {("data", 3, "K")}
-    assert sum(len(one["time"]) for one in events) == 40
+    assert {(event["event"], event["channel"], event["unit"]) for event in events} == {("data", 3, "K")}
+    assert sum(len(event["time"]) for event in events) == 40
     assert end["event"] == "end"
     assert end["samples"] == 120, "the end counts the whole recording"
 
@@ -120,7 +120,7 @@ def test_a_file_that_may_not_grow_ends_a_conversion_with_words_and_leaves_nothin
     )
     assert done.returncode == 7
     assert "cannot grow" in done.stderr
-    assert {one.name for one in tmp_path.iterdir()} == {"run.mcap"}
+    assert {path.name for path in tmp_path.iterdir()} == {"run.mcap"}
 
 
 def test_wide_needs_a_file_of_text(tmp_path: Path) -> None:

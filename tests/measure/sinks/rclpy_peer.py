@@ -33,7 +33,7 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):  # arrays of numpy and of the standard library
         return value.tolist()
     if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     return value
 
 
@@ -79,11 +79,12 @@ class Peer:
             topic: {
                 "types": types,
                 "publishers": [
-                    [f"{one.node_namespace}{one.node_name}", *(kind.name for kind in _kinds(one.qos_profile))]
-                    for one in self.node.get_publishers_info_by_topic(topic)
+                    [f"{item.node_namespace}{item.node_name}", *(kind.name for kind in _kinds(item.qos_profile))]
+                    for item in self.node.get_publishers_info_by_topic(topic)
                 ],
                 "subscribers": [
-                    f"{one.node_namespace}{one.node_name}" for one in self.node.get_subscriptions_info_by_topic(topic)
+                    f"{item.node_namespace}{item.node_name}"
+                    for item in self.node.get_subscriptions_info_by_topic(topic)
                 ],
             }
             for topic, types in self.node.get_topic_names_and_types()

@@ -52,13 +52,13 @@ class Peer:
         self.process.stdin.flush()
 
     def of(self, event: str) -> list[dict[str, Any]]:
-        return [one for one in list(self.lines) if one["event"] == event]
+        return [line for line in list(self.lines) if line["event"] == event]
 
     def hear(self, topic: str, kind: str, *, latched: bool = False, reliable: bool = True) -> None:
         self.tell(op="hear", topic=topic, type=kind, latched=latched, reliable=reliable)
 
     def heard(self, topic: str) -> list[Any]:
-        return [one["message"] for one in self.of("message") if one["topic"] == topic]
+        return [entry["message"] for entry in self.of("message") if entry["topic"] == topic]
 
     def graph(self, ready: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """The graph as this node sees it, as soon as it is so."""

@@ -90,44 +90,44 @@ def test_a_csv_says_what_a_reader_needs_then_has_raw_beside_calibrated(tmp_path:
 @example(block(np.array([[2**63 + 1]], dtype=np.uint64), [[1.0]]))
 @example(block(np.array([[b"\x01\xff"]], dtype=object), [[0.0]], [[False]]))
 @settings(max_examples=40)
-def test_every_block_comes_back_from_text(one: Block) -> None:
+def test_every_block_comes_back_from_text(data_block: Block) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.txt"
-        record(path, [one], facts=())
+        record(path, [data_block], facts=())
         got = rows(path.read_text(), "\t")
-    assert len(got) == len(one.time)
+    assert len(got) == len(data_block.time)
     for k, row in enumerate(got):
-        assert int(row["index"]) == one.index + k
-        for column, number in enumerate(one.channels):
+        assert int(row["index"]) == data_block.index + k
+        for column, number in enumerate(data_block.channels):
             name = f"{ARM}/channel {number}"
-            raw = one.raw[k, column]
+            raw = data_block.raw[k, column]
             if isinstance(raw, bytes):
                 assert bytes.fromhex(row[f"{name} raw"]) == raw
-            elif one.raw.dtype.kind == "f":
+            elif data_block.raw.dtype.kind == "f":
                 assert float(row[f"{name} raw"]) == raw
             else:
                 assert int(row[f"{name} raw"]) == raw
-            assert (row[name] != "") == one.valid[k, column]
-            if one.valid[k, column]:
-                assert float(row[name]) == pytest.approx(one.value[k, column], rel=1e-11)
+            assert (row[name] != "") == data_block.valid[k, column]
+            if data_block.valid[k, column]:
+                assert float(row[name]) == pytest.approx(data_block.value[k, column], rel=1e-11)
 
 
 @given(blocks())
 @settings(max_examples=25)
-def test_every_block_comes_back_from_mcap_by_foreign_readers(one: Block) -> None:
+def test_every_block_comes_back_from_mcap_by_foreign_readers(data_block: Block) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
-        record(path, [one])
+        record(path, [data_block])
         got = samples(path)
-    assert [topic for topic, _, _ in got] == ["/bench/arm/stream_0"] * len(one.time)
+    assert [topic for topic, _, _ in got] == ["/bench/arm/stream_0"] * len(data_block.time)
     for k, (_, message, logged) in enumerate(got):
-        assert (message.index, message.tick) == (one.index + k, one.tick[k])
-        assert abs(logged / 1e9 - one.time[k]) < 1e-6
+        assert (message.index, message.tick) == (data_block.index + k, data_block.tick[k])
+        assert abs(logged / 1e9 - data_block.time[k]) < 1e-6
         assert message.stamp.sec == logged // 10**9
-        np.testing.assert_array_equal(message.value, one.value[k])
-        raw = message.raw_float if one.raw.dtype.kind == "f" else message.raw
-        np.testing.assert_array_equal(raw, one.raw[k])
-        assert message.clock_error == one.clock_error
+        np.testing.assert_array_equal(message.value, data_block.value[k])
+        raw = message.raw_float if data_block.raw.dtype.kind == "f" else message.raw
+        np.testing.assert_array_equal(raw, data_block.raw[k])
+        assert message.clock_error == data_block.clock_error
 
 
 def test_a_message_of_mcap_says_what_is_not_known_or_no_measurement_and_forgets_it_in_the_next(tmp_path: Path) -> None:
@@ -144,19 +144,19 @@ def test_a_message_of_mcap_says_what_is_not_known_or_no_measurement_and_forgets_
 
 @given(blocks())
 @settings(max_examples=25)
-def test_every_block_comes_back_from_json_lines(one: Block) -> None:
+def test_every_block_comes_back_from_json_lines(data_block: Block) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.jsonl"
-        record(path, [one])
+        record(path, [data_block])
         lines = [json.loads(line) for line in path.read_text().splitlines()]
     data = [line for line in lines if line["event"] == "data"]
-    assert [line["channel"] for line in data] == list(one.channels)
+    assert [line["channel"] for line in data] == list(data_block.channels)
     for column, line in enumerate(data):
-        assert line["valid"] == one.valid[:, column].tolist()
-        assert line["raw"] == one.raw[:, column].tolist()
-        expected = [v if g else None for v, g in zip(one.value[:, column].tolist(), line["valid"], strict=True)]
+        assert line["valid"] == data_block.valid[:, column].tolist()
+        assert line["raw"] == data_block.raw[:, column].tolist()
+        expected = [v if g else None for v, g in zip(data_block.value[:, column].tolist(), line["valid"], strict=True)]
         assert line["value"] == expected
-        assert len(line["time"]) == len(one.time)
+        assert len(line["time"]) == len(data_block.time)
 
 
 def test_channels_in_any_order_keep_their_columns(tmp_path: Path) -> None:
@@ -224,14 +224,14 @@ def test_an_mcap_holds_the_facts_where_its_users_look(tmp_path: Path) -> None:
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
-        metadata = {one.name: one.metadata for one in reader.iter_metadata()}
+        metadata = {metadata.name: metadata.metadata for metadata in reader.iter_metadata()}
         strings = {
             c.topic: m.data[8:-1].decode()
             for s, c, m in reader.iter_messages()
             if s and s.name == "std_msgs/msg/String"
         }
     assert summary is not None
-    [stream] = [one for one in summary.channels.values() if one.topic == "/bench/arm/stream_0"]
+    [stream] = [channel for channel in summary.channels.values() if channel.topic == "/bench/arm/stream_0"]
     assert json.loads(stream.metadata["channels"])[0]["fingerprint"] == "ab" * 32
     assert metadata["channel"]["unit"] == "rad"
     assert metadata["measurement"]["group"] == "crane"
@@ -261,9 +261,11 @@ def test_chunks_of_an_mcap_are_small(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     record(path, [block(np.full((100, 8), 5), channels=tuple(range(1, 9)), index=100 * k) for k in range(20)])
     with path.open("rb") as file:
-        chunks = [one for one in StreamReader(file, emit_chunks=True).records if type(one).__name__ == "Chunk"]
+        chunks = [record for record in StreamReader(file, emit_chunks=True).records if type(record).__name__ == "Chunk"]
     assert len(chunks) > 3
-    assert all(one.uncompressed_size < (1 << 16) + 100 * 300 for one in chunks), "64 KiB, and the block that filled it"
+    assert all(record.uncompressed_size < (1 << 16) + 100 * 300 for record in chunks), (
+        "64 KiB, and the block that filled it"
+    )
 
 
 @pytest.mark.parametrize("octets", [30, 400, 3000, None])
@@ -329,7 +331,7 @@ def readable(path: Path) -> list[float]:
         assert summary is not None
         assert summary.statistics is not None
         assert len(list(reader.iter_messages())) == summary.statistics.message_count
-    return [one[2] / 1e9 for one in samples(path)]
+    return [pair[2] / 1e9 for pair in samples(path)]
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_no_two_topics_are_equal_whatever_was_chosen_and_made(
             station = replace(station, names={**station.names, (uuid, number): name})
     topics = Topics(station)
     topics.learn(facts)
-    every = [topics.channel(*one.key) for one in facts]
+    every = [topics.channel(*channel_facts.key) for channel_facts in facts]
     every += [f"{topic}/cmd" for topic in every]
     of_nodes = ("teds", "state", "imu", "imu_2", "magnetic_field", "wrench", "wrench_1", "stream_0")
     every += [topics.of_node(uuid, what) for uuid in nodes for what in of_nodes]
@@ -115,9 +115,11 @@ def test_no_two_topics_are_equal_whatever_was_chosen_and_made(
     every += ["/bench/reports", "/bench/status", "/bench/all", "/bench/all/age", "/diagnostics"]
     assert sorted(every) == sorted(set(every))
     some = Topics(station)
-    some.learn([one for one in facts if one.uuid in measured and one.number != 2])
-    mine = [one for one in facts if one.uuid in measured and one.number != 2]
-    assert [some.channel(*one.key) for one in mine] == [topics.channel(*one.key) for one in mine]
+    some.learn(
+        [channel_facts for channel_facts in facts if channel_facts.uuid in measured and channel_facts.number != 2]
+    )
+    mine = [channel_facts for channel_facts in facts if channel_facts.uuid in measured and channel_facts.number != 2]
+    assert [some.channel(*facts.key) for facts in mine] == [topics.channel(*facts.key) for facts in mine]
     assert all(some.node(uuid) == topics.node(uuid) for uuid in measured & nodes.keys())
 
 
@@ -183,7 +185,7 @@ def axes(unit: str, first: int, **more: Any) -> list[ChannelFacts]:
 
 def test_a_vector_group_is_one_message_where_its_unit_says_what_it_is() -> None:
     def kinds(*facts: ChannelFacts) -> list[tuple[str, str]]:
-        return [(one.type, one.name) for one in compounds_of(facts)]
+        return [(compound.type, compound.name) for compound in compounds_of(facts)]
 
     assert kinds(*axes("T", 1)) == [("sensor_msgs/MagneticField", "magnetic_field")]
     assert kinds(*axes("m/s^2", 1)) == [("sensor_msgs/Imu", "imu")]
@@ -193,7 +195,7 @@ def test_a_vector_group_is_one_message_where_its_unit_says_what_it_is() -> None:
     assert kinds(*axes("N", 1)) == [], "a force alone is no wrench"
     assert kinds(*axes("degC", 1)) == [], "three temperatures are no vector that ROS has a message for"
     assert kinds(*axes("T", 1)[:2]) == [], "an axis is not in the stream"
-    assert kinds(*(replace(one, vector=()) for one in axes("T", 1))) == [], "nobody said that they are one vector"
+    assert kinds(*(replace(facts, vector=()) for facts in axes("T", 1))) == [], "nobody said that they are one vector"
     assert kinds(*axes("T", 1)[:2], *axes("m/s^2", 1)[2:]) == [], "axes of two units"
     assert kinds(*axes("m/s^2", 1, kind="actuator")) == []
 
@@ -316,10 +318,10 @@ def test_an_invalid_value_has_no_scalar_message_and_is_nan_in_the_array() -> Non
 
 def test_each_channel_has_its_own_frame_and_the_deviation_of_its_profile() -> None:
     tip = replace(ANGLE, frame="{node}_tip", deviation=0.002)
-    base = [replace(one, frame="base") for one in axes("m/s^2", 4)]
+    base = [replace(facts, frame="base") for facts in axes("m/s^2", 4)]
     sink = carried([block([[1, 2, 3, 4]], channels=(1, 4, 5, 6))], facts=[tip, *base])
     assert sink.frames == {"arm_tip", "base"}
-    [angle] = [one for one in sink.scalars if one[0] == "/bench/arm/angle"]
+    [angle] = [pair for pair in sink.scalars if pair[0] == "/bench/arm/angle"]
     assert angle[3] == pytest.approx(0.002**2), "the standard deviation goes before the worst case"
 
 
@@ -344,7 +346,7 @@ def test_a_gripper_is_a_joint_whose_state_goes_out_and_whose_set_points_come_in(
     sink._joint_command(["stranger", "hand"], [9.0, 0.02], [], [])
     sink._joint_command(["hand"], [], [1.0], [])
     sink._joint_command(["hand"], [float("nan")], [], [])
-    assert [(one.uuid, one.channel, one.value) for one in came] == [(HAND, 1, 0.02)]
+    assert [(command.uuid, command.channel, command.value) for command in came] == [(HAND, 1, 0.02)]
     assert sink.refused_commands == 3
 
 
@@ -353,8 +355,8 @@ def test_sensors_alone_are_no_joint_and_nobody_guesses_whose_they_are() -> None:
     assert joints_of([ANGLE, FORCE], topics) == []
     second = replace(gripper()[0], number=4, name="thumb")
     joints = joints_of([*gripper(), second], topics)
-    assert [(one.actuator, dict(one.state)) for one in joints] == [(1, {}), (4, {})]
-    assert len({one.name for one in joints}) == 2
+    assert [(joint.actuator, dict(joint.state)) for joint in joints] == [(1, {}), (4, {})]
+    assert len({joint.name for joint in joints}) == 2
 
 
 def test_the_datasheet_is_on_a_topic_whole() -> None:
@@ -384,7 +386,7 @@ def test_an_unsigned_datasheet_is_told_in_diagnostics_and_metadata() -> None:
     assert sink.scalars == []
     assert json.loads(sink.words["/bench/arm/teds"])["channels"][0]["unsigned"] is True
     assert "unsigned" not in json.loads(sink.words["/bench/hand/teds"])["channels"][0]
-    [told] = [one for one in sink.statuses if one.message.startswith("unsigned:")]
+    [told] = [diagnostic for diagnostic in sink.statuses if diagnostic.message.startswith("unsigned:")]
     assert (told.level, told.hardware) == (1, ARM)
 
 
@@ -424,7 +426,7 @@ def test_a_command_that_is_no_number_moves_nothing() -> None:
     sink = Carrier(commands)
     for value in (float("nan"), float("inf"), 1.5):
         sink._command(HAND, 2, value)
-    assert [one.value for one in commands] == [1.5]
+    assert [command.value for command in commands] == [1.5]
     assert sink.refused_commands == 2
 
 

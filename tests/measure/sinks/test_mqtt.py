@@ -88,8 +88,8 @@ class Cable:
                 return
             far = socket.create_connection(("127.0.0.1", self._broker))
             self._ends += [near, far]
-            for one, other in ((near, far), (far, near)):
-                threading.Thread(target=self._carry, args=(one, other), daemon=True).start()
+            for sock, other in ((near, far), (far, near)):
+                threading.Thread(target=self._carry, args=(sock, other), daemon=True).start()
 
     def _carry(self, one: socket.socket, other: socket.socket) -> None:
         try:
@@ -104,8 +104,8 @@ class Cable:
 
     def close(self) -> None:
         self._listening.close()
-        for one in self._ends:
-            one.close()
+        for sock in self._ends:
+            sock.close()
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ class TestWithMosquitto:
             assert config["device_class"] == "temperature"
             assert config["value_template"] == "{{ value_json.oil_3 }}"
             assert config["availability_mode"] == "all"
-            assert [one["topic"] for one in config["availability"]] == ["bench/status", "bench/hand/state"]
+            assert [item["topic"] for item in config["availability"]] == ["bench/status", "bench/hand/state"]
             warm = block([[7]], [[293.15]], uuid=HAND, channels=(3,))
             until(lambda: (sink.write(warm), config["state_topic"] in heard)[1])
             assert json.loads(heard[config["state_topic"]])["oil_3"] == pytest.approx(20.0)
@@ -252,7 +252,7 @@ class TestWithMosquitto:
             sink.close()
             client.disconnect()
             client.loop_stop()
-        assert [json.loads(one)["name"] for one in heard] == ["angle", "oil", "hot oil"]
+        assert [json.loads(item)["name"] for item in heard] == ["angle", "oil", "hot oil"]
 
     def test_a_node_that_gets_another_name_leaves_nothing_behind(self, broker: Broker) -> None:
         broker.start()

@@ -56,7 +56,7 @@ class Authority:
     def issue(self, name: str, *addresses: str, passphrase: bytes | None = None) -> tuple[Path, Path]:
         """Files of a certificate and its key."""
         key = ec.generate_private_key(ec.SECP256R1())
-        names = [x509.IPAddress(ipaddress.ip_address(one)) for one in addresses]
+        names = [x509.IPAddress(ipaddress.ip_address(address)) for address in addresses]
         more = [x509.SubjectAlternativeName(names)] if names else []
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         certificate, secret = self.folder / f"{name}.crt", self.folder / f"{name}.key"
@@ -214,7 +214,7 @@ def test_files_are_regular_small_and_what_they_should_be(tmp_path: Path, authori
         thread = threading.Thread(target=_open_into, args=(f"mqtts://arm@127.0.0.1?{query}", found), daemon=True)
         thread.start()
         thread.join(30)
-        assert [type(one) for one in found] == [error], query
+        assert [type(error) for error in found] == [error], query
 
 
 def _open_into(url: str, found: list[TedsProvisionError]) -> None:

@@ -106,7 +106,7 @@ class TestSeenByRclpy:
         assert oil["variance"] == pytest.approx(0.03)
         assert peer.heard("/bench/arm/imu")[-1]["linear_acceleration"]["z"] == pytest.approx(0.3)
         assert peer.heard("/bench/arm/range_finder")[-1]["max_range"] == 8.0
-        peer.graph(lambda one: bool(one["topics"].get("/bench/hand/force/cmd", {}).get("subscribers")))
+        peer.graph(lambda entry: bool(entry["topics"].get("/bench/hand/force/cmd", {}).get("subscribers")))
         until(
             lambda: (
                 peer.tell(op="say", topic="/bench/hand/force/cmd", type="std_msgs/Float64", fields={"data": 1.25}),
@@ -121,14 +121,16 @@ class TestSeenByRclpy:
         peer = domain.peer()
         open_and_feed(sink, lambda: sink.stats.messages > 60)
         graph = peer.graph(
-            lambda one: (
-                "/teds_provision_bench" in one["nodes"]
-                and {"/diagnostics", "/bench/arm/range_finder"} <= one["topics"].keys()
-                and not any("_UNKNOWN_" in text for text in map(str, one["topics"].values()))
+            lambda entry: (
+                "/teds_provision_bench" in entry["nodes"]
+                and {"/diagnostics", "/bench/arm/range_finder"} <= entry["topics"].keys()
+                and not any("_UNKNOWN_" in text for text in map(str, entry["topics"].values()))
             )
         )
         ours = {
-            topic: one["publishers"] for topic, one in graph["topics"].items() if topic.startswith(("/bench", "/diag"))
+            topic: item["publishers"]
+            for topic, item in graph["topics"].items()
+            if topic.startswith(("/bench", "/diag"))
         }
         ours.pop("/bench/hand/force/cmd", None)
         for topic, publishers in ours.items():
@@ -152,9 +154,9 @@ class TestSeenByRclpy:
         child = getattr(sink, "_child", None)
         first = 7400 + 250 * domain.number
         here = ports_of(child.pid if child else os.getpid())
-        mine = [one for one in here if first <= int(one.rpartition(":")[2]) < first + 250 or one.endswith(":7000")]
+        mine = [name for name in here if first <= int(name.rpartition(":")[2]) < first + 250 or name.endswith(":7000")]
         assert mine
-        assert all("%lo:" in one for one in mine), here
+        assert all("%lo:" in name for name in mine), here
 
     def test_facts_are_parameters_which_nobody_sets(self, domain: Domain) -> None:
         sink = open_sink(f"ros2:{domain.number}")
@@ -166,7 +168,7 @@ class TestSeenByRclpy:
             lambda: (
                 peer.tell(op="parameters", node=node, names=names),
                 time.sleep(0.3),
-                [one for one in peer.of("parameters") if len(one["values"]) == 3 and one["values"][2]["type"]],
+                [entry for entry in peer.of("parameters") if len(entry["values"]) == 3 and entry["values"][2]["type"]],
             )[2]
         )
         uuid, calibrated, vector = peer.of("parameters")[-1]["values"]
@@ -194,18 +196,18 @@ class TestSeenByRclpy:
     def test_two_stations_of_one_name_are_both_heard(self, domain: Domain) -> None:
         """ROS 2 lets two nodes have one name; topics tell them apart by their nodes' names."""
         sinks = [open_sink(f"ros2:{domain.number}") for _ in range(2)]
-        for one, facts in zip(sinks, ([ANGLE], [replace(OIL, name="oil")]), strict=True):
-            one.open(facts, STATION)
-        until(lambda: all(one.stats.state == "running" for one in sinks))
+        for sink, facts in zip(sinks, ([ANGLE], [replace(OIL, name="oil")]), strict=True):
+            sink.open(facts, STATION)
+        until(lambda: all(sink.stats.state == "running" for sink in sinks))
         peer = domain.peer()
         for node in ("arm", "hand"):
             peer.hear(f"/bench/{node}/teds", "std_msgs/String", latched=True)
         until(lambda: peer.heard("/bench/arm/teds") and peer.heard("/bench/hand/teds"))
-        graph = peer.graph(lambda one: one["nodes"].count("/teds_provision_bench") == 2)
+        graph = peer.graph(lambda entry: entry["nodes"].count("/teds_provision_bench") == 2)
         assert len(graph["topics"]["/bench/crane"]["publishers"]) == 2
-        for one in sinks:
-            one.close()
-            assert one.stats.error == ""
+        for sink in sinks:
+            sink.close()
+            assert sink.stats.error == ""
 
     def test_messages_of_an_installation_without_them_are_asked_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)

@@ -196,7 +196,7 @@ class Bench:
                 while (sent := self.tim.next_frame(bus)) is not None:
                     self.frames.append((self.hardware.tick, sent))
                 waits.append(self.tim.next_frame_in())
-            wait = min((each for each in waits if each is not None), default=None)
+            wait = min((wait for wait in waits if wait is not None), default=None)
             due = tick if wait is None else self.hardware.tick + max(1, round(wait * SECOND))
             if due >= tick:
                 break

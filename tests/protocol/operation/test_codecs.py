@@ -71,7 +71,7 @@ def test_drive_and_trigger_identifiers(node: int, station: int) -> None:
 @given(st.integers(0, (1 << 29) - 1))
 def test_an_identifier_is_one_thing_at_most(identifier: int) -> None:
     found = [data_address(identifier), drive_address(identifier), trigger_station(identifier)]
-    assert sum(each is not None for each in found) <= 1
+    assert sum(item is not None for item in found) <= 1
 
 
 @given(st.binary(min_size=9, max_size=240), st.booleans(), st.booleans())

@@ -136,11 +136,11 @@ class McapSink(FileSink):
         if not facts:
             return
         self._names.learn(facts)
-        for one in facts:
-            self._out.metadata("channel", _as_texts(facts_as_json(one)))
-        uuids = dict.fromkeys(one.uuid for one in facts)
+        for channel_facts in facts:
+            self._out.metadata("channel", _as_texts(facts_as_json(channel_facts)))
+        uuids = dict.fromkeys(channel_facts.uuid for channel_facts in facts)
         for uuid in uuids:
-            every = [facts_as_json(one) for one in self.facts.values() if one.uuid == uuid]
+            every = [facts_as_json(facts) for facts in self.facts.values() if facts.uuid == uuid]
             self._string(self._names.of_node(uuid, "teds"), json.dumps({"uuid": uuid, "channels": every}), time.time())
         # A stream's topic carries facts in its metadata, so changed ones need a topic record of their own.
         self._streams = {key: value for key, value in self._streams.items() if key[0] not in uuids}
@@ -158,7 +158,7 @@ class McapSink(FileSink):
             for name in ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid")
         }
         words["clock_error"] = report.clock_error
-        words["invalid_why"] = [asdict(one) for one in report.invalid_why]
+        words["invalid_why"] = [asdict(invalid) for invalid in report.invalid_why]
         self._string(f"/{self._names.station}/reports", json.dumps(words), report.time or time.time())
 
     def _stream(self, block: Block) -> tuple[int, np.ndarray]:
@@ -168,8 +168,8 @@ class McapSink(FileSink):
         if key not in self._streams:
             known = [self.facts.get((block.uuid, number)) for number in block.channels]
             labels = [
-                facts_as_json(one) if one else {"number": number}
-                for one, number in zip(known, block.channels, strict=True)
+                facts_as_json(item) if item else {"number": number}
+                for item, number in zip(known, block.channels, strict=True)
             ]
             topic = self._names.of_node(block.uuid, f"stream_{block.stream}")
             metadata = {QOS: RELIABLE, "uuid": block.uuid, "channels": json.dumps(labels)}
@@ -182,7 +182,7 @@ class McapSink(FileSink):
         if raw.dtype.kind == "O":
             # Octet strings have no place in this message; what is a number in them is kept as nearly as a float can.
             raw = np.array(
-                [[one if isinstance(one, int | float) else np.nan for one in row] for row in raw.tolist()],
+                [[cell if isinstance(cell, int | float) else np.nan for cell in row] for row in raw.tolist()],
                 dtype=np.float64,
             )
         channel, plain = self._stream(block)

@@ -183,9 +183,9 @@ _Places = dict[int, list[tuple[int, int]]]
 
 def _places(body: bytes) -> _Places:
     found: _Places = {}
-    for place, code, one in _inside(body):
-        if code == MESSAGE and len(one) >= 22:
-            channel, time = int.from_bytes(one[:2], "little"), int.from_bytes(one[6:14], "little")
+    for place, code, content in _inside(body):
+        if code == MESSAGE and len(content) >= 22:
+            channel, time = int.from_bytes(content[:2], "little"), int.from_bytes(content[6:14], "little")
             found.setdefault(channel, []).append((time, place))
     return found
 
@@ -193,14 +193,17 @@ def _places(body: bytes) -> _Places:
 def _indexes(places: _Places) -> list[bytes]:
     """Message indexes of a chunk, made anew."""
     return [
-        record(MESSAGE_INDEX, struct.pack("<HI", key, 16 * len(one)) + b"".join(struct.pack("<QQ", *e) for e in one))
-        for key, one in places.items()
+        record(
+            MESSAGE_INDEX,
+            struct.pack("<HI", key, 16 * len(entries)) + b"".join(struct.pack("<QQ", *e) for e in entries),
+        )
+        for key, entries in places.items()
     ]
 
 
 def _names_all(found: dict[int, bytes], places: _Places) -> bool:
     """Whether the contents of message indexes name exactly these messages."""
-    told = {channel: sorted(struct.iter_unpack("<QQ", one[6:])) for channel, one in found.items() if len(one) > 6}
+    told = {channel: sorted(struct.iter_unpack("<QQ", index[6:])) for channel, index in found.items() if len(index) > 6}
     return told == {channel: sorted(entries) for channel, entries in places.items()}
 
 
@@ -240,7 +243,7 @@ class _Scan:
             self._damage("summary", at, len(self.octets))
         if not finished:
             # What is damaged behind the last good record of an unfinished file is its torn end
-            self.damaged = [one for one in self.damaged if one.offset < self.end]
+            self.damaged = [damage for damage in self.damaged if damage.offset < self.end]
         self._join_damage()
 
     def _read_end(self) -> bool:
@@ -334,13 +337,13 @@ class _Scan:
     def _join_damage(self) -> None:
         """What touches is one piece, called by what begins it."""
         joined: list[Damage] = []
-        for one in sorted(self.damaged, key=lambda one: one.offset):
+        for damage in sorted(self.damaged, key=lambda damage: damage.offset):
             last = joined[-1] if joined else None
-            if last is not None and last.offset + last.octets >= one.offset:
-                octets = max(last.offset + last.octets, one.offset + one.octets) - last.offset
+            if last is not None and last.offset + last.octets >= damage.offset:
+                octets = max(last.offset + last.octets, damage.offset + damage.octets) - last.offset
                 joined[-1] = Damage(last.what, last.offset, octets)
             else:
-                joined.append(one)
+                joined.append(damage)
         self.damaged = joined
 
     def _next_chunk(self, at: int) -> int:
@@ -370,8 +373,11 @@ class _Scan:
         counts = {
             channel: (len(entries), min(entries)[0], max(entries)[0]) for channel, entries in _places(body).items()
         }
-        span = min((one[1] for one in counts.values()), default=0), max((one[2] for one in counts.values()), default=0)
-        described = [(code, one) for _, code, one in _inside(body) if code in (SCHEMA, CHANNEL)]
+        span = (
+            min((count[1] for count in counts.values()), default=0),
+            max((count[2] for count in counts.values()), default=0),
+        )
+        described = [(code, content) for _, code, content in _inside(body) if code in (SCHEMA, CHANNEL)]
         packed = len(content) - CHUNK_HEAD.size - 12 - int.from_bytes(content[CHUNK_HEAD.size :][:4], "little")
         begin = at + HEAD.size + len(content)
         return _Chunk(at, begin, begin, packed, len(body), span, counts, described)
@@ -383,11 +389,11 @@ class _Scan:
         summary, at = McapSummary(), len(MAGIC)
         if put is not None:
             put(MAGIC)
-        for count, one in enumerate(self._kept):
-            if isinstance(one, _Chunk):
-                at = self._chunk_into(summary, one, at, put)
+        for count, chunk in enumerate(self._kept):
+            if isinstance(chunk, _Chunk):
+                at = self._chunk_into(summary, chunk, at, put)
             else:
-                octets = self.octets[one[0] : one[1]]
+                octets = self.octets[chunk[0] : chunk[1]]
                 at = _record_into(summary, octets, at, put)
             if put is not None and count == 0:  # behind the header
                 for described in self._rescued():
@@ -404,7 +410,7 @@ class _Scan:
         length = chunk.begin - chunk.offset
         anew = _indexes(_places(self._body(chunk))) if not chunk.indexed and (put or chunk is self.chunk) else None
         if anew is not None:
-            indexes = [(int.from_bytes(one[HEAD.size :][:2], "little"), len(one)) for one in anew]
+            indexes = [(int.from_bytes(octets[HEAD.size :][:2], "little"), len(octets)) for octets in anew]
         else:
             indexes = [(channel, octets) for channel, _, octets in chunk.indexes]
         places, end = b"", at + length
@@ -429,10 +435,10 @@ class _Scan:
     def _rescued(self) -> list[bytes]:
         """Schemas and channels of messages that are whole, which stood in a damaged chunk: as the summary has them."""
         known, used = McapSummary(), set[int]()
-        for one in self._kept:
-            if isinstance(one, _Chunk):
-                used |= one.counts.keys()
-                for code, content in one.described:
+        for kept in self._kept:
+            if isinstance(kept, _Chunk):
+                used |= kept.counts.keys()
+                for code, content in kept.described:
                     _describe(known, code, content)
         elsewhere = McapSummary()
         for body in (*self._spoiled, self._summary):  # the summary, whose checksum holds, has the last word
@@ -442,7 +448,7 @@ class _Scan:
         lost = [number for number in used if number not in known.channels]
         channels = {number: elsewhere.channels.get(number) or _nameless(number) for number in lost}
         described = (*known.channels.values(), *channels.values())
-        schemas = {int.from_bytes(one[HEAD.size + 2 : HEAD.size + 4], "little") for one in described} - {0}
+        schemas = {int.from_bytes(octets[HEAD.size + 2 : HEAD.size + 4], "little") for octets in described} - {0}
         wanted = [number for number in sorted(schemas) if number not in known.schemas]
         return [*(elsewhere.schemas.get(number) or _shapeless(number) for number in wanted), *channels.values()]
 

@@ -118,7 +118,7 @@ class ChildSink(TopicSink):
             elif words.get("event") == "command":
                 self._command(words["uuid"], words["channel"], float(words["value"]))
             elif words.get("event") == "joints":
-                self._joint_command(words["names"], *([float(one) for one in words[kind]] for kind in INTERFACES))
+                self._joint_command(words["names"], *([float(word) for word in words[kind]] for kind in INTERFACES))
         child.stdout.close()
 
     def _hear_complaints(self, child: subprocess.Popen[bytes]) -> None:
@@ -246,7 +246,10 @@ class ChildSink(TopicSink):
 
     def _diagnose(self, stamp: float, statuses: Sequence[DiagnosticEntry]) -> None:
         number = self._number("/diagnostics", DIAGNOSTICS)
-        entries = [[one.level, one.name, one.message, one.hardware, one.values] for one in statuses]
+        entries = [
+            [diagnostic.level, diagnostic.name, diagnostic.message, diagnostic.hardware, diagnostic.values]
+            for diagnostic in statuses
+        ]
         self._send(op="status", id=number, t=stamp, v=entries)
 
     def _stop(self, patience: float) -> None:

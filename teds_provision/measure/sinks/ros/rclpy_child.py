@@ -34,9 +34,9 @@ _OUT = threading.Lock()
 def plain(value: Any) -> Any:
     """A value as a parameter may have it: lists of one type, no null, no table."""
     if isinstance(value, list):
-        kinds = {type(one) for one in value}
+        kinds = {type(element) for element in value}
         if kinds <= {int, float}:
-            return [float(one) for one in value]
+            return [float(element) for element in value]
         return value if kinds in ({str}, {bool}) else json.dumps(value)
     return value if isinstance(value, bool | int | float | str) else json.dumps(value)
 
@@ -216,7 +216,7 @@ class Bridge:
             return
 
         def came(message: Any) -> None:
-            given = {name: [repr(float(one)) for one in getattr(message, name)] for name in INTERFACES}
+            given = {name: [repr(float(number)) for number in getattr(message, name)] for name in INTERFACES}
             say(event="joints", names=list(message.name), **given)
 
         kind, asked = self.type_of("sensor_msgs/JointState"), self.qos(latched=False, reading=True)

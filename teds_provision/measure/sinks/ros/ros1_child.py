@@ -112,7 +112,7 @@ class Outlet:
     def sent(self) -> bool:
         """Whether its connections have taken all of it; their queues are rospy's own."""
         connections = getattr(self.publisher.impl, "connections", ()) if self.publisher.impl else ()
-        return not any(getattr(one, "_queue", ()) for one in connections)
+        return not any(getattr(connection, "_queue", ()) for connection in connections)
 
 
 class Bridge:
@@ -245,7 +245,7 @@ class Bridge:
             return
 
         def came(message: Any) -> None:
-            given = {name: [repr(float(one)) for one in getattr(message, name)] for name in INTERFACES}
+            given = {name: [repr(float(number)) for number in getattr(message, name)] for name in INTERFACES}
             say(event="joints", names=list(message.name), **given)
 
         kind = self.type_of("sensor_msgs/JointState")

@@ -261,9 +261,13 @@ class Ros2Sink(TopicSink):
     def _diagnose(self, stamp: float, statuses: Sequence[DiagnosticEntry]) -> None:
         types = self._types
         entries = []
-        for one in statuses:
-            values = [types.KeyValue(key, value) for key, value in one.values]
-            entries.append(types.DiagnosticStatus(one.level, one.name, one.message, one.hardware, values))
+        for diagnostic in statuses:
+            values = [types.KeyValue(key, value) for key, value in diagnostic.values]
+            entries.append(
+                types.DiagnosticStatus(
+                    diagnostic.level, diagnostic.name, diagnostic.message, diagnostic.hardware, values
+                )
+            )
         message = types.DiagnosticArray(self._header(stamp), entries)
         self._write(self._writer("/diagnostics", DIAGNOSTICS), message, 0)
 

@@ -89,8 +89,8 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
         # Cyclone's own word for a sequence says nothing of what is in it.
         names, *numbers = cast("tuple[Sequence[Any], ...]", (self.name, self.position, self.velocity, self.effort))
         octets += _names_in_cdr(self.header.frame_id, tuple(names))
-        for one in numbers:
-            octets += _numbers_in_cdr(one, len(octets) - _CDR_HEAD)
+        for part in numbers:
+            octets += _numbers_in_cdr(part, len(octets) - _CDR_HEAD)
         return octets
 
 

@@ -51,7 +51,14 @@ def _python(_sourced: str, _paths: str) -> str | None:
     around = child.environment(sourced=True)
     conda = os.environ.get("CONDA_PREFIX", "")
     found = [f"{conda}/bin/python3" if conda else "", SYSTEM, shutil.which("python3") or ""]
-    return next((one for one in dict.fromkeys(found) if one and child.imports(one, NEEDS, around)), None)
+    return next(
+        (
+            interpreter
+            for interpreter in dict.fromkeys(found)
+            if interpreter and child.imports(interpreter, NEEDS, around)
+        ),
+        None,
+    )
 
 
 @functools.cache
