@@ -128,7 +128,7 @@ class Bench:
             watcher = Watcher(block=lambda block: came.append((time.monotonic_ns(), block)))
             measuring = threading.Thread(target=lambda: job.run(buses, stop, watcher=watcher))
             measuring.start()
-            while job.measurement is None or not job.measurement.keepers:
+            while job.measurement is None or not job.measurement.supervisors:
                 time.sleep(0.01)
             time.sleep(1.5)  # it asked, nobody answered: it waits
             offset = job.measurement._host.present[1]

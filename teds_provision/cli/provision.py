@@ -200,8 +200,8 @@ def _one(app: App, boards: BatchRun, questions: Questions) -> None:
         app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
         return
     except steps_room.adoption.NotAdoptedError as error:
-        _show_brought(app, error.brought)
-        app.conclude({"findings": error.brought.findings}, None, error)
+        _show_brought(app, error.datasheet)
+        app.conclude({"findings": error.datasheet.findings}, None, error)
         return
     failure = steps_room.batch_sheet.BoardResult(done.who.uuid, 0.0, done).failure
     _print_result(app, done, error=failure, **_of_line(boards, done.who.uuid))

@@ -580,7 +580,7 @@ def _standing(standing: StationStanding) -> dict[str, Any]:
         "name": standing.name,
         "fingerprint": standing.fingerprint,
         "roles": list(standing.roles),
-        "n": standing.n,
+        "n": standing.number,
         "age": standing.age,
         "state": standing.state,
     }
@@ -597,7 +597,9 @@ def _shown(station: Station, found: PlantStatus) -> str:
     roles = max(len(" ".join(peer.roles)) for peer in found.standings)
     for peer in found.standings:
         age = _age(peer.age) if peer.age is not None else "-"
-        lines.append(f"{peer.name:<{wide}}  {' '.join(peer.roles):<{roles}}  page {peer.n:>5}  {age:>8}  {peer.state}")
+        lines.append(
+            f"{peer.name:<{wide}}  {' '.join(peer.roles):<{roles}}  page {peer.number:>5}  {age:>8}  {peer.state}"
+        )
     last = f"last sync {local_time(found.record.synced)}" if found.record.synced else "never synced"
     lines.append(f"{_count(found.conflicts, 'conflict')}, {_count(found.unsent, 'event')} unsent, {last}")
     review, due = plant.removed_members.last(station), plant.removed_members.rotations_due(station)
@@ -651,7 +653,7 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
     said = plant.status.log(station, uuid=uuid, of=of, since=moment(since) if since else None)
     if app.json:
         more = (
-            (stated, {"fingerprint_of_station": stated.station, "page": stated.n, "counts": stated.counts})
+            (stated, {"fingerprint_of_station": stated.station, "page": stated.number, "counts": stated.counts})
             for stated in said
         )
         print_json_list(
@@ -660,7 +662,7 @@ def log(app: App, node: str | None, name: str | None, since: str | None) -> None
         return
     for stated in said:
         counts = "" if stated.counts else "  (does not count)"
-        who = f"{held.name_of(stated.station)} {stated.n}"
+        who = f"{held.name_of(stated.station)} {stated.number}"
         app.lines([sanitize(f"{stated.event['at']}  {who}  {stated.event['act']}  {_members(stated.event)}{counts}")])
 
 

@@ -86,7 +86,7 @@ class ImportedRows:
                 for other in self.others
             ],
             groups=self._groups(taken),
-            marks=self._marks(taken),
+            key_flags=self._marks(taken),
         )
 
     @staticmethod

@@ -33,9 +33,9 @@ class BackgroundReread:
     """Reads the rest of one node's datasheet, a step at a time; :meth:`close` when the session ends before it does."""
 
     def __init__(self, station: Station, trusted: VerifiedSession, bus: MeasuredBus, *, by: str) -> None:
-        self._station, self._trusted, self._bus, self._by = station, trusted, bus, by
+        self._station, self._verified, self._bus, self._by = station, trusted, bus, by
         self._steps = read_in_between(trusted.node, gap=GAP)
-        self._c = trusted.node.c
+        self._c = trusted.node.open_counter
         self._mine = False
         self._began = time.time()
         self._due = time.monotonic() + FIRST
@@ -66,7 +66,7 @@ class BackgroundReread:
             BadDataError,
         ):  # its data still come, or the keeper finds that they do not
             self.close()
-            self._steps, self._due = read_in_between(self._trusted.node, gap=GAP), began + AGAIN
+            self._steps, self._due = read_in_between(self._verified.node, gap=GAP), began + AGAIN
             self._left -= 1
             return self._left > 0
         self._due = time.monotonic() + SPARING * (time.monotonic() - began)
@@ -79,7 +79,7 @@ class BackgroundReread:
             self._bus.reading.release()
 
     def _conclude(self, image: Image) -> None:
-        trusted, uuid = self._trusted, self._trusted.sheet.uuid
+        trusted, uuid = self._verified, self._verified.sheet.uuid
         known = freshness_floor_of(self._station, uuid, trusted.node.proven)
         verified = readings.keep(self._station, trusted.node, image, by=self._by, known=known, c=self._c).verified
         same = hashlib.sha256(image.security or b"").hexdigest() == trusted.fingerprint

@@ -27,7 +27,7 @@ class MeasuredBus:
     def __init__(
         self, port: CanPort | BlePort, hearing: StreamReceiver, share: BusShare, lookout: CanDiscovery | BleDiscovery
     ) -> None:
-        self.port, self.hearing, self.share, self.lookout = port, hearing, share, lookout
+        self.port, self.receiver, self.share, self.discovery = port, hearing, share, lookout
         self.reading = threading.Lock()
         """Held while a datasheet is read behind a measurement: one node at a time."""
 
@@ -38,8 +38,8 @@ class MeasuredBus:
 
     def close(self) -> None:
         """End its threads; the port stays open."""
-        self.lookout.close()
-        self.hearing.close()
+        self.discovery.close()
+        self.receiver.close()
 
     def assembly(self, length: int) -> StreamAssembly:
         """What puts frames of messages of so many octets together."""
@@ -82,7 +82,7 @@ class Buses:
         news: Callable[[Sighting], None] = lambda _sighting: None,
         note: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        self.sightings = Presence(news, note)
+        self.presence = Presence(news, note)
         self._poll: float | None = None
         self._buses: dict[str, MeasuredBus] = {}
         for port in ports:
@@ -99,7 +99,7 @@ class Buses:
     def add(self, port: CanPort | BlePort) -> MeasuredBus:
         """Hear one more bus."""
         if port.place not in self._buses:
-            self._buses[port.place] = bus_at(port, self.sightings, poll=self._poll)
+            self._buses[port.place] = bus_at(port, self.presence, poll=self._poll)
         return self._buses[port.place]
 
     def all(self) -> Sequence[MeasuredBus]:
@@ -119,7 +119,7 @@ class Buses:
         """Ask everybody so often from now on; None (as at the beginning): only while somebody is missing."""
         self._poll = seconds
         for bus in self.all():
-            bus.lookout.poll(seconds)
+            bus.discovery.poll(seconds)
 
     def discover(self) -> list[Sighting]:
         """Ask every bus now; who answered until now. A bus that has failed is left out, the last failure raised."""
@@ -127,13 +127,13 @@ class Buses:
         worked = 0
         for bus in self.all():
             try:
-                bus.lookout.discover()
+                bus.discovery.discover()
                 worked += 1
             except LinkError as error:
                 failure = error
         if failure is not None and not worked:
             raise failure
-        return self.sightings.all()
+        return self.presence.all()
 
     def close(self) -> None:
         """End the threads of every bus."""

@@ -71,7 +71,7 @@ class Discovery:
     LONGEST: ClassVar[float]  # seconds that one round of questions may take
 
     def __init__(self, place: str, sightings: Presence, poll: float | None) -> None:
-        self._sightings, self._poll = sightings, poll
+        self._presence, self._poll = sightings, poll
         self._stop, self._asked = threading.Event(), threading.Event()
         self._begun = self._finished = 0  # rounds of questions
         self._turn = threading.Condition()
@@ -147,17 +147,17 @@ class CanDiscovery(Discovery):
     def _watch(self) -> None:
         """Ask, and hear announcements, until the bus fails."""
         with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as listener:
-            gone = self._sightings.gone
+            gone = self._presence.gone
             self._ask()
             pace, soon = BroadcastPace(time.monotonic(), first=SOON), math.inf
             while not self._stop.is_set():
                 soon = min(soon, self._heard(listener.get(LOOK)))
-                missing = self._sightings.missing()
-                if missing and self._sightings.gone != gone:
+                missing = self._presence.missing()
+                if missing and self._presence.gone != gone:
                     soon = SOON  # one that goes does not wait for the pause that another one's absence has come to
                 wanted = self._asked.is_set() or time.monotonic() - pace.asked >= soon
                 if pace.is_due(wanted=wanted, missing=missing, poll=self._poll):
-                    soon, gone = math.inf, self._sightings.gone
+                    soon, gone = math.inf, self._presence.gone
                     self._ask()
                     pace.asked = time.monotonic()
                 self._ask_announcer()
@@ -167,10 +167,10 @@ class CanDiscovery(Discovery):
         announce = Announce.decode(frame.identifier, frame.data) if frame is not None else None
         if announce is None:
             return math.inf
-        self._sightings.announced(self.port.place, announce)
-        if self._sightings.awaits(announce):
+        self._presence.announced(self.port.place, announce)
+        if self._presence.awaits(announce):
             return SOON if self._believes(announce) else math.inf
-        if self._sightings.is_welcome(announce) and self._believes(announce):
+        if self._presence.is_welcome(announce) and self._believes(announce):
             self._ask_one(announce.address, PATIENCE)  # it alone: everybody's answers would cost the others' data
             return math.inf
         if self._poll and announce.address not in self._announcers:
@@ -219,12 +219,12 @@ class CanDiscovery(Discovery):
     def _settle(self, found: FunctionalAnswers, began: float) -> None:
         settled = ask_unclear_again(found, self.port.identify, until=began + 2 * LONGEST_SECONDS)
         for address in sorted(settled.conflicts):
-            self._sightings.conflict(self.port.place, address)
+            self._presence.conflict(self.port.place, address)
         for address, identity in sorted(settled.identities.items()):
             if address in found.conflicts | found.unfinished:
                 self._saw(address, identity)
         for uuid, addresses in settled.twice.items():
-            self._sightings.note(twice_text(uuid, addresses))
+            self._presence.note(twice_text(uuid, addresses))
 
     def identify_at(self, address: int, seconds: float) -> None:
         """Ask one address now, on the caller's thread; who answers is told of as everybody is. Raises LinkError.
@@ -237,13 +237,13 @@ class CanDiscovery(Discovery):
         try:
             identity = self.port.identify(address, seconds=seconds, until_announced=until_announced)
         except AddressConflictError:
-            self._sightings.conflict(self.port.place, address)
+            self._presence.conflict(self.port.place, address)
             return
         if identity is not None:
             self._saw(address, identity)
 
     def _saw(self, address: int, identity: Identity) -> None:
-        self._sightings.add_sighting(Sighting(identity, address, self.port, time.monotonic()))
+        self._presence.add_sighting(Sighting(identity, address, self.port, time.monotonic()))
 
 
 # Nodes in the air: their data messages, and the look-out that connects to each and asks who it is (operation.md 6).
@@ -298,7 +298,7 @@ class BleDiscovery(Discovery):
         pace = BroadcastPace(0.0)
         while not self._stop.is_set():
             wanted = self._asked.is_set()
-            if not pace.is_due(wanted=wanted, missing=self._sightings.missing(), poll=self._poll):
+            if not pace.is_due(wanted=wanted, missing=self._presence.missing(), poll=self._poll):
                 self._asked.wait(LOOK)
                 continue
             self._look()
@@ -310,7 +310,7 @@ class BleDiscovery(Discovery):
         try:
             for contact in self.port.everyone(seconds=2 * LEAST, notice=_nothing):
                 number = contact.connection or 0
-                self._sightings.add_sighting(Sighting(contact.identity, number, self.port, time.monotonic()))
+                self._presence.add_sighting(Sighting(contact.identity, number, self.port, time.monotonic()))
         except NoNodeError:
             pass
         except LinkError as failure:

@@ -67,7 +67,7 @@ class HeldActuator:
         if not channel.actuator:
             raise BadDataError(f"Channel {number} of node {trusted.uuid} is not an actuator.")
         self.unit = unit_for(channel, unit)
-        self.channel, self._trusted, self._dead_man = channel, trusted, dead_man
+        self.channel, self._verified, self._dead_man = channel, trusted, dead_man
         self._interpreter = ChannelInterpreter(trusted.sheet, number)
         if self._interpreter.problem:
             raise BadDataError(self._interpreter.problem)
@@ -83,15 +83,15 @@ class HeldActuator:
         return one.encode(own)
 
     def __enter__(self) -> HeldActuator:
-        claim(self._trusted, self.channel.number, lease=LEASE, dead_man=self._dead_man)
+        claim(self._verified, self.channel.number, lease=LEASE, dead_man=self._dead_man)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self._trusted.node.request(idle(self.channel.number), "to let go of the actuator")
-            state, _ = operation(self._trusted.node).channels[self.channel.number]
+            self._verified.node.request(idle(self.channel.number), "to let go of the actuator")
+            state, _ = operation(self._verified.node).channels[self.channel.number]
             self.safe = bool(state & ChannelState.SAFE)
         except (TedsProvisionError, SessionLostError, KeyError):
             self.safe = None  # nobody can say so from here; the node's dead-man sees to it
@@ -106,7 +106,7 @@ class HeldActuator:
         octets = self.octets_of(value)
         began = time.monotonic()
         try:
-            self._trusted.node.request(
+            self._verified.node.request(
                 write_data_set(self.channel.number, octets), "to set the actuator", within=self._dead_man / 1000
             )
         except SessionLostError as lost:

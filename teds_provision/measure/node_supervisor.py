@@ -85,7 +85,7 @@ class NodeSupervisor:
         self.error: TedsProvisionError | None = None
         self.state: State = "waiting"
         self.ever_ran = False
-        self.trusted: VerifiedSession | None = None
+        self.verified: VerifiedSession | None = None
         self.streams = NodeStreams(host, events.block)
         self.turn = threading.Lock()  # of the session: one exchange at a time
         self.ready = threading.Event()  # streams were asked for
@@ -99,7 +99,7 @@ class NodeSupervisor:
         self._elsewhere = 0.0  # when it answered at another place
         self._lost_at = 0.0
         self._proven = True  # whether what failed last did so in a session
-        self._patience = RetryPolicy(None)
+        self._retry_policy = RetryPolicy(None)
         self._standing: NodeStanding | None = None  # of the present try
         self.sighting: Sighting | None = None  # where it was last
         self._halved = 0
@@ -159,7 +159,7 @@ class NodeSupervisor:
 
     def _run(self) -> None:
         pause = FIRST_PAUSE
-        patience = self._patience = RetryPolicy(None if self._request.patient else self._request.timeout)
+        patience = self._retry_policy = RetryPolicy(None if self._request.patient else self._request.timeout)
         try:
             while not self._stop.is_set():
                 self._anew.clear()
@@ -197,14 +197,14 @@ class NodeSupervisor:
             self.ready.set()
 
     def _is_elsewhere(self) -> bool:
-        return self._buses.sightings.elsewhere(self.uuid)
+        return self._buses.presence.elsewhere(self.uuid)
 
     def _wait(self, pause: float, began: float) -> None:
         """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
         if self.sighting is not None:
-            self._buses.sightings.on_announce(self.sighting, self._anew.set)
+            self._buses.presence.on_announce(self.sighting, self._anew.set)
         self._anew.wait(pause)
-        self._buses.sightings.let_announce(self.uuid)  # from here on it is looked for
+        self._buses.presence.let_announce(self.uuid)  # from here on it is looked for
         self._stop.wait(max(0.0, began + AT_ONCE - time.monotonic()))
 
     def _failure(self) -> TedsProvisionError | None:
@@ -236,9 +236,9 @@ class NodeSupervisor:
         seconds = (
             LOOKING
             if self.ever_ran
-            else max(LOOKING, round(min(self._request.timeout, self._patience.seconds_left), 1))
+            else max(LOOKING, round(min(self._request.timeout, self._retry_policy.seconds_left), 1))
         )
-        sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
+        sighting = self._buses.presence.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self.sighting = sighting
         self.bus = self._buses.bus_of(sighting)
         for other in self._buses.all():
@@ -250,15 +250,15 @@ class NodeSupervisor:
             raise
         except BaseException as error:
             self._lost_at = time.monotonic()
-            self._buses.sightings.let_announce(self.uuid)
+            self._buses.presence.let_announce(self.uuid)
             # Under its key it said what it is refused for: it is there, and another measurement may want it now.
             if not (self._proven and isinstance(error, (NotAuthenticError, PolicyError, BadDataError))):
-                self._buses.sightings.wrong(sighting)
+                self._buses.presence.wrong(sighting)
             raise
 
     def _in_session(self, bus: MeasuredBus, sighting: Sighting, standing: NodeStanding) -> None:
         self._announced = self._elsewhere = 0.0
-        self._buses.sightings.on_announce(sighting, self._heard_announce, self._seen_elsewhere)
+        self._buses.presence.on_announce(sighting, self._heard_announce, self._seen_elsewhere)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
             if isinstance(node.contact.link, CancellableLink):
                 node.contact.link.hopeless = self._is_gone
@@ -272,7 +272,7 @@ class NodeSupervisor:
                 self._proven = node.sealed
             if self._request.require is not None:
                 self._request.require.offer(self.uuid, trusted.sheet, self._stop)
-            self.trusted, self._announced = trusted, 0.0
+            self.verified, self._announced = trusted, 0.0
             answers = False
             try:
                 self._measure(bus, trusted, sighting.address)
@@ -303,7 +303,7 @@ class NodeSupervisor:
         notes = [plans.slowed] if plans.slowed else []
         notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
-        self._patience.has_run()
+        self._retry_policy.has_run()
         self._set_state("running", why="; ".join(note.removesuffix(".") for note in notes))
         self.ready.set()
 
@@ -438,7 +438,7 @@ class NodeSupervisor:
                 lied = True
                 self._set_state("running", why=f"its clock is inconsistent: {self.streams.clock.lie}")
             silent = self.streams.silent(now)
-            if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
+            if silent and (failure := bus.receiver.failure) is not None:  # the adapter was pulled: it is not the node
                 raise failure
             if silent:
                 raise LinkError(f"No message from the node for {silent:.1f} s.", hint="Check its power and the bus.")
@@ -485,7 +485,7 @@ class NodeSupervisor:
         if self._driven is not None:
             self._driven.close()
             self._driven = None
-        self._buses.sightings.let_announce(self.uuid)
+        self._buses.presence.let_announce(self.uuid)
         self.streams.stop(bus, trusted if answers else None, address)
         if not self._comes_back:
             with bus.share.lock:
@@ -495,7 +495,7 @@ class NodeSupervisor:
                 trusted.node.request(idle(0), "to let go")
         else:
             trusted.node.forget()
-        self.trusted = None
+        self.verified = None
 
     # -- telling ---------------------------------------------------------------------------------------------------
 

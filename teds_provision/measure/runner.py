@@ -78,7 +78,7 @@ class Measurement:
     watcher: Watcher = field(default_factory=Watcher)
     began: Callable[[], None] = lambda: None
     lent: set[bytes] = field(default_factory=set)
-    keepers: list[NodeSupervisor] = field(default_factory=list, init=False)
+    supervisors: list[NodeSupervisor] = field(default_factory=list, init=False)
     ready: threading.Event = field(default_factory=threading.Event, init=False)  # nodes may join
 
     def run(self, stop: threading.Event, duration: float | None = None) -> MeasurementEnd:
@@ -108,11 +108,11 @@ class Measurement:
         if self.request.require is not None:
             self.request.require.expect(self.uuids)
         events = self._events = Events(self._block, self._describe, self._report, self._read)
-        self.keepers = [
+        self.supervisors = [
             NodeSupervisor(self.station, self.buses, uuid, self.request, self._host, events, self._common_start)
             for uuid in self.uuids
         ]
-        for keeper in self.keepers:
+        for keeper in self.supervisors:
             if keeper.uuid not in self.lent:
                 keeper.start()
         try:
@@ -147,34 +147,34 @@ class Measurement:
 
     def _trigger(self) -> None:
         """Pull the trigger when it is due; say for whom, and for how long, it waits."""
-        late = [supervisor for supervisor in self.keepers if not supervisor.ready.is_set()]
-        if self._common_start.due(len(self.keepers) - len(late), len(self.keepers)):
-            trigger.pull(self._common_start, self.keepers, self.watcher.note)
-        elif late and len(late) < len(self.keepers) and self._common_start.tells():
+        late = [supervisor for supervisor in self.supervisors if not supervisor.ready.is_set()]
+        if self._common_start.due(len(self.supervisors) - len(late), len(self.supervisors)):
+            trigger.pull(self._common_start, self.supervisors, self.watcher.note)
+        elif late and len(late) < len(self.supervisors) and self._common_start.tells():
             names = ", ".join(supervisor.uuid.hex() for supervisor in late[:3]) + (" …" if len(late) > 3 else "")
             self.watcher.note(f"Waiting for {names} before the trigger, up to {TOGETHER:.0f} s.")
 
     def _until(self, now: float, duration: float | None) -> float:
         """When ``duration`` seconds of data are over: they count from the first values."""
         left = self._common_start.seconds_left
-        if duration is None or left is None or not any(keeper.ever_ran for keeper in self.keepers):
+        if duration is None or left is None or not any(keeper.ever_ran for keeper in self.supervisors):
             return math.inf
         self.began()
         # A stream that may begin when its node likes begins a moment after Subscribe.
-        first = [supervisor.streams.first_sample() for supervisor in self.keepers]
+        first = [supervisor.streams.first_sample() for supervisor in self.supervisors]
         return max(now + left, *first) + duration
 
     def _all_done(self) -> bool:
-        return not self._open and not self.lent and all(keeper.done.is_set() for keeper in self.keepers)
+        return not self._open and not self.lent and all(keeper.done.is_set() for keeper in self.supervisors)
 
     def _gave_up(self) -> bool:
         """Whether no node ever ran and each has had its time."""
         return not self._open and all(
-            not supervisor.ever_ran and isinstance(supervisor.error, NoNodeError) for supervisor in self.keepers
+            not supervisor.ever_ran and isinstance(supervisor.error, NoNodeError) for supervisor in self.supervisors
         )
 
     def _look(self) -> None:
-        for keeper in self.keepers:
+        for keeper in self.supervisors:
             self._report(keeper.report())
         for sink in self.sinks:
             if self._is_news(sink):
@@ -238,7 +238,7 @@ class Measurement:
             yield None
             return
         with keeper.turn:
-            yield keeper.trusted
+            yield keeper.verified
 
     @property
     def _open(self) -> bool:
@@ -252,7 +252,7 @@ class Measurement:
             keeper = NodeSupervisor(
                 self.station, self.buses, uuid, self.request, self._host, self._events, self._common_start
             )
-            self.keepers = [*self.keepers, keeper]
+            self.supervisors = [*self.supervisors, keeper]
         if not self._ending:
             keeper.start()
         return keeper
@@ -284,11 +284,11 @@ class Measurement:
         self.lent.discard(uuid)
 
     def _keeper(self, uuid: bytes) -> NodeSupervisor | None:
-        return next((supervisor for supervisor in self.keepers if supervisor.uuid == uuid), None)
+        return next((supervisor for supervisor in self.supervisors if supervisor.uuid == uuid), None)
 
     def command(self, command: SetPointCommand) -> None:
         """A set point that came by a sink."""
-        for keeper in self.keepers:
+        for keeper in self.supervisors:
             if keeper.uuid.hex() == command.uuid:
                 keeper.command(command)
 
@@ -331,7 +331,7 @@ class Measurement:
 
     def _new_grid(self, uuid: str) -> Grid:
         """Of one node, or of all of them ("")."""
-        keepers = [supervisor for supervisor in self.keepers if uuid in ("", supervisor.uuid.hex())]
+        keepers = [supervisor for supervisor in self.supervisors if uuid in ("", supervisor.uuid.hex())]
         spans = [heard.receiver.plan.span for keeper in keepers for heard in list(keeper.streams.running.values())]
         patience = max(spans, default=0) / 1e9 + 2 * BEAT
         known = [facts for _, facts in sorted(self._known.items()) if facts.kind != "actuator"]
@@ -350,11 +350,11 @@ class Measurement:
 
     def _end(self) -> None:
         self._ending = True
-        for keeper in self.keepers:
+        for keeper in self.supervisors:
             keeper.give_room_up()
             keeper.stop()
         end = time.monotonic() + ENDING
-        for keeper in self.keepers:
+        for keeper in self.supervisors:
             keeper.join(max(0.1, end - time.monotonic()))
         with suppress(TedsProvisionError):
             self._rows()
@@ -363,7 +363,7 @@ class Measurement:
         self._look()
 
     def _note_who_never_came(self) -> None:
-        for keeper in self.keepers:
+        for keeper in self.supervisors:
             if not keeper.ever_ran and keeper.error is None:
                 keeper.error = NoNodeError(
                     f"Node {keeper.uuid.hex()} did not answer before the measurement ended.",
@@ -371,8 +371,8 @@ class Measurement:
                 )
 
     def _ended(self) -> MeasurementEnd:
-        nodes = [_summary(keeper) for keeper in self.keepers]
-        errors = [keeper.error for keeper in self.keepers if keeper.error is not None]
+        nodes = [_summary(keeper) for keeper in self.supervisors]
+        errors = [keeper.error for keeper in self.supervisors if keeper.error is not None]
         errors += [error for sink in self.sinks if (error := _as_error(sink)) is not None]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]

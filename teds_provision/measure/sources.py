@@ -100,6 +100,6 @@ def _require_alone(port: CanPort) -> None:
             return
     until = time.monotonic() + SIGN_OF_LIFE
     while time.monotonic() < until:
-        if bus.rivals.seen():
-            raise AddressConflictError(bus.rivals.text, hint=bus.rivals.hint)
+        if bus.conflicts.seen():
+            raise AddressConflictError(bus.conflicts.text, hint=bus.conflicts.hint)
         time.sleep(0.05)

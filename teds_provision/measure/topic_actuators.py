@@ -73,7 +73,7 @@ class TopicActuators:
         echo: Callable[[Block], None],
         tell: Callable[[str], None],
     ) -> None:
-        self._trusted, self._send_message = trusted, send
+        self._verified, self._send_message = trusted, send
         self._dead_man, self._clock, self._turn, self._mapping = dead_man, clock, turn, mapping
         self._echo, self._tell = echo, tell
         self._actuators = {number: _Actuator(ChannelInterpreter(trusted.sheet, number)) for number in numbers}
@@ -145,7 +145,7 @@ class TopicActuators:
     def _send(self, command: SetPointCommand, actuator: _Actuator, octets: bytes) -> None:
         self._seconds_left(command)
         if self._unsure:
-            self._trusted.node.request(CLOCK, "to tell its time", within=self._dead_man / 1000)
+            self._verified.node.request(CLOCK, "to tell its time", within=self._dead_man / 1000)
             self._unsure = False
         now = time.monotonic()
         if now >= actuator.claimed_until:
@@ -176,12 +176,12 @@ class TopicActuators:
 
     def _write(self, command: SetPointCommand, octets: bytes) -> None:
         words = write_data_set(command.channel, octets)
-        self._trusted.node.request(words, "to set the actuator", within=self._seconds_left(command))
+        self._verified.node.request(words, "to set the actuator", within=self._seconds_left(command))
 
     def _claim(self, number: int, actuator: _Actuator) -> None:
         actuator.driver = None
         try:
-            claim(self._trusted, number, lease=LEASE, dead_man=self._dead_man)
+            claim(self._verified, number, lease=LEASE, dead_man=self._dead_man)
         except NodeRefusedError as refusal:
             if refusal.reason != Reason.WRONG_STATE:  # it is claimed by this session still
                 raise
@@ -205,8 +205,8 @@ class TopicActuators:
         number = command.channel
         if actuator.driver is None:
             layout = Layout((number,), (len(octets),))
-            reply = DriveReply.decode(self._trusted.node.request(drive([number]), "to be driven"))
-            key = self._trusted.node.message_key
+            reply = DriveReply.decode(self._verified.node.request(drive([number]), "to be driven"))
+            key = self._verified.node.message_key
             actuator.driver = Driver(layout, reply, key, dead_man=self._dead_man, after=self._last_drive)
             self._last_drive = reply.run
         left = round(self._seconds_left(command) * 1e9)
@@ -223,7 +223,7 @@ class TopicActuators:
         value = np.asarray(one.unit.to_si(found.value), dtype=np.float64)  # type: ignore[arg-type]
         self._echo(
             Block(
-                uuid=self._trusted.uuid,
+                uuid=self._verified.uuid,
                 stream=ECHO,
                 channels=(number,),
                 index=actuator.count,

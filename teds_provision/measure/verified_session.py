@@ -164,7 +164,7 @@ def open_unverified(station: Station, node: Conversation, *, by: str) -> Verifie
         require_authentic(looked.verified)
     image = looked.image
     if looked.kept:  # its Security TEDS names no digest of the others: what was read before the start says nothing
-        c, image = node.c, read_image(node)
+        c, image = node.open_counter, read_image(node)
         verified = keep(
             station, node, image, by=by, known=freshness_floor_of(station, node.uuid, node.proven), c=c
         ).verified

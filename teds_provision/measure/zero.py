@@ -217,7 +217,7 @@ class _ZeroRun:
             step.result = DONE if written.octets else NOTHING
             step.detail = f"{written.octets} octets"
         with self.steps.step("verify") as step:
-            judged = verify_node(station, node, written.on_node, who.point, by=_NAME, c=node.c)
+            judged = verify_node(station, node, written.on_node, who.point, by=_NAME, c=node.open_counter)
             step.detail = judged.verified.verdict
             trusted = trusted_from(station, node, NodeVerification(written.on_node, judged))
             channel, own = _adjustable(trusted, found.channel.number)

@@ -43,10 +43,10 @@ class Daemon:
 
     def __init__(self, station: Station, settings: Settings) -> None:
         self.station, self.settings = station, settings
-        self.live, self.turns, self.tokens = Live(), NodeLocks(), Tokens(station.home)
-        self.roster = NodeDirectory(station, self.live)
+        self.live, self.node_locks, self.tokens = Live(), NodeLocks(), Tokens(station.home)
+        self.directory = NodeDirectory(station, self.live)
         self.buses = Buses(news=self._saw)
-        self.desk = NodeJobs(self.roster, self.turns, self._port_of)
+        self.node_jobs = NodeJobs(self.directory, self.node_locks, self._port_of)
         sinks = DaemonSinks(
             station.home,
             settings.sinks,
@@ -54,30 +54,41 @@ class Daemon:
             actuators=settings.actuators,
             brokers=settings.brokers,
         )
-        self.measuring = MeasurementSupervisor(
-            station, self.roster, self.live, self.turns, self.buses, sinks, self._admits, dead_man=settings.dead_man
+        self.measurements = MeasurementSupervisor(
+            station,
+            self.directory,
+            self.live,
+            self.node_locks,
+            self.buses,
+            sinks,
+            self._admits,
+            dead_man=settings.dead_man,
         )
-        self.turns.given = self._free_again
+        self.node_locks.given = self._free_again
         self._takes_set_points = sinks.take_set_points
-        self.names = Names(station, self.roster, self.live, self.measuring.is_measured, self.measuring.facts_of)
-        self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
-        self.provisioning = Provisioning(station, self.roster, self.live, self.desk, self.measuring.unmeasured)
-        self.holding = ActuatorLeases(
+        self.names = Names(
+            station, self.directory, self.live, self.measurements.is_measured, self.measurements.facts_of
+        )
+        self.sheets = Sheets(station, self.directory, self.node_jobs, self.measurements.sheet)
+        self.provisioning = Provisioning(
+            station, self.directory, self.live, self.node_jobs, self.measurements.unmeasured
+        )
+        self.leases = ActuatorLeases(
             station,
             self.live,
-            self.desk,
-            self.turns,
-            self.measuring.session,
-            self.measuring.is_measured,
+            self.node_jobs,
+            self.node_locks,
+            self.measurements.session,
+            self.measurements.is_measured,
             dead_man=settings.dead_man,
         )
         self.virtuals = Virtuals(station, self.live)
         self.plant = PlantWatch(station, self.live, self._plant_changed)
         self.adopting = AutoProvisioner(
-            station, self.roster, self.live, self.virtuals, lambda: self._adopts, signs=settings.yes
+            station, self.directory, self.live, self.virtuals, lambda: self._adopts, signs=settings.yes
         )
-        self.roster.topic, self.roster.actuator = self.names.topic, self.holding.state
-        self.roster.virtual = lambda uuid: uuid in self.virtuals
+        self.directory.topic, self.directory.actuator = self.names.topic, self.leases.state
+        self.directory.virtual = lambda uuid: uuid in self.virtuals
         self.url: str | None = None
         self.started = time.time()
         self._version = station.version()
@@ -95,20 +106,20 @@ class Daemon:
         """Links, measurements and the eye on the store, for the length of the block; then all let go, in order."""
         if self.settings.detection is not None and self.settings.detection != self.detection:
             self.set_detection(self.settings.detection)
-        self.roster.refresh()
+        self.directory.refresh()
         self._observer.start()
-        self.live.past.start()
+        self.live.history.start()
         for watch in self.watches:
             watch.start()
         if self.virtuals.all():
             self._start_virtuals()
-        self.measuring.start()
+        self.measurements.start()
         if self.settings.unverified:
-            self.measuring.unverified(rate=self.settings.rate)
+            self.measurements.unverified(rate=self.settings.rate)
         if self.settings.registry:
             self.plant.start()
         if self.settings.measure is not None:
-            self.measuring.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
+            self.measurements.match(self.settings.measure, rate=self.settings.rate, frozen=self.settings.frozen)
         try:
             yield
         finally:
@@ -118,8 +129,8 @@ class Daemon:
         """Actuators safe first, then claims released and files closed, then links, then the virtual nodes."""
         self._stop.set()
         self.plant.stop()
-        self.holding.end()
-        self.measuring.stop()
+        self.leases.end()
+        self.measurements.stop()
         for watch in self.watches:
             watch.stop()
         self.buses.close()
@@ -127,7 +138,7 @@ class Daemon:
         for watch in self.watches:
             watch.join(max(0.1, until - time.monotonic()))
         self.virtuals.stop()
-        self.live.past.close()
+        self.live.history.close()
         self._observer.join(_LOOK)
 
     async def serve(self, begin: Callable[[], Any], stop: asyncio.Event) -> None:
@@ -143,7 +154,7 @@ class Daemon:
 
     def _plant_changed(self) -> None:
         """Pages, keys or a roster came: pins, bans and verdicts may be others."""
-        self.roster.refresh()
+        self.directory.refresh()
         self.live.event("store", state="changed")
 
     def _watch(self, place: str) -> LinkWatch:
@@ -151,7 +162,9 @@ class Daemon:
             return self.detection == "transparent"
 
         buses, trace = self.buses, self.settings.trace
-        return LinkWatch(place, self.station, self.roster, self.live, self.turns, self, transparent, buses, trace)
+        return LinkWatch(
+            place, self.station, self.directory, self.live, self.node_locks, self, transparent, buses, trace
+        )
 
     def _start_virtuals(self) -> None:
         """Virtual transducers hang on a bus of their own, which is a link like others."""
@@ -169,7 +182,7 @@ class Daemon:
             version = self.station.version()
             if version != self._version:
                 self._version = version
-                self.roster.refresh()
+                self.directory.refresh()
                 self.names.forget()
                 self.live.event("store", state="changed")
 
@@ -187,7 +200,7 @@ class Daemon:
             self.live.event("vault", state="locked", why=problem["message"], hint=problem["hint"])
             return
         self.live.event("vault", state="open")
-        self.measuring.look_who_is_meant()
+        self.measurements.look_who_is_meant()
         for watch in self.watches:
             watch.look_at_all()
 
@@ -197,22 +210,22 @@ class Daemon:
         return next((watch.port for watch in self.watches if watch.place == place), None)
 
     def _saw(self, sighting: Sighting) -> None:
-        self.measuring.on_sighting(sighting.uuid.hex())
+        self.measurements.on_sighting(sighting.uuid.hex())
         for watch in self.watches:
             if watch.port is sighting.port:
                 watch.on_sighting(sighting)
 
     def _free_again(self, uuid: str) -> None:
         """A node was looked at, or provisioned: now it may be one that is measured."""
-        if self.roster.seen(uuid).present:
-            self.measuring.on_sighting(uuid)
+        if self.directory.seen(uuid).present:
+            self.measurements.on_sighting(uuid)
 
     def serve_node(self, node: Conversation) -> bool:
         """Whether somebody asked for this node, or it is to be taken up; then that was done."""
         before = node.identity.state
-        served = self.desk.serve(node) or self.adopting.serve(node)
+        served = self.node_jobs.serve(node) or self.adopting.serve(node)
         if served or node.identity.state != before:  # what a measurement refused it for may be gone
-            self.measuring.look_who_is_meant()
+            self.measurements.look_who_is_meant()
         return served
 
     @property
@@ -238,16 +251,16 @@ class Daemon:
             "nodes": sum(link["nodes"] for link in links),
             "strangers": sum(link["strangers"] for link in links),
             "clients": self.live.listeners,
-            "measurements": self.measuring.all(),
-            "sinks": self.measuring.sinks(),
-            "clock_error": self.measuring.clock_error(),
-            "budget": self.measuring.budget(),
+            "measurements": self.measurements.all(),
+            "sinks": self.measurements.sinks(),
+            "clock_error": self.measurements.clock_error(),
+            "budget": self.measurements.budget(),
             "plant": self.station.plant.joined is not None,
             "vault": {"state": "open" if self._vault_problem is None else "locked", "problem": self._vault_problem},
         }
 
     def _admits(self, set_point: SetPointCommand) -> bool:
-        return self.holding.admits(set_point)
+        return self.leases.admits(set_point)
 
     def _link(self, watch: LinkWatch) -> dict[str, Any]:
         state = watch.state
@@ -260,8 +273,8 @@ class Daemon:
             "waiting": state.waiting or None,
             "notice": state.told or None,
             "since": state.since,
-            "nodes": self.roster.present(watch.place),
-            "strangers": self.roster.strangers(watch.place),
+            "nodes": self.directory.present(watch.place),
+            "strangers": self.directory.strangers(watch.place),
         }
 
     def hello(self) -> dict[str, Any]:
@@ -284,11 +297,11 @@ class Daemon:
         with self.station.durable("detection"):
             self.station.measurements.detection = mode  # type: ignore[assignment]
             self.station.audit("detection", None, "set", mode=mode)
-        self.measuring.look_who_is_meant()
+        self.measurements.look_who_is_meant()
         self.live.event("detection", state=mode)
         for watch in self.watches:
             if changes:
-                self.roster.forget_place(watch.place)
+                self.directory.forget_place(watch.place)
             watch.look_at_all()
 
     def discover(self) -> list[dict[str, Any]]:
@@ -296,24 +309,24 @@ class Daemon:
         for watch in self.watches:
             watch.look_at_all()
         self._stop.wait(_DISCOVERY)
-        return self.roster.nodes()
+        return self.directory.nodes()
 
     def known(self, text: str) -> str:
         """The UUID that a path names, of a node that something is known of; raises NotFoundError, UsageError."""
         uuid = self.resolve(text)
-        if not self.roster.known(uuid) and not self.station.nodes.is_known(bytes.fromhex(uuid)):
+        if not self.directory.known(uuid) and not self.station.nodes.is_known(bytes.fromhex(uuid)):
             raise NotFoundError(f"No node matches {uuid!r}.", hint="See /nodes.")
         return uuid
 
     def resolve(self, text: str) -> str:
         """The UUID that a word names: whole, or a prefix or name as everywhere; raises NotFoundError, UsageError."""
         digits = text.lower().removeprefix("0x")
-        if self.roster.known(digits):
+        if self.directory.known(digits):
             return digits
         try:
             return self.station.nodes.resolve(text).hex()
         except NotFoundError:
-            near = [uuid for uuid in self.roster.uuids() if uuid.startswith(digits)] if len(digits) >= 4 else []
+            near = [uuid for uuid in self.directory.uuids() if uuid.startswith(digits)] if len(digits) >= 4 else []
             if len(near) == 1:
                 return near[0]
             raise
@@ -334,7 +347,7 @@ class Daemon:
             {
                 "name": group.name,
                 "uuids": [uuid.hex() for uuid in group.uuids],
-                "measuring": self.measuring.group_is_measured(group.name),
+                "measuring": self.measurements.group_is_measured(group.name),
             }
             for group in self.station.groups.all()
         ]
@@ -365,14 +378,14 @@ class Daemon:
         self._group_changed(name)
 
     def _require_thawed(self, name: str) -> None:
-        if self.measuring.group_is_measured(name):
+        if self.measurements.group_is_measured(name):
             raise FrozenError(
                 f"Group {name!r} is being measured and cannot be changed now.", hint="End the measurement first."
             )
 
     def _group_changed(self, name: str) -> None:
-        self.roster.refresh()
-        self.measuring.look_who_is_meant()
+        self.directory.refresh()
+        self.measurements.look_who_is_meant()
         self.live.event("group", state="changed", name=name)
 
     # -- virtual transducers -----------------------------------------------------------------------------------------
@@ -383,7 +396,7 @@ class Daemon:
         """Make one and start it; it is provisioned when it answers. Raises UsageError, BadDataError, NotFoundError."""
         made = self.virtuals.make(name=name, source=source, content=content, profile=profile)
         self._start_virtuals()
-        self.roster.refresh([made.uuid])
+        self.directory.refresh([made.uuid])
         return made.as_json()
 
     def drop_virtual(self, uuid: str) -> None:
@@ -391,11 +404,11 @@ class Daemon:
 
         Raises NotFoundError, FrozenError (it is measured), NodeBusyError (it is worked on).
         """
-        with self.turns.hold(uuid, "it is removed"):
+        with self.node_locks.hold(uuid, "it is removed"):
             with self.station.lock("virtual"):  # nobody begins to measure it meanwhile
-                if self.measuring.measurement_of(uuid) is not None:
+                if self.measurements.measurement_of(uuid) is not None:
                     raise FrozenError(f"Node {uuid} is being measured.", hint="End the measurement first.")
                 one = self.virtuals.forget(uuid)
             self.virtuals.end(one)
-            self.roster.note(uuid, "left", present=False)
-        self.roster.refresh()
+            self.directory.note(uuid, "left", present=False)
+        self.directory.refresh()

@@ -74,7 +74,7 @@ class _LostNode:
 
 @dataclass
 class _Member:
-    keeper: NodeSupervisor | None = None
+    supervisor: NodeSupervisor | None = None
     stack: ExitStack = field(default_factory=ExitStack)
     load: NodeLoad = field(default_factory=NodeLoad)
 
@@ -105,7 +105,7 @@ class DynamicMembership:
         budget: float | None,
         rows: bool,
     ) -> None:
-        self._station, self._roster, self._turns, self._buses, self._job = station, roster, turns, buses, job
+        self._station, self._directory, self._node_locks, self._buses, self._job = station, roster, turns, buses, job
         self._match, self._elsewhere, self._budget = match, elsewhere, budget
         self._rows = rows
         self._told_joined, self._told_left, self._told_waiting = joined, left, waiting
@@ -146,14 +146,14 @@ class DynamicMembership:
     @property
     def taken(self) -> int:
         """How many nodes that are meant and there are another measurement's."""
-        return sum(self._roster.seen(uuid).present and self._elsewhere(uuid) for uuid in list(self._others))
+        return sum(self._directory.seen(uuid).present and self._elsewhere(uuid) for uuid in list(self._others))
 
     def _says_factory(self, uuid: str) -> bool:
         """Whether it says that it has no key: one that was refused here a moment ago is left to whoever adopts it.
 
         That is a hint, as anyone may send it: it costs the half minute until a refused node is tried again anyway.
         """
-        sighting = self._buses.sightings.seen_at(bytes.fromhex(uuid))
+        sighting = self._buses.presence.seen_at(bytes.fromhex(uuid))
         return sighting is not None and sighting.identity.state == NodeState.FACTORY
 
     def _why_not(self, uuid: str) -> str:
@@ -162,7 +162,7 @@ class DynamicMembership:
 
     def _arrive(self, uuid: str) -> None:
         try:
-            self._turns.acquire(uuid, f"measurement {self._job.kept.id}", wait=0.0, frozen=True)
+            self._node_locks.acquire(uuid, f"measurement {self._job.kept.id}", wait=0.0, frozen=True)
         except TedsProvisionError:  # it is looked at, or provisioned: it joins when that is done
             with self._guard:
                 self._busy[uuid] = time.monotonic() + LOOK
@@ -180,8 +180,8 @@ class DynamicMembership:
         """Let a node go for good; it may come again."""
         with self._guard:
             member = self._members.get(uuid)
-        if member is not None and member.keeper is not None:
-            member.keeper.stop(why)
+        if member is not None and member.supervisor is not None:
+            member.supervisor.stop(why)
 
     # -- the measurement's thread ------------------------------------------------------------------------------------
 
@@ -219,7 +219,7 @@ class DynamicMembership:
         with self._guard:
             arrived, self._arrived = list(self._arrived), {}
         for uuid in arrived:
-            self._turns.release(uuid)
+            self._node_locks.release(uuid)
         self._askers.shutdown(wait=False, cancel_futures=True)
 
     def _gather(self) -> None:
@@ -240,7 +240,7 @@ class DynamicMembership:
         if now - self._welcomed >= WELCOMING:
             self._welcomed = now
             held = {uuid for uuid, *_ in self._station.keys.all_key_names()}
-            self._buses.sightings.welcome(held)
+            self._buses.presence.welcome(held)
         changed = version != self._version or self._anew.is_set()
         if not changed or now - self._followed < FOLLOWING:
             return
@@ -249,8 +249,8 @@ class DynamicMembership:
         self._others.clear()  # whoever is still meant is seen again below
         for uuid, member in list(self._members.items()):
             why = self._why_not(uuid)
-            if why and member.keeper is not None:
-                member.keeper.stop(why)
+            if why and member.supervisor is not None:
+                member.supervisor.stop(why)
         for uuid in [uuid for uuid in self._left if self._why_not(uuid)]:
             self._is_past(uuid)
         mended = [
@@ -258,13 +258,13 @@ class DynamicMembership:
         ]  # it may be, what it was refused for
         for uuid in mended:
             del self._waits[uuid]
-        for uuid in dict.fromkeys((*mended, *(sighting.uuid.hex() for sighting in self._buses.sightings.all()))):
-            if uuid not in self._waits and self._roster.seen(uuid).present:
+        for uuid in dict.fromkeys((*mended, *(sighting.uuid.hex() for sighting in self._buses.presence.all()))):
+            if uuid not in self._waits and self._directory.seen(uuid).present:
                 self.on_sighting(uuid)
 
     def _reserve(self, uuid: str) -> None:
         """Say what it wants of its bus before the first of those that come together is given its part."""
-        sighting = self._buses.sightings.seen_at(bytes.fromhex(uuid))
+        sighting = self._buses.presence.seen_at(bytes.fromhex(uuid))
         if sighting is None:
             return
         share = self._buses.bus_of(sighting).share
@@ -285,7 +285,7 @@ class DynamicMembership:
 
     def _join(self, uuid: str, measurement: Measurement) -> None:
         member, octets = self._members[uuid], bytes.fromhex(uuid)
-        sighting = self._buses.sightings.seen_at(octets)
+        sighting = self._buses.presence.seen_at(octets)
         if sighting is None or self._why_not(uuid):
             self._release(uuid)
             if sighting is None and uuid in self._places:  # a session failed there: whoever answers there joins
@@ -305,7 +305,7 @@ class DynamicMembership:
         self._waits.pop(uuid, None)
         self._left.discard(uuid)
         self._told_joined(uuid)
-        member.keeper = measurement.join(octets)
+        member.supervisor = measurement.join(octets)
 
     def _wait(self, uuid: str, why: str, room: float | None, seconds: float = AGAIN) -> None:
         self._release(uuid)
@@ -316,10 +316,10 @@ class DynamicMembership:
 
     def _reap(self, uuid: str, now: float) -> None:
         """Let a node go whose keeper has ended, unless it is only lent; see why, and when it is tried again."""
-        keeper = self._members[uuid].keeper
+        keeper = self._members[uuid].supervisor
         if keeper is None or not keeper.done.is_set() or keeper.uuid in self._job.lent:
             return
-        error, sighting = keeper.error, self._buses.sightings.seen_at(keeper.uuid)
+        error, sighting = keeper.error, self._buses.presence.seen_at(keeper.uuid)
         last = keeper.sighting
         if last is not None:
             self._places[uuid] = last
@@ -345,7 +345,7 @@ class DynamicMembership:
         member.stack.close()
         for bus in self._buses.all():
             bus.share.leave(bytes.fromhex(uuid))
-        self._turns.release(uuid)
+        self._node_locks.release(uuid)
         self._left.add(uuid)
         self._told_left(uuid)
 
@@ -359,12 +359,12 @@ class DynamicMembership:
             for uuid in busy:
                 del self._busy[uuid]
         for uuid in busy:
-            if self._roster.seen(uuid).present:
+            if self._directory.seen(uuid).present:
                 self.on_sighting(uuid)
         for uuid, waits in list(self._waits.items()):
             if now >= waits.at or (waits.room is not None and self._room_of(uuid) > waits.room + 1e-6):
                 del self._waits[uuid]
-                if self._roster.seen(uuid).present:
+                if self._directory.seen(uuid).present:
                     self.on_sighting(uuid)
                 else:
                     self._is_past(uuid)
@@ -376,12 +376,12 @@ class DynamicMembership:
                 self._askers.submit(self._ask, lost.sighting)
 
     def _room_of(self, uuid: str) -> float:
-        sighting = self._buses.sightings.seen_at(bytes.fromhex(uuid))
+        sighting = self._buses.presence.seen_at(bytes.fromhex(uuid))
         return self._buses.bus_of(sighting).share.room if sighting is not None else 0.0
 
     def _ask(self, sighting: Sighting) -> None:
         """Ask a lost node where it was; where it answers, it is seen, and so joins."""
         with suppress(LinkError, KeyError):
-            lookout = self._buses.bus_of(sighting).lookout
+            lookout = self._buses.bus_of(sighting).discovery
             if isinstance(sighting.port, CanPort) and isinstance(lookout, CanDiscovery):
                 lookout.identify_at(sighting.address, ANSWERING)

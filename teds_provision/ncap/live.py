@@ -107,11 +107,11 @@ class _Channel:
 class Live:
     """The fan-out. ``block`` and ``event`` may be called from any thread and return at once.
 
-    ``past`` keeps the last hour of what comes.
+    ``history`` keeps the last hour of what comes.
     """
 
     def __init__(self) -> None:
-        self.past = History()
+        self.history = History()
         self._lock = threading.Lock()
         self._waiting: deque[Block] = deque()
         self._channels: dict[Key, _Channel] = {}
@@ -128,7 +128,7 @@ class Live:
 
     def block(self, block: Block) -> None:
         """Samples of a stream."""
-        self.past.block(block)
+        self.history.block(block)
         with self._lock:
             if len(self._waiting) >= _WAITING:
                 self._waiting.popleft()

@@ -61,7 +61,7 @@ class RunningMeasurement:
 
     kept: KeptMeasurement
     uuids: tuple[str, ...]  # of one that takes in whoever comes: those that are in
-    newcomers: DynamicMembership | None = None
+    membership: DynamicMembership | None = None
     job: MeasurementJob | None = None
     state: str = "starting"
     why: str = ""
@@ -98,7 +98,7 @@ class MeasurementSupervisor:
         *,
         dead_man: int = DEAD_MAN,
     ) -> None:
-        self._station, self._roster, self._live, self._turns = station, roster, live, turns
+        self._station, self._directory, self._live, self._node_locks = station, roster, live, turns
         self._unverified: UnsignedNodes | None = None
         self._adopted: set[bytes] = set()
         self._buses, self._sinks, self._admits = buses, sinks, admits
@@ -146,12 +146,14 @@ class MeasurementSupervisor:
         loan = NodeLoan(uuid, why)
         with self._guard:
             every = [
-                running for running in self._running.values() if running.newcomers is not None and uuid in running.uuids
+                running
+                for running in self._running.values()
+                if running.membership is not None and uuid in running.uuids
             ]
         mine = [
-            running.newcomers
+            running.membership
             for running in every
-            if running.kept.id == UnsignedNodes.text and running.newcomers is not None
+            if running.kept.id == UnsignedNodes.text and running.membership is not None
         ]
         with self._lending:
             self._loans.setdefault(uuid, []).append(loan)
@@ -168,14 +170,14 @@ class MeasurementSupervisor:
     def on_sighting(self, uuid: str) -> None:
         """A node answered on a bus; called before anybody else looks at it."""
         with self._guard:
-            every = [running.newcomers for running in self._running.values() if running.newcomers is not None]
+            every = [running.membership for running in self._running.values() if running.membership is not None]
         for newcomers in every:
             newcomers.on_sighting(uuid)
 
     def look_who_is_meant(self) -> None:
         """Who may be measured, or what an expression names, changed in this process: a group, a key, a datasheet."""
         with self._guard:
-            every = [running.newcomers for running in self._running.values() if running.newcomers is not None]
+            every = [running.membership for running in self._running.values() if running.membership is not None]
         for newcomers in every:
             newcomers.look_who_is_meant()
 
@@ -327,7 +329,7 @@ class MeasurementSupervisor:
     def is_measured(self, uuid: str) -> bool:
         """Whether a node is in a session of a measurement now."""
         job = self._job_of(uuid)
-        return job is not None and job.measurement is not None and self._turns.holder(uuid) is not None
+        return job is not None and job.measurement is not None and self._node_locks.holder(uuid) is not None
 
     def facts_of(self, uuid: str) -> StationFacts | None:
         """What the sinks of the running measurement of a node were told of the station's names; None: none runs."""
@@ -398,15 +400,15 @@ class MeasurementSupervisor:
             if job is not None:
                 job.resume_node(bytes.fromhex(loan.uuid))
                 return
-        if self._roster.seen(loan.uuid).present:
+        if self._directory.seen(loan.uuid).present:
             self.on_sighting(loan.uuid)
 
     def _ask_where_it_is(self, uuid: bytes) -> None:
         """A node that was given another address does not announce it: it is asked there, as the store knows it."""
-        seen, record = self._buses.sightings.seen_at(uuid), self._station.nodes.get(uuid)
+        seen, record = self._buses.presence.seen_at(uuid), self._station.nodes.get(uuid)
         if seen is None or record is None or record.can_address in (None, seen.address):
             return
-        lookout = self._buses.bus_of(seen).lookout
+        lookout = self._buses.bus_of(seen).discovery
         if isinstance(lookout, CanDiscovery):
             with suppress(LinkError):
                 lookout.identify_at(record.can_address, ANSWERING)
@@ -444,7 +446,7 @@ class MeasurementSupervisor:
         kept = running.kept
         with self._guard:
             left = (
-                [uuid for uuid in running.reports if uuid not in running.past] if running.newcomers is not None else []
+                [uuid for uuid in running.reports if uuid not in running.past] if running.membership is not None else []
             )
         return {
             "id": kept.id,
@@ -531,7 +533,7 @@ class MeasurementSupervisor:
                 if running.stop.is_set():
                     return False
                 taken.append(uuid)
-                self._roster.note(uuid, measurement=running.kept.id)
+                self._directory.note(uuid, measurement=running.kept.id)
             job = running.job = self._new_job(running)
             self._publish_state(running, "starting")
             job.start(self._buses, self._watcher(running))
@@ -546,8 +548,8 @@ class MeasurementSupervisor:
             self._publish_state(running, "failed", error.message)
         finally:
             for uuid in taken:
-                self._turns.release(uuid)
-                self._roster.note(uuid, "idle", measurement=None, report=None)
+                self._node_locks.release(uuid)
+                self._directory.note(uuid, "idle", measurement=None, report=None)
         return False
 
     def _who(self, kept: KeptMeasurement) -> NodeMatch | UnsignedNodes | ListedNodes:
@@ -605,7 +607,7 @@ class MeasurementSupervisor:
             with self._guard:
                 running.uuids = (*running.uuids, uuid)
                 running.past.discard(uuid)
-            self._roster.note(uuid, measurement=running.kept.id)
+            self._directory.note(uuid, measurement=running.kept.id)
             if unverified:  # signed later, it is measured on by the other of the two that unverified() begins
                 self._adopted.add(bytes.fromhex(uuid))
 
@@ -614,7 +616,7 @@ class MeasurementSupervisor:
                 there = uuid in running.uuids
                 running.uuids = tuple(other for other in running.uuids if other != uuid)
             if there:
-                self._roster.note(uuid, "idle", measurement=None, report=None)
+                self._directory.note(uuid, "idle", measurement=None, report=None)
 
         def past(uuid: str) -> None:
             with self._guard:
@@ -632,8 +634,8 @@ class MeasurementSupervisor:
             live = [sink for sink in job.sinks if not sink.recorder]  # a file takes what comes: no budget is for it
             newcomers = DynamicMembership(
                 self._station,
-                self._roster,
-                self._turns,
+                self._directory,
+                self._node_locks,
                 self._buses,
                 job,
                 self._who(running.kept),
@@ -647,7 +649,7 @@ class MeasurementSupervisor:
                 budget=BUDGET if live else None,
                 rows=any(sink.wants_rows for sink in live),
             )
-            running.newcomers = newcomers
+            running.membership = newcomers
         except TedsProvisionError as error:
             self._publish_state(running, "failed", error.message)
             return
@@ -666,7 +668,7 @@ class MeasurementSupervisor:
     def _wait_for_turn(self, running: RunningMeasurement, uuid: str) -> None:
         while not running.stop.is_set():
             try:
-                self._turns.acquire(uuid, f"measurement {running.kept.id}", frozen=True)
+                self._node_locks.acquire(uuid, f"measurement {running.kept.id}", frozen=True)
                 return
             except TedsProvisionError as error:
                 self._publish_state(running, "waiting", error.message)
@@ -693,8 +695,8 @@ class MeasurementSupervisor:
         def facts(said: Sequence[ChannelFacts]) -> None:
             self._live.learn(said)
             for uuid in {fact.uuid for fact in said}:
-                self._roster.show_sheet(uuid, None)
-                self._roster.refresh([uuid])
+                self._directory.show_sheet(uuid, None)
+                self._directory.refresh([uuid])
 
         def sink(failed: Sink) -> None:
             self._live.event("sink", **sink_json(running.kept.id, failed))
@@ -703,8 +705,8 @@ class MeasurementSupervisor:
             self._live.event("measurement", state="note", id=running.kept.id, why=text)
 
         def read(uuid: bytes) -> None:
-            self._roster.refresh([uuid.hex()])
-            self._roster.note(uuid.hex(), "verified", looked=time.time())
+            self._directory.refresh([uuid.hex()])
+            self._directory.note(uuid.hex(), "verified", looked=time.time())
 
         return Watcher(self._live.block, facts, report, sink, note, read)
 
@@ -725,9 +727,9 @@ class MeasurementSupervisor:
         elif changed and said.state in ("lost", "refused", "waiting") and said.why and self._is_of(said.uuid, running):
             facts["problem"] = as_problem(TedsProvisionError(said.why))
         if changed:
-            self._roster.refresh([said.uuid])
-        self._roster.note(said.uuid, said.state if changed else None, **facts)
-        if changed and running.job is not None and not running.stop.is_set() and running.newcomers is None:
+            self._directory.refresh([said.uuid])
+        self._directory.note(said.uuid, said.state if changed else None, **facts)
+        if changed and running.job is not None and not running.stop.is_set() and running.membership is None:
             self._publish_state(running, *_state_of(running, running.job))
 
     def _is_of(self, uuid: str, running: RunningMeasurement) -> bool:
@@ -754,7 +756,7 @@ def _state_of_open(running: RunningMeasurement, job: MeasurementJob, unknown: st
         return "running", ""
     if job.error is not None:
         return "waiting", job.error.message
-    taken = running.newcomers.taken if running.newcomers is not None else 0
+    taken = running.membership.taken if running.membership is not None else 0
     if taken:
         return "waiting", f"{taken} matching node{'s are' if taken > 1 else ' is'} measured by another measurement"
     return "waiting", (unknown if not running.reports else "") or "no matching node is present"

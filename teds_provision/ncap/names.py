@@ -30,7 +30,7 @@ class Names:
         is_measured: Callable[[str], bool],
         in_use: Callable[[str], StationFacts | None],
     ) -> None:
-        self._station, self._roster, self._live, self._is_measured = station, roster, live, is_measured
+        self._station, self._directory, self._live, self._is_measured = station, roster, live, is_measured
         self._in_use = in_use
         self._of_running: tuple[StationFacts, int, Topics] | None = None
         self._guard = threading.Lock()
@@ -41,7 +41,7 @@ class Names:
         """A chosen name has changed: make them anew when somebody asks. Nodes and datasheets are followed anyway."""
         with self._guard:
             self._topics = None
-        self._roster.touch()
+        self._directory.touch()
 
     def topic(self, uuid: str, channel: int) -> str:
         """Whole topic of a channel."""
@@ -51,11 +51,11 @@ class Names:
         """Every channel with its topic, and what was chosen for it; channel 0 is the node's part."""
         now, chosen = self._now(), self._station.measurements.names
         found = []
-        for uuid in self._roster.uuids():
+        for uuid in self._directory.uuids():
             topics = self._topics_of(uuid, now)
             raw = bytes.fromhex(uuid)
             found.append({"uuid": uuid, "channel": 0, "name": chosen.get((raw, 0)), "topic": topics.node(uuid)})
-            for number, _ in self._roster.channel_names(uuid):
+            for number, _ in self._directory.channel_names(uuid):
                 name = chosen.get((raw, number))
                 found.append({"uuid": uuid, "channel": number, "name": name, "topic": topics.channel(uuid, number)})
         return found
@@ -70,7 +70,7 @@ class Names:
                 f"{name!r} is not a valid topic name.",
                 hint="Use letters, digits and single _, beginning with a letter; / between parts.",
             )
-        known = [number for number, _ in self._roster.channel_names(uuid)]
+        known = [number for number, _ in self._directory.channel_names(uuid)]
         if name is not None and channel and known and channel not in known:
             raise NotFoundError(
                 f"{uuid} has no channel {channel}.", hint=f"Channels in its datasheet: {', '.join(map(str, known))}."
@@ -92,7 +92,7 @@ class Names:
         self._live.event("names", state="changed", uuid=uuid, channel=channel)
 
     def _now(self) -> Topics:
-        changes = self._roster.changes
+        changes = self._directory.changes
         with self._guard:
             topics = self._topics if self._made_of == changes else None
         if topics is not None:
@@ -104,11 +104,11 @@ class Names:
 
     def _learn_topics(self, station: StationFacts) -> Topics:
         topics = Topics(station)
-        for uuid in self._roster.uuids():
-            called, unverified = self._roster.called(uuid)
+        for uuid in self._directory.uuids():
+            called, unverified = self._directory.called(uuid)
             topics.learn(
                 ChannelFacts(uuid, called, number, name, unverified=unverified)
-                for number, name in self._roster.channel_names(uuid)
+                for number, name in self._directory.channel_names(uuid)
             )
         return topics
 
@@ -117,7 +117,7 @@ class Names:
         facts = self._in_use(uuid)
         if facts is None:
             return now
-        changes, made = self._roster.changes, self._of_running
+        changes, made = self._directory.changes, self._of_running
         if made is None or made[0] is not facts or made[1] != changes:
             made = self._of_running = (facts, changes, self._learn_topics(facts))
         return made[2]

@@ -47,7 +47,7 @@ class PlantWatch:
         self._station, self._live, self._changed = station, live, changed
         self._wake, self._stop = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
-        self._post: Transport | None = None
+        self._transport: Transport | None = None
         self._listener: Registry | None = None
         self._told = ("", "")
         self._look_again = 0.0
@@ -63,7 +63,7 @@ class PlantWatch:
         """End: a sync that is under way is cut, and the next one carries on."""
         self._stop.set()
         self._wake.set()
-        for connection in (self._post, self._listener):
+        for connection in (self._transport, self._listener):
             if isinstance(connection, PostgresTransport | Registry):
                 connection.interrupt()
         for thread in self._threads:
@@ -92,7 +92,7 @@ class PlantWatch:
                     "name": standing.name,
                     "fingerprint": standing.fingerprint,
                     "roles": list(standing.roles),
-                    "page": standing.n,
+                    "page": standing.number,
                     "age": standing.age,
                     "state": standing.state,
                 }
@@ -160,15 +160,15 @@ class PlantWatch:
         """One sync; True where another command of this home is at it."""
         station = self._station
         try:
-            if self._post is None:
-                self._post = plant.connecting.open_transport(station)
-            if self._post is None:
+            if self._transport is None:
+                self._transport = plant.connecting.open_transport(station)
+            if self._transport is None:
                 self._publish_state("unreachable", "nothing is known that carries: registry connect")
                 return False
             self._say_daily()
-            done = plant.sync.sync(station, self._post)
+            done = plant.sync.sync(station, self._transport)
             if time.monotonic() >= self._look_again:
-                plant.connecting.check_database(station, self._post)
+                plant.connecting.check_database(station, self._transport)
                 self._look_again = time.monotonic() + _DATABASE_CHECK
         except StoreLockedError:
             return True

@@ -152,7 +152,7 @@ class VirtualNode:
         self._delays = delays or Delays()
         self.flash_file = FlashFile(folder, delay=self._delays.flash, exclusive=exclusive)
         self.board = board(self.flash_file)
-        self._core, self._pulse = _Core(), pulse
+        self._core, self._realtime_loop = _Core(), pulse
         self._wire = threading.Lock()
         self._sampled = 0
         self._told_missed, self._tell_at = 0, 0.0
@@ -343,8 +343,8 @@ class VirtualNode:
             time.sleep(wait)
 
     def _wake(self) -> None:
-        if self._pulse is not None and self.board is not None:
-            self._pulse.wake(self)
+        if self._realtime_loop is not None and self.board is not None:
+            self._realtime_loop.wake(self)
 
     # -- slow parts ------------------------------------------------------------------------------------------------
 

@@ -136,13 +136,13 @@ def take_pages(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
             tables.put_heads(chain.chain, page.heads)
         fresh = recount(station, chain, roster)
         for page in pages:
-            if (page.n, page.hash) not in fresh:  # on no branch that counts; what it bans is banned all the same
+            if (page.number, page.hash) not in fresh:  # on no branch that counts; what it bans is banned all the same
                 _keep_bans(station, chain, page.events, counts=False)
 
 
 def row_of(page: Page) -> PageRow:
     """A page as the store keeps it."""
-    return PageRow(page.n, page.hash, page.previous, page.created, page.home, *split(page.octets))
+    return PageRow(page.number, page.hash, page.previous, page.created, page.home, *split(page.octets))
 
 
 def recount(station: Station, chain: Chain, roster: Roster) -> set[tuple[int, str]]:

@@ -30,7 +30,7 @@ def open_carried(carried: CarriedPage, roster: Roster, station: str) -> Page:
     Raises NotAuthenticError, NewerFormatError.
     """
     page = open_page(carried.octets, roster.registry, roster.point_of)
-    if page.station != station or page.n != carried.n:
+    if page.station != station or page.number != carried.number:
         raise NotAuthenticError("It is in the place of another page.")
     return page
 
@@ -45,7 +45,7 @@ def read_pages(carried: Iterable[CarriedPage], roster: Roster, station: str) -> 
         except NewerFormatError:
             raise
         except TedsProvisionError:
-            junk.append(carried_page.n)
+            junk.append(carried_page.number)
     return good, junk
 
 
@@ -62,7 +62,7 @@ def fetch(station: Station, post: Transport, roster: Roster) -> int:
         newest = max((n for n, _, _ in station.plant.tables.page_names(chain.chain)), default=0)
         taken = take_carried(station, roster, fingerprint, post.pages(fingerprint, newest))
         fetched += taken.pages
-        _report_junk(station, roster, fingerprint, [carried.n for carried in taken.junk], post)
+        _report_junk(station, roster, fingerprint, [carried.number for carried in taken.junk], post)
         note_waiting(station, fingerprint, taken)
     return fetched
 
@@ -94,9 +94,9 @@ def take_carried(
             taken.junk.append(carried)
             on_junk(carried)
             continue
-        if page.n - 1 not in numbers:
+        if page.number - 1 not in numbers:
             break
-        numbers.add(page.n)
+        numbers.add(page.number)
         known.add(page.hash)
         batch.append(page)
         taken.pages += 1

@@ -167,7 +167,7 @@ def branch(station: Station, of: str, hash: str | None, post: Transport | None) 
     branches = by_number[n]
     wanted = _among(branches, hash)
     if hash is None and post is not None and not post.everybody:
-        shown = {carried.n: carried for carried in post.pages(of, n - 1)}
+        shown = {carried.number: carried for carried in post.pages(of, n - 1)}
         wanted = [branch for branch in branches if n in shown and hash_of(shown[n].octets) == branch]
     if len(wanted) != 1:
         listed = ", ".join(branch[:16] for branch in branches)

@@ -112,7 +112,7 @@ def _octets(database: Returned, offers: Sequence[Offer], liars: Collection[str])
 
 def _report_forged(station: Station, roster: Roster, carried: CarriedPage) -> None:
     who, whose = roster.name_of(carried.by), roster.name_of(carried.station)
-    alarm(station, FORGED, carried.by, carried.n, f"{who} handed in a page of {whose} that {whose} did not sign")
+    alarm(station, FORGED, carried.by, carried.number, f"{who} handed in a page of {whose} that {whose} did not sign")
 
 
 def hand_in(station: Station, database: Returned, roster: Roster) -> tuple[int, list[str]]:

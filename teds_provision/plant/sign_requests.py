@@ -120,7 +120,7 @@ class Inbox:
     """
 
     def __init__(self, station: Station, post: Transport, kind: DocumentKind) -> None:
-        self._station, self._post, self._kind = station, post, kind
+        self._station, self._transport, self._kind = station, post, kind
         self._known: set[str] = set()
         self._listener: postgres.Registry | None = None
         self._hears = isinstance(post, postgres.PostgresTransport)
@@ -134,11 +134,11 @@ class Inbox:
             if row.id not in self._known:
                 self._known.add(row.id)
                 found.append(Delivery(document, partial(self._drop, row.id, tables.drop_parcel, "in")))
-        for parcel in self._post.new_parcels(own, self._known):
+        for parcel in self._transport.new_parcels(own, self._known):
             self._known.add(parcel.id)
             opened = self._opened(parcel.octets)
             if opened is not None:
-                found.append(Delivery(opened, partial(self._drop, parcel.id, self._post.drop, own)))
+                found.append(Delivery(opened, partial(self._drop, parcel.id, self._transport.drop, own)))
         return found
 
     def _drop(self, parcel: str, drop: Callable[[str, Any], object], of: str) -> None:
@@ -218,7 +218,7 @@ class RemoteOffice:
     """
 
     def __init__(self, station: Station, post: Transport, timeout: float) -> None:
-        self.station, self.post, self.timeout = station, post, timeout
+        self.station, self.transport, self.timeout = station, post, timeout
         self._inbox = Inbox(station, post, SIGNED)
         self._news = threading.Condition()
         self._came: dict[tuple[str, str], Delivery] = {}
@@ -226,7 +226,7 @@ class RemoteOffice:
 
     def request_signature(self, request: SignRequest) -> bytes | None:
         """Send the request and wait for its answer; what others than that office signed answers nothing."""
-        send(self.station, self.post, request.to, request.octets, name_of(request.hash))
+        send(self.station, self.transport, request.to, request.octets, name_of(request.hash))
         wanted = request.to, request.hash
         until, pause = time.monotonic() + self.timeout, _LOOK_SECONDS
         while True:
@@ -265,7 +265,7 @@ class RemoteOffice:
     def close(self) -> None:
         """Let go of what carries."""
         self._inbox.close()
-        self.post.close()
+        self.transport.close()
 
 
 @dataclass

@@ -28,7 +28,7 @@ class StationStanding:
     name: str
     fingerprint: str
     roles: tuple[str, ...]
-    n: int
+    number: int
     age: int | None
     state: str
 
@@ -112,7 +112,7 @@ class StatedEvent:
     """An event as a station said it, on page ``n``; ``counts``: whether the page does."""
 
     station: str
-    n: int
+    number: int
     counts: bool
     event: dict[str, Any]
 

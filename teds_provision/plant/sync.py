@@ -165,7 +165,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
     above = max(0, joined.acknowledged - 1) if connected and not restored else 0
     appended = _own_pages(station, post, roster, done, above)
     found = appended + returned.own(station, post.returned, roster, {page.hash for page in appended})
-    new = [page for page in found if (page.n, page.hash) not in known]
+    new = [page for page in found if (page.number, page.hash) not in known]
     if new and restored and _follows(chain, new):
         adopt(station, roster, new)
         station.plant.tables.end_alarms("fork", station.fingerprint)
@@ -178,7 +178,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
     else:
         _require_resumed(station)
     if restored:
-        _require_all_seen(station, roster, {page.n for page in found})
+        _require_all_seen(station, roster, {page.number for page in found})
         if new or connected or joined.url is None:
             station.plant.end_restored()
         else:  # a stick that knows less than what this home joined by shows nothing: it would say a number twice
@@ -186,7 +186,7 @@ def _own_head(station: Station, post: Transport, roster: Roster, done: SyncResul
                 "this home was restored from a backup and publishes nothing new until it has synced with its"
                 " own registry"
             )
-    there = max((page.n for page in appended), default=0)
+    there = max((page.number for page in appended), default=0)
     if connected and there < joined.acknowledged and not post.everybody:
         there = post.heads().get(station.fingerprint, 0)
         why = f"page {joined.acknowledged} was there, and now {there} is the last"
@@ -217,7 +217,7 @@ def _own_pages(station: Station, post: Transport, roster: Roster, done: SyncResu
 def _stop_at_fork(station: Station, post: Transport, new: Sequence[Page]) -> NoReturn:
     """Raise ForkError: another home writes, or has written, under this station's key."""
     homes = ", ".join(sorted({page.home or "unknown" for page in new}))
-    first = min(page.n for page in new)
+    first = min(page.number for page in new)
     alarm(station, "fork", station.fingerprint, first, f"pages of home {homes} that are not of this one")
     raise ForkError(
         f"{post.where} has pages under this station's key that are not of this home, from number {first} on"
@@ -248,22 +248,22 @@ def _require_resumed(station: Station) -> None:
 def _follows(chain: Chain, new: Sequence[Page]) -> bool:
     """Whether pages go on, without a gap, from the newest page that counts here."""
     place = chain.counted
-    for page in sorted(new, key=lambda page: page.n):
-        if (page.n - 1, page.previous) != place:
+    for page in sorted(new, key=lambda page: page.number):
+        if (page.number - 1, page.previous) != place:
             return False
-        place = page.n, page.hash
+        place = page.number, page.hash
     return True
 
 
 def adopt(station: Station, roster: Roster, pages: Sequence[Page]) -> None:
     """Take back pages that this station wrote: their events wait no more, what they say is known again."""
     with station.transaction():
-        take_pages(station, roster, sorted(pages, key=lambda page: page.n))
+        take_pages(station, roster, sorted(pages, key=lambda page: page.number))
         ids = [stated.get("id") for page in pages for stated in page.events if isinstance(stated, dict)]
         station.plant.tables.drop_events([id_ for id_ in ids if isinstance(id_, str)])
         for page in pages:
             _know_again(station, page)
-        station.audit("registry", None, "adopted", pages=[page.n for page in pages])
+        station.audit("registry", None, "adopted", pages=[page.number for page in pages])
 
 
 def _know_again(station: Station, page: Page) -> None:
@@ -348,12 +348,12 @@ def resume(station: Station, post: Transport) -> int:
         new = _strange(station, found)
         with station.transaction():
             if new:
-                newest = max(new, key=lambda page: (page.n, page.hash))
+                newest = max(new, key=lambda page: (page.number, page.hash))
                 tables = station.plant.tables
-                theirs = {(page.n, page.hash) for page in found}
+                theirs = {(page.number, page.hash) for page in found}
                 counted = [(n, hash) for n, hash, _ in tables.page_names(chain.chain) if n <= chain.counted[0]]
-                lost = [place for place in counted if place not in theirs and place[0] >= new[0].n]
-                tables.put_chain(replace(chain, accepted=(newest.n, newest.hash)))
+                lost = [place for place in counted if place not in theirs and place[0] >= new[0].number]
+                tables.put_chain(replace(chain, accepted=(newest.number, newest.hash)))
                 adopt(station, roster, new)
                 _tell_again(station, chain, lost, new)
             station.plant.tables.end_alarms("fork", station.fingerprint)
@@ -379,7 +379,7 @@ def _under_our_key(station: Station, post: Transport, roster: Roster) -> list[Pa
 
 def _strange(station: Station, found: Sequence[Page]) -> list[Page]:
     known = {(n, hash) for n, hash, _ in station.plant.tables.page_names(own_chain(station).chain)}
-    return [page for page in found if (page.n, page.hash) not in known]
+    return [page for page in found if (page.number, page.hash) not in known]
 
 
 def _tell_again(station: Station, chain: Chain, lost: Sequence[tuple[int, str]], new: Sequence[Page]) -> None:

@@ -24,7 +24,7 @@ class CarriedPage:
     """
 
     station: str
-    n: int
+    number: int
     octets: bytes = field(repr=False)
     by: str = ""
 

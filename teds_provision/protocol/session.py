@@ -104,7 +104,7 @@ class StationSession:
         self._one_time: PrivateKey | None = one_time or SoftwareKey.generate()
         self._keys: SessionKeys | None = None
         self._counter = 0
-        self.c = b""
+        self.open_counter = b""
         """c of Open, as the node gave it: the mac is over it, so a good reply says that it was the node's own."""
 
     def request_counter(self) -> Command:
@@ -116,7 +116,7 @@ class StationSession:
         assert self._one_time is not None, "open() after accept()"
         if len(counter) != COUNTER_OCTETS:
             raise GarbledError(f"The node's counter for Open has {len(counter)} octets, not {COUNTER_OCTETS}.")
-        self.c, station = counter, self._one_time.point
+        self.open_counter, station = counter, self._one_time.point
         mac = open_mac(self._key, self._uuid, counter, station)
         return security_command(Function.OPEN, key_id(self._key) + station + mac)
 

@@ -26,7 +26,7 @@ class StationIdentity:
     def __init__(self, store: Store, vault: Callable[[], Vault], seals: RowMacs) -> None:
         self._store = store
         self._vault = vault
-        self._seals = seals
+        self._row_macs = seals
 
     # -- facts -----------------------------------------------------------------------------------------------------
 
@@ -43,12 +43,14 @@ class StationIdentity:
 
     def establish(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
         """Keep where the secrets of a new station lie, and the key for which it asks a certificate, if it does."""
-        self._store.put_facts(self._seals.facts(StationRecord(name or DEFAULT_NAME, keystore, keystore_why, requested)))
+        self._store.put_facts(
+            self._row_macs.facts(StationRecord(name or DEFAULT_NAME, keystore, keystore_why, requested))
+        )
 
     def complete(self, point: bytes, ca: bytes, signature: bytes) -> None:
         """Keep the station's key, its owner's CA and SIG104: init is finished."""
-        self._seals.require()
-        self._store.put_facts(self._seals.facts(replace(self._facts, point=point, ca=ca, signature=signature)))
+        self._row_macs.require()
+        self._store.put_facts(self._row_macs.facts(replace(self._facts, point=point, ca=ca, signature=signature)))
 
     @property
     def _facts(self) -> StationRecord:

@@ -65,7 +65,7 @@ class NodeKeys:
         self._store = store
         self._vault = vault
         self._identity = identity
-        self._seals = seals
+        self._row_macs = seals
         self._reopened = reopened
 
     def keys_of(self, uuid: bytes) -> list[KeyRecord]:
@@ -258,7 +258,7 @@ class NodeKeys:
         marks = self._store.key_flags(uuid)
         if marks.ca is None:
             return self._identity.ca
-        self._seals.check_ca(uuid, marks.ca, marks.ca_mac)
+        self._row_macs.check_ca(uuid, marks.ca, marks.ca_mac)
         return marks.ca
 
     def cas_of_nodes(self) -> dict[bytes, bytes]:
@@ -273,7 +273,7 @@ class NodeKeys:
         cas: dict[bytes, bytes] = {}
         for uuid, marks in marked.items():
             if marks.ca is not None:
-                self._seals.check_ca(uuid, marks.ca, marks.ca_mac)
+                self._row_macs.check_ca(uuid, marks.ca, marks.ca_mac)
                 cas[uuid] = marks.ca
         return cas
 
@@ -297,7 +297,7 @@ class NodeKeys:
             if ca == own:
                 sealed = {"ca": None, "ca_mac": None}
             elif ca is not None and ca != before.ca:
-                sealed = {"ca_mac": self._seals.ca(uuid, ca)}
+                sealed = {"ca_mac": self._row_macs.ca(uuid, ca)}
             values = {**change, **sealed}
             after = (
                 KeyFlags(**values) if before is _NO_MARKS else replace(before, **values)

@@ -39,7 +39,7 @@ class Nodes:
     def __init__(self, store: Store, seals: RowMacs, plant: Plant) -> None:
         self._plant = plant
         self._store = store
-        self._seals = seals
+        self._row_macs = seals
 
     def all(self) -> list[NodeRecord]:
         """All nodes, by UUID."""
@@ -89,7 +89,7 @@ class Nodes:
             return None
         if present is not None and present.point == point and present.point_mac is not None:
             return present.point_mac
-        return self._seals.point(uuid, point)
+        return self._row_macs.point(uuid, point)
 
     def met_at(self, uuid: bytes, place: str) -> None:
         """A session with this node was opened at ``place`` (``LINK:WHERE``): there it is looked for next time.

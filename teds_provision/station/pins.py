@@ -32,7 +32,7 @@ class Pins:
     def __init__(self, store: Store, keys: NodeKeys, seals: RowMacs, plant: Plant) -> None:
         self._store = store
         self._keys = keys
-        self._seals = seals
+        self._row_macs = seals
         self._plant = plant
         self._recorded: dict[bytes, tuple[float, int]] = {}
 
@@ -48,7 +48,7 @@ class Pins:
         node = self._store.node(uuid)
         if node is None or node.point is None:
             return pin
-        self._seals.check_point(node)
+        self._row_macs.check_point(node)
         return _wholer(pin, keys.fingerprint(node.point))
 
     def all(self, nodes: Iterable[NodeRecord] | None = None) -> dict[bytes, str]:
@@ -62,7 +62,7 @@ class Pins:
         pins: dict[bytes, str] = {}
         for node in nodes:
             if node.point is not None:
-                self._seals.check_point(node)
+                self._row_macs.check_point(node)
                 pins[node.uuid] = keys.fingerprint(node.point)
         for entry in entries:
             if entry.fingerprint is not None:
@@ -93,7 +93,7 @@ class Pins:
         """All entries, by UUID."""
         entries = self._store.whitelist()
         for entry in entries:
-            self._seals.check_entry(entry)
+            self._row_macs.check_entry(entry)
         return entries
 
     def all_entries(self) -> Iterator[WhitelistEntry]:
@@ -101,12 +101,12 @@ class Pins:
         return map(self._checked, self._store.all_whitelisted())
 
     def _checked(self, entry: WhitelistEntry) -> WhitelistEntry:
-        self._seals.check_entry(entry)
+        self._row_macs.check_entry(entry)
         return entry
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
         """The whitelist entry of a node, None where it is not on it."""
-        return self._seals.check_entry(self._store.whitelisted(uuid))
+        return self._row_macs.check_entry(self._store.whitelisted(uuid))
 
     def get_many(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
         """The entries of a page of nodes, by UUID."""
@@ -114,11 +114,11 @@ class Pins:
 
     def put(self, *entries: WhitelistEntry) -> None:
         """Add or replace entries of the whitelist (the vault opens); the caller has held keys against pinned ones."""
-        self._seals.require()
+        self._row_macs.require()
         with self._store.together():
             for entry in entries if self._plant.joined is not None else ():
                 self._report_pin(entry)
-            self._store.put_whitelist_entries(self._seals.entry(entry) for entry in entries)
+            self._store.put_whitelist_entries(self._row_macs.entry(entry) for entry in entries)
 
     def _report_pin(self, entry: WhitelistEntry) -> None:
         """Tell the plant of a pin of this station's own, where it is a new one."""
@@ -132,7 +132,7 @@ class Pins:
 
     def remove(self, uuid: bytes) -> bool:
         """Take a node off the whitelist (the vault opens); False if it was not on it. A contact's key stays pinned."""
-        self._seals.require()
+        self._row_macs.require()
         with self._store.together():
             entry = self._store.whitelisted(uuid) if self._plant.joined is not None else None
             if entry is not None and is_whole(entry.fingerprint) and entry.assurance != "registry":
@@ -143,7 +143,7 @@ class Pins:
 
     def unpin(self, uuid: bytes) -> None:
         """Forget the pinned key; the link keys that are held still belong to the board that had it."""
-        self._seals.require()
+        self._row_macs.require()
         entry, node = self._store.whitelisted(uuid), self._store.node(uuid)  # whatever it is: it is forgotten
         pinned = entry.fingerprint if entry is not None else None
         if not is_whole(pinned) and node is not None and node.point is not None:

@@ -89,7 +89,7 @@ class Plant:
         self.parcels: ParcelTables = store
         self._store = store
         self._identity = identity
-        self._seals = seals
+        self._row_macs = seals
         self._read: tuple[str, roster.Roster] | None = None
         self._process = os.getpid()
         self._elsewhere: Store | None = None
@@ -109,7 +109,7 @@ class Plant:
         record, row = self.joined, self.tables.held_roster()
         if record is None or row is None:
             return None
-        if not self._seals.noted("roster", row.hash, row.mac):
+        if not self._row_macs.noted("roster", row.hash, row.mac):
             raise StoreChangedError(
                 "The roster in the store was changed by another program and is not trusted.",
                 hint="To get it again: teds-provision registry sync",
@@ -160,7 +160,7 @@ class Plant:
         return [
             signer.SignatureClaim(station, n, vouched)
             for station, n, vouched, mac in tables.digest_words(digest)
-            if self._seals.noted("digest", f"{digest.hex()} {station} {n} {'vouched' if vouched else 'signed'}", mac)
+            if self._row_macs.noted("digest", f"{digest.hex()} {station} {n} {'vouched' if vouched else 'signed'}", mac)
         ]
 
     def record_event(self, act: str, uuid: bytes | None = None, **members: object) -> None:
@@ -223,14 +223,14 @@ class Plant:
         record = self.joined
         if record is None or record.restored is None:
             return False
-        return self._seals.noted("restored", record.restored, record.restored_mac)
+        return self._row_macs.noted("restored", record.restored, record.restored_mac)
 
     def begin_restored(self) -> None:
         """Note that a backup rebuilt this home (the vault opens): it closes no page before it looked for its own."""
         record = self.tables.plant()
         if record is not None:
             at = utc_now()
-            self.tables.put_plant(replace(record, restored=at, restored_mac=self._seals.note("restored", at)))
+            self.tables.put_plant(replace(record, restored=at, restored_mac=self._row_macs.note("restored", at)))
 
     def end_restored(self) -> None:
         """Note that this home knows again what it said."""

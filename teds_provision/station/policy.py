@@ -35,13 +35,13 @@ class Policy:
         self._identity = identity
         self._keys = keys
         self._pins = pins
-        self._seals = seals
+        self._row_macs = seals
 
     # -- trust -----------------------------------------------------------------------------------------------------
 
     def trusted(self, role: TrustRole | None = None) -> list[TrustRecord]:
         """Every station and CA whose key counts here, or those of one role, by name."""
-        return [record for record in self.listed() if role in (None, record.role) and self._seals.trusted(record)]
+        return [record for record in self.listed() if role in (None, record.role) and self._row_macs.trusted(record)]
 
     def listed(self) -> list[TrustRecord]:
         """Every station and CA that is listed as trusted, by name; also one that another program put there.
@@ -80,14 +80,14 @@ class Policy:
 
     def trust(self, record: TrustRecord) -> None:
         """Trust a key under a name (the vault opens); PolicyError if the name stands for another key or role."""
-        self._seals.require()
+        self._row_macs.require()
         with self._store.transaction():
-            self._store.put_trust(self._seals.trust(record))
+            self._store.put_trust(self._row_macs.trust(record))
             self._store.renew_ca(record.fingerprint)
 
     def distrust(self, name_or_fingerprint: str) -> bool:
         """Trust a key no more (the vault opens); False if none fits, raises UsageError if several do."""
-        self._seals.require()
+        self._row_macs.require()
         return self._store.remove_trust(name_or_fingerprint)
 
     def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
@@ -103,12 +103,12 @@ class Policy:
     def counts(self, ca: bytes) -> bool:
         """Whether trust in a CA has not been ended."""
         ended, name = self._store.ended_cas(), keys.fingerprint(ca)
-        return name not in ended or not self._seals.noted("ended ca", name, ended[name])
+        return name not in ended or not self._row_macs.noted("ended ca", name, ended[name])
 
     def end_ca(self, ca: bytes) -> None:
         """Have a CA that came in a bundle count no more for the nodes that keep it."""
         name = keys.fingerprint(ca)
-        self._store.end_ca(name, self._seals.note("ended ca", name))
+        self._store.end_ca(name, self._row_macs.note("ended ca", name))
 
     def renew_ca(self, ca: bytes) -> None:
         """Have a CA count again for the nodes that keep it: a person took in a bundle that names it."""
@@ -146,11 +146,11 @@ class Policy:
         entry = self.revocation(uuid)
         if entry is None:
             return False
-        self._seals.require()
+        self._row_macs.require()
         with self._store.transaction():
             hash = event.hash_of_statement(entry.statement)
             for name in (_digest(entry.statement), hash):
-                self._store.put_lifted(name, self._seals.note("lifted", name))
+                self._store.put_lifted(name, self._row_macs.note("lifted", name))
             self._plant.record_event("lifted", of=hash)
             return self._store.remove_revocation(uuid)
 
@@ -162,7 +162,7 @@ class Policy:
         """Whether a person has lifted the ban of this very statement here."""
         lifted = self._store.lifted()
         names = (_digest(statement), event.hash_of_statement(statement)) if lifted else ()
-        return any(name in lifted and self._seals.noted("lifted", name, lifted[name]) for name in names)
+        return any(name in lifted and self._row_macs.noted("lifted", name, lifted[name]) for name in names)
 
     def denied(self, uuid: bytes, key: str | None) -> RevocationRecord | None:
         """Why a node with this key (fingerprint, None: not known) is denied; a ban of another key is none."""

@@ -68,7 +68,7 @@ class Handovers:
     def __init__(self, store: Store, keys: NodeKeys, seals: RowMacs) -> None:
         self._store = store
         self._keys = keys
-        self._seals = seals
+        self._row_macs = seals
 
     def all(self) -> list[Handover]:
         """Every bundle that left or came, oldest first."""
@@ -89,13 +89,13 @@ class Handovers:
     def take_in(self, batch: BulkRows) -> None:
         """Add or replace many rows, all or none; the caller has held them against what is there."""
         with self._store.transaction():
-            seals = self._seals
+            seals = self._row_macs
             self._store.put_bulk(
                 batch,
                 seal_node=lambda node: seals.point(node.uuid, node.point) if node.point else None,
                 seal_entry=seals.of_entry,
             )
-            self._keys.set_flags(batch.marks)
+            self._keys.set_flags(batch.key_flags)
 
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
@@ -105,7 +105,7 @@ __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", 
 class _DurableRun:
     """A run of steps: who takes some of them behind its back, and the number of its ``last`` commit not waited for."""
 
-    behind: BackgroundWriter
+    background: BackgroundWriter
     last: int = 0
 
 
@@ -345,7 +345,7 @@ class Station:
                 yield
             finally:
                 self._runs.now = None
-                run.behind.close()
+                run.background.close()
         finally:
             self._store.flush(run.last)  # not what other threads have written since: they see to it themselves
 
@@ -368,7 +368,7 @@ class Station:
             finally:
                 self._runs.now = None
 
-        run.behind.submit(taken)
+        run.background.submit(taken)
 
     def flush(self) -> None:
         """Wait until all that this thread's run has written is on the disk; outside a run it is."""

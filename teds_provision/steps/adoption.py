@@ -67,7 +67,7 @@ class NotAdoptedError(PolicyError):
 
     def __init__(self, message: str, brought: FactoryDatasheet, *, hint: str = "") -> None:
         super().__init__(message, hint=hint)
-        self.brought = brought
+        self.datasheet = brought
 
 
 def refuse_adoption(brought: FactoryDatasheet) -> None:

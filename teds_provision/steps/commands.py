@@ -343,7 +343,7 @@ def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter
     uuid = station.nodes.resolve(node)
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         why = open_or_say_why(station, visit.node)
-        c = visit.node.c
+        c = visit.node.open_counter
         image = read_image(visit.node)
         check = provenance_check(visit.node, visit.who.point, why)
         if visit.node.sealed:

@@ -75,7 +75,7 @@ def keep(
     ``c`` is that of the session in which the reading began, where the one that is open now may be a later one. ``more``
     are checks that were made at the node. Gives the verdict on this very reading, whether it was kept or not.
     """
-    c = (c or node.c) if node.sealed else None
+    c = (c or node.open_counter) if node.sealed else None
     return keep_read(station, image, c, by=by, known=known, more=more, profile=profile)
 
 
@@ -132,8 +132,8 @@ def is_known(station: Station, node: Conversation, image: Image) -> bool:
     return (
         row is not None
         and row.whole
-        and node.c is not None
-        and row.is_of_this_start(node.c)
+        and node.open_counter is not None
+        and row.is_of_this_start(node.open_counter)
         and row.digests == _packed(image)
     )
 
@@ -147,15 +147,15 @@ def cached_image_if_current(
     that is noted: what is judged then is ``kept``. None: all of it has to be read.
     """
     row, image = station.nodes.reading(node.uuid), station.nodes.datasheet(node.uuid)
-    if row is None or image is None or not row.in_session or node.c is None:
+    if row is None or image is None or not row.in_session or node.open_counter is None:
         return None
     if image.security != security_teds or _packed(image) != row.digests or row.failed - MERELY_UNSIGNED:
         return None
     said, _ = static_checks(image, known)
     if {check.name for check in said if check.result == "failed"} - MERELY_UNSIGNED:
         return None
-    if not row.is_of_this_start(node.c):
-        station.nodes.started_anew(node.uuid, node.c)
+    if not row.is_of_this_start(node.open_counter):
+        station.nodes.started_anew(node.uuid, node.open_counter)
     return image
 
 

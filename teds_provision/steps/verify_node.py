@@ -51,7 +51,7 @@ def verify_at_node(station: Station, node: Conversation, who: IdentifiedNode) ->
     One in which the node answers nothing but that it is busy is as good as none: then all is read without it.
     """
     why = open_or_say_why(station, node)
-    c = node.c
+    c = node.open_counter
     try:
         image = read_image(node)
     except NodeRefusedError as refusal:
@@ -70,7 +70,7 @@ def verify_in_session(station: Station, node: Conversation, *, by: str) -> NodeV
     has started since; then what is said of the rest is ``kept``, until somebody reads it (:mod:`.readings`). Everything
     is judged anew all the same: trust, bans and pins may have changed.
     """
-    identity, c = read_identity(node), node.c
+    identity, c = read_identity(node), node.open_counter
     octets = read_block(node, SECURITY)
     known = freshness_floor_of(station, node.uuid, identity)
     image = readings.cached_image_if_current(station, node, octets, known)
@@ -127,7 +127,7 @@ def verify_node(
         station.audit("verify", node.uuid, verified.verdict, why=why)
         return NodeVerdict(verified, "plain", utc_now(), by)
     more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
-    c = (c or node.c) if node.sealed else None
+    c = (c or node.open_counter) if node.sealed else None
     with station.reading():
         row, judged = readings.judge_reading(station, image, c, by=by, known=known, more=more)
 

@@ -109,7 +109,7 @@ def write(
         has = between
     octets += _commit(station, node, image, has, progress)
     node.proven = replace(identity, sequence=signed.sequence, state=NodeState.PROVISIONED)
-    c = node.c
+    c = node.open_counter
     back = read_image(node)
     _conclude(station, node, image, back, facts, c=c, octets=octets, sequence=signed.sequence)
     return WriteResult(octets, time.monotonic() - started, back)
@@ -147,7 +147,7 @@ def _conclude(
 
     identity, profile = node.proven, facts.get("profile")
     named = profile if isinstance(profile, str) else None
-    c = (c or node.c) if node.sealed else None
+    c = (c or node.open_counter) if node.sealed else None
 
     def record() -> None:  # asks the node nothing: the next message may be on its way
         with station.durable("write", more_follows=True):

@@ -121,7 +121,7 @@ class Connection:
         self.later = 0
         """How many commits did not wait for the disk."""
         self._settled = 0
-        self.behind: dict[int, BackgroundWriter] = {}
+        self.background: dict[int, BackgroundWriter] = {}
         """By thread: the run that has a step taken behind its back, for which its next statement waits."""
         self.notice: Callable[[str], object] | None = None
         """Told, in a sentence, what a change of the store waits for."""
@@ -130,7 +130,7 @@ class Connection:
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run one statement and return all its rows; raises StoreError."""
-        if self.behind:
+        if self.background:
             self.drain()
         with self._lock:
             try:  # not by _run(): every step makes dozens of statements
@@ -142,7 +142,7 @@ class Connection:
 
     def drain(self) -> None:
         """Wait until what this thread had done behind its back is done; raises what that raised."""
-        behind = self.behind.get(threading.get_ident())
+        behind = self.background.get(threading.get_ident())
         if behind is not None:
             behind.wait()
 
@@ -161,7 +161,7 @@ class Connection:
             self._connection.executemany(statement, rows)
 
     def _run(self, run: Callable[[], _Given]) -> _Given:
-        if self.behind:
+        if self.background:
             self.drain()
         with self._lock:
             try:
@@ -262,7 +262,7 @@ class Connection:
 
     def enter(self, block: Transaction) -> None:
         """Begin a block; for :class:`Transaction` alone."""
-        if self.behind:
+        if self.background:
             self.drain()
         self._lock.acquire()
         try:

@@ -194,7 +194,7 @@ class Database(Connection):
 
         For what every step asks again of the node at hand. Raises what :meth:`read` raises.
         """
-        if self.behind:
+        if self.background:
             self.drain()
         with self._lock:
             state = (self.state(), self._connection.total_changes)

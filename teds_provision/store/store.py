@@ -132,7 +132,7 @@ class Store(
 
     def background_writer(self) -> BackgroundWriter:
         """For a run of this thread: what takes its steps behind its back, which its next statement here waits for."""
-        return BackgroundWriter(self._database.behind)
+        return BackgroundWriter(self._database.background)
 
     def drain(self) -> None:
         """Wait for what this thread has done behind its back; before it takes a lock that such a step takes too."""

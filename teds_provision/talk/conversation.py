@@ -124,7 +124,7 @@ class Conversation:
         self._key: bytes | None = None
         self._session: StationSession | None = None
         self._statics: tuple[bytes, ...] = ()
-        self.c: bytes | None = None
+        self.open_counter: bytes | None = None
         """c of the Open of this session, 8 octets: it tells whether the node has started anew since another one."""
         self._release: Callable[[], object] = _nothing
 
@@ -177,7 +177,7 @@ class Conversation:
         if not reply.ok:
             raise refused(reply.reason, _OPENING)
         session.accept(reply.payload)
-        self._session, self._key, self.c = session, key, session.c
+        self._session, self._key, self.open_counter = session, key, session.open_counter
 
     def _open(self, key: bytes) -> tuple[StationSession, Reply]:
         """Ask for c and send one Open; each has a one-time key of its own."""

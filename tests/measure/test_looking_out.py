@@ -123,7 +123,7 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
     hub: Hub,  # noqa: F811
 ) -> None:
     """The pause had grown with the absence of the other one, to 30 s."""
-    sightings, stop = lookout._sightings, threading.Event()
+    sightings, stop = lookout._presence, threading.Event()
     [*_, one] = sightings.all()
 
     def lost() -> float:
@@ -160,11 +160,11 @@ def looked_for(lookout: CanDiscovery) -> Iterator[None]:
 
     def wait() -> None:
         with suppress(LinkError):
-            lookout._sightings.find(ONE, seconds=PATIENCE, stop=stop)
+            lookout._presence.find(ONE, seconds=PATIENCE, stop=stop)
 
     waiting = threading.Thread(target=wait)
     waiting.start()
-    until(lookout._sightings.missing)
+    until(lookout._presence.missing)
     try:
         yield
     finally:

@@ -53,7 +53,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> LinkWatch:
 def reader(watch: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> Iterator[LinkWatch]:
     """A watch on a reader that runs; ``open_place`` is to be given before it starts."""
     watch.place = "nfc:x"
-    monkeypatch.setattr(watch._roster, "forget_place", lambda _place: None)
+    monkeypatch.setattr(watch._directory, "forget_place", lambda _place: None)
     yield watch
     watch.stop()
     watch.join(5)
@@ -73,7 +73,7 @@ class Reader:
 
 
 def present(watch: LinkWatch) -> int:
-    return watch._roster.present(watch.place)
+    return watch._directory.present(watch.place)
 
 
 def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch: LinkWatch) -> None:
@@ -90,8 +90,8 @@ def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch
     assert list(watch._known) == [gone.uuid.hex(), stays.uuid.hex()]
     gone.at -= 1000.0
     watch._see_who_left(100.0)
-    assert not watch._roster.seen(gone.uuid.hex()).present
-    assert watch._roster.seen(stays.uuid.hex()).present
+    assert not watch._directory.seen(gone.uuid.hex()).present
+    assert watch._directory.seen(stays.uuid.hex()).present
 
 
 def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,7 +100,7 @@ def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, m
 
     def serve(contact: Any) -> None:
         uuid = contact.identity.uuid.hex()
-        with watch._turns.hold(uuid, "it is looked at"):
+        with watch._node_locks.hold(uuid, "it is looked at"):
             time.sleep(0.001)
         with watch._guard:
             watch._pending.discard(uuid)
@@ -115,7 +115,7 @@ def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: LinkWatch, m
                 time.sleep(0.02)  # some are looked at meanwhile
     assert present(watch) == MOST_KNOWN
     assert most <= MOST_KNOWN + 2 + 1, "those that are looked at just now, and the newest"
-    assert len(watch._roster._seen) <= MOST_KNOWN + MOST_GONE + 3
+    assert len(watch._directory._seen) <= MOST_KNOWN + MOST_GONE + 3
 
 
 def test_what_was_looked_at_while_others_took_its_place_leaves(
@@ -124,9 +124,9 @@ def test_what_was_looked_at_while_others_took_its_place_leaves(
     one = sighting(7)
 
     def serve(contact: Any) -> None:
-        with watch._turns.hold(one.uuid.hex(), "it is looked at"):
+        with watch._node_locks.hold(one.uuid.hex(), "it is looked at"):
             watch._gone(one.uuid.hex())
-        watch._roster.note(one.uuid.hex(), "problem")
+        watch._directory.note(one.uuid.hex(), "problem")
 
     monkeypatch.setattr(watch, "_serve", serve)
     watch._for_strangers = SimpleNamespace(submit=lambda work, contact: work(contact))  # type: ignore[assignment]
@@ -143,7 +143,7 @@ def test_a_clock_that_is_set_keeps_no_node_from_being_looked_at_again(
     one = sighting(3)
     watch.on_sighting(one)
     watch._pending.clear()
-    watch._roster.note(one.uuid.hex(), "problem", problem={"code": "link", "message": "It fell silent."})
+    watch._directory.note(one.uuid.hex(), "problem", problem={"code": "link", "message": "It fell silent."})
     watch.on_sighting(sighting(3))
     assert len(looked) == 1, "not at once"
     now = time.time() + set_by
@@ -194,7 +194,7 @@ def test_a_reader_that_is_not_there_keeps_no_command_waiting(
 def test_what_a_measurement_says_of_a_node_that_it_has_no_more_is_no_problem(watch: LinkWatch) -> None:
     """Each reports once a second: an adopted node was measured, and shown with "Its datasheet is signed now"."""
     nothing: Any = None
-    uuid, roster = "ab" * 10, watch._roster
+    uuid, roster = "ab" * 10, watch._directory
     measuring = MeasurementSupervisor(nothing, roster, watch._live, NodeLocks(), nothing, nothing, nothing)
     newcomers: Any = object()
     left, has = (

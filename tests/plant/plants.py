@@ -58,7 +58,7 @@ class Speaker:
         octets = seal_page(draft, events, self.key)
         self.pages.append(octets)
         opened = open_page(octets, REGISTRY, lambda kid: self.key.point)
-        self.head = opened.n, opened.hash
+        self.head = opened.number, opened.hash
         return self.head
 
 
@@ -87,7 +87,7 @@ class Reader:
         self.pages: dict[str, dict[Place, Page]] = {}
         for octets in pages:
             page = open_page(octets, REGISTRY, roster.point_of)
-            self.pages.setdefault(page.station, {})[page.n, page.hash] = page
+            self.pages.setdefault(page.station, {})[page.number, page.hash] = page
         self.counting: dict[str, CountedPages] = {}
         self.claims: dict[bytes, dict[str, Claim]] = {}
         self.words: dict[str, list[SignatureClaim]] = {}
@@ -98,7 +98,7 @@ class Reader:
 
     def _fold(self, station: str, there: dict[Place, Page], accepted: Place | None) -> None:
         removed = self.roster.removed_one(station)
-        names = [(page.n, page.hash, page.previous) for page in there.values()]
+        names = [(page.number, page.hash, page.previous) for page in there.values()]
         counts = counting(names, last=removed.last if removed else None, accepted=accepted)
         self.counting[station] = counts
         seen: set[str] = set()

@@ -64,12 +64,12 @@ def add_without_statements(reader: Reader, octets: bytes) -> None:
     from teds_provision.protocol.plant.page import open_page
 
     page = open_page(octets, KAT["registry"], reader.roster.point_of)
-    reader.pages[page.station] = {(page.n, page.hash): page}
-    reader.counting[page.station] = counting([(page.n, page.hash, page.previous)], last=None, accepted=None)
+    reader.pages[page.station] = {(page.number, page.hash): page}
+    reader.counting[page.station] = counting([(page.number, page.hash, page.previous)], last=None, accepted=None)
     for event_read in map(event.read, page.events):
         assert isinstance(event_read, event.Event)
         if event_read.act != "revoked":
-            reader._take(page.station, (page.n, page.hash), event_read)
+            reader._take(page.station, (page.number, page.hash), event_read)
         else:
             with pytest.raises(TedsProvisionError):
                 open_revocation(event_read.members["statement"], reader.roster.point_of)

@@ -115,7 +115,7 @@ def test_a_registry_that_was_away_hears_everything_once(plant: Office) -> None:
     line.office = AtHand(north)
     assert build(line, first).verified.verdict == build(line, second).verified.verdict == "authentic"
     with pytest.raises(RegistryError):
-        sync(west, away.post)
+        sync(west, away.transport)
     for _ in range(2):
         plant.sync(west, north)
     attempts = attempts_of(north, job.id)

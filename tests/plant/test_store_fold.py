@@ -51,7 +51,7 @@ def test_pages_in_any_order_and_a_roster_between_them_give_the_oracles_view(
         chance.shuffle(waiting)
         for page in list(waiting):
             names = station.plant.tables.page_names(station.plant.tables.chain(page.station).chain)
-            if page.n == 1 or any(n == page.n - 1 for n, _, _ in names):
+            if page.number == 1 or any(n == page.number - 1 for n, _, _ in names):
                 roster = station.plant.roster
                 assert roster is not None
                 take_pages(station, roster, [page])

@@ -280,9 +280,9 @@ def test_a_page_of_a_clock_a_year_ahead_counts_and_no_name_of_it_wins_for_ever(p
     ahead = datetime.now(UTC) + timedelta(days=365)
     draft = PageDraft(roster.registry, chain.counted[0] + 1, chain.counted[1], "0" * 16, ahead, {}, (1, "0" * 64))
     octets = seal_page(draft, [], south.vault.identity())
-    FolderTransport(plants.stick).append(south.fingerprint, draft.n, draft.previous, hash_of(octets), octets)
+    FolderTransport(plants.stick).append(south.fingerprint, draft.number, draft.previous, hash_of(octets), octets)
     plants.sync(plants.north)
-    assert plants.north.plant.tables.chain(south.fingerprint).counted[0] == draft.n
+    assert plants.north.plant.tables.chain(south.fingerprint).counted[0] == draft.number
     assert alarms(plants.north) == []
 
 

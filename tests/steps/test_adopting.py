@@ -112,7 +112,7 @@ def test_what_the_guard_finds_needs_a_reason_and_that_is_logged(station: Station
     node = board(tmp_path / "n", factory(slope=800.0))  # goes round more than twice
     with pytest.raises(NotAdoptedError, match="refused") as refused:
         adopted(station, node)
-    assert refused.value.brought.errors
+    assert refused.value.datasheet.errors
     assert "--accept-calibration" in refused.value.hint
     done, [shown] = adopted(station, node, BuildOrder(adopt=True, accept_calibration="two turns are right here"))
     assert shown.errors

@@ -383,7 +383,7 @@ class AddressPair:
     events: SimpleQueue[ReplyEvent] = field(default_factory=SimpleQueue)
     transaction: int = -1
     partial: Reassembly | None = None
-    gathering: BroadcastReplies | None = None
+    replies: BroadcastReplies | None = None
     heard_at: float = 0.0
     gap: int = 0  # ms that the node is asked to leave between the frames of its reply
     asked: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
@@ -413,7 +413,7 @@ class PendingBroadcast:
     ``began`` and ``heard_at``: when it was asked, and when the last frame of an answer came (time.monotonic).
     """
 
-    gathering: BroadcastReplies
+    replies: BroadcastReplies
     heard_at: float
     began: float
     until: float = math.inf
@@ -434,7 +434,7 @@ class BusMultiplexer:
         self._bus = bus
         self.spec = bus.spec
         self.own = bus.spec.source
-        self.rivals = AddressConflicts(self.own)
+        self.conflicts = AddressConflicts(self.own)
         self._failure: LinkError | None = None
         self._listeners: tuple[Listener, ...] = ()
         self._asked: tuple[PendingBroadcast, ...] = ()
@@ -558,7 +558,7 @@ class BusMultiplexer:
             line.flows.put(b"")
 
     def _route(self, frame: Frame) -> None:
-        self.rivals.heard(frame)
+        self.conflicts.heard(frame)
         if is_announce(frame.identifier):
             node = frame.identifier & 0xFF
             self._announced[node] = time.monotonic()
@@ -597,7 +597,7 @@ class BusMultiplexer:
             line.events.put(ReplyEvent("whole", body, frame.at))
             line.flows.put(b"")  # whoever waits for a flow control has its answer
         elif not self._gathered(line, frame, body[0]) and body[0] not in line.asked:
-            self.rivals.unasked(line.node)
+            self.conflicts.unasked(line.node)
 
     def _first(self, line: AddressPair, frame: Frame) -> None:
         partial = Reassembly.begin(line.node, frame)
@@ -613,7 +613,7 @@ class BusMultiplexer:
                 line.events.put(ReplyEvent("clash"))
             elif other is not None and not other.number:
                 return  # the same frame twice
-            line.partial, line.gathering = partial, None
+            line.partial, line.replies = partial, None
             self._reply(flow(line.node, line.own, CONTINUE, fd=frame.fd, gap=line.gap))
             line.events.put(ReplyEvent("begun"))
         elif self._gathered(line, frame, transaction):
@@ -621,20 +621,20 @@ class BusMultiplexer:
         elif transaction in line.asked:  # a late reply: end it, so that the node is free for the next
             self._reply(flow(line.node, line.own, OVERFLOW, fd=frame.fd))
         else:
-            self.rivals.unasked(line.node)
+            self.conflicts.unasked(line.node)
 
     def _gathered(self, line: AddressPair, frame: Frame, transaction: int) -> bool:
         for asked in self._asked:
-            if asked.gathering.transaction == transaction and asked.until > frame.at:
-                line.gathering, line.partial = asked.gathering, None
+            if asked.replies.transaction == transaction and asked.until > frame.at:
+                line.replies, line.partial = asked.replies, None
                 self._gather(asked, line.node, frame)
                 return True
         return False
 
     def _consecutive(self, line: AddressPair, frame: Frame) -> None:
-        if line.gathering is not None:
+        if line.replies is not None:
             for asked in self._asked:
-                if asked.gathering is line.gathering:
+                if asked.replies is line.replies:
                     self._gather(asked, line.node, frame)
             return
         partial = line.partial
@@ -652,7 +652,7 @@ class BusMultiplexer:
                 line.events.put(ReplyEvent("torn"))
 
     def _gather(self, asked: PendingBroadcast, node: int, frame: Frame) -> None:
-        gathering = asked.gathering
+        gathering = asked.replies
         asked.heard_at = max(asked.heard_at, frame.at)
         before = len(gathering.answers), len(gathering.conflicts)
         answer = gathering.add_frame(frame)

@@ -66,11 +66,11 @@ def ask_all(
         bus.send(Frame(FUNCTIONAL | bus.own, single(body, fd=fd), fd))
         told: set[int] = set()
         for node in _news(bus, asked, silence, longest):
-            identity = _read(asked.gathering, node)
+            identity = _read(asked.replies, node)
             if identity is not None and node not in told:
                 told.add(node)
                 yield node, identity
-        gathering = asked.gathering
+        gathering = asked.replies
     yield FunctionalAnswers(
         _identities(gathering), set(gathering.conflicts), gathering.unfinished | _unreadable(gathering)
     )

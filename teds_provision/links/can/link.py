@@ -134,10 +134,10 @@ class CanLink:
         with bus.gather(transaction) as asked:
             until, fd = time.monotonic() + _HELLO_SECONDS, bus.spec.fd
             bus.send(Frame(FUNCTIONAL | bus.own, single(bytes([transaction]) + IDENTIFY.encode(), fd=fd), fd))
-            while (left := until - time.monotonic()) > 0 and self.address not in asked.gathering.answers:
+            while (left := until - time.monotonic()) > 0 and self.address not in asked.replies.answers:
                 asked.next(left)
                 bus.check()
-            return asked.gathering.answers.get(self.address, b"")
+            return asked.replies.answers.get(self.address, b"")
 
     def there(self, address: int) -> Identity | None:
         """Who answers Identify at this address."""
@@ -179,8 +179,8 @@ class CanLink:
                 self.left = self.left or time.monotonic()
                 reply, self.came = exchange.run()
         except LinkError as failure:
-            if bus.rivals.seen() and not bus.failed:
-                raise type(failure)(f"{failure.message} {bus.rivals.text}", hint=bus.rivals.hint) from failure
+            if bus.conflicts.seen() and not bus.failed:
+                raise type(failure)(f"{failure.message} {bus.conflicts.text}", hint=bus.conflicts.hint) from failure
             raise
         if bus.clash(self.address):
             raise conflict(self.address)

@@ -266,7 +266,7 @@ class CanPort:
 
     def tell_of_rivals(self, notice: NoticeSink) -> None:
         """Name another station under our source address, once."""
-        rivals = self.bus().rivals
+        rivals = self.bus().conflicts
         if not self._rival_told and rivals.seen():
             self._rival_told = True
             notice(Notice("conflict", f"{rivals.text} {rivals.hint}"))

@@ -127,7 +127,7 @@ class NodeStreams:
     ) -> None:
         """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
         number = plan.subscribe.stream
-        bus.hearing.expect(address, number)
+        bus.receiver.expect(address, number)
         payload = trusted.node.request(plan.command(), "to stream")
         with self.mapping:
             reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()), after=self._run)
@@ -151,7 +151,7 @@ class NodeStreams:
         heard.heard += ahead
         self.running[number] = heard
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
-        bus.hearing.register(address, number, heard)
+        bus.receiver.register(address, number, heard)
 
     def stop(self, bus: MeasuredBus, trusted: VerifiedSession | None, address: int) -> None:
         """Stop each in order, so that its counter tells what was lost at the end; without a session hear no more.
@@ -169,7 +169,7 @@ class NodeStreams:
                     due = min(counter, wanted[number]) if wanted[number] else counter
                     heard.hear_out(due)
                     heard.receiver.finish(counter, due)
-            bus.hearing.forget(address, number)
+            bus.receiver.forget(address, number)
             self.totals[number].add(heard)
         self.running.clear()
 

@@ -56,7 +56,7 @@ def _arm(
     """The nodes that wait for the trigger now."""
     armed = []
     for keeper in keepers:
-        trusted = keeper.trusted
+        trusted = keeper.verified
         if trusted is None or not keeper.ever_ran:
             continue
         try:

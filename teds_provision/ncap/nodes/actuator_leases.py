@@ -71,14 +71,14 @@ class _SharedSession:
 
     turn: threading.RLock = field(default_factory=threading.RLock)
     users: int = 0
-    trusted: VerifiedSession | None = None
+    verified: VerifiedSession | None = None
     stack: ExitStack = field(default_factory=ExitStack)
 
     @contextmanager
     def session(self, _uuid: str) -> Iterator[VerifiedSession | None]:
         """One exchange at a time."""
         with self.turn:
-            yield self.trusted
+            yield self.verified
 
 
 class ActuatorLeases:
@@ -98,7 +98,7 @@ class ActuatorLeases:
         *,
         dead_man: int = DEAD_MAN,
     ) -> None:
-        self._station, self._live, self._desk, self._turns = station, live, desk, turns
+        self._station, self._live, self._node_jobs, self._node_locks = station, live, desk, turns
         self._measured, self._is_measured, self._dead_man = measured, is_measured, dead_man
         self._held: dict[tuple[str, int], _HeldActuator] = {}
         self._shared: dict[str, _SharedSession] = {}
@@ -236,7 +236,7 @@ class ActuatorLeases:
             shared = self._shared.setdefault(uuid, _SharedSession())
         with shared.turn:
             if not shared.users:
-                shared.trusted = shared.stack.enter_context(self._own_session(uuid))
+                shared.verified = shared.stack.enter_context(self._own_session(uuid))
             shared.users += 1
         try:
             yield shared.session
@@ -244,15 +244,15 @@ class ActuatorLeases:
             with shared.turn:
                 shared.users -= 1
                 if not shared.users:
-                    shared.trusted = None
+                    shared.verified = None
                     shared.stack.close()
 
     @contextmanager
     def _own_session(self, uuid: str) -> Iterator[VerifiedSession]:
-        contact = self._desk.contact(uuid)
+        contact = self._node_jobs.contact(uuid)
         if contact is None:
             raise NoNodeError(f"Node {uuid} is not on any bus of this station.", hint="Connect it to a bus.")
-        with self._turns.hold(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
+        with self._node_locks.hold(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
             yield open_trusted(self._station, node, by="ncap")
 
     def _hold(self, held: _HeldActuator, session: Measured) -> None:

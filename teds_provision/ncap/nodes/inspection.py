@@ -65,7 +65,7 @@ def read_anew(station: Station, node: Conversation) -> tuple[Image, NodeVerdict]
     """Read every TEDS of a node in a session, and keep that reading; None where no session comes about."""
     if session_if_keyed(station, node) is None:
         return None
-    c, identity = node.c, read_identity(node)
+    c, identity = node.open_counter, read_identity(node)
     image = read_image(node)
     known = freshness_floor_of(station, node.uuid, identity)
     with station.durable("read"):

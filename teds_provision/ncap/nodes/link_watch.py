@@ -134,7 +134,7 @@ class LinkWatch:
         self.place = place
         self.state = LinkState(place)
         self.port: Port | None = None
-        self._station, self._roster, self._live, self._turns = station, roster, live, turns
+        self._station, self._directory, self._live, self._node_locks = station, roster, live, turns
         self._taps, self._transparent, self._buses = taps, transparent, buses
         self._trace = trace
         self._known: dict[str, Sighting] = {}
@@ -200,7 +200,7 @@ class LinkWatch:
 
     def _down(self, error: TedsProvisionError) -> None:
         self._publish_state("down", error)
-        self._roster.forget_place(self.place)
+        self._directory.forget_place(self.place)
         self._close()
 
     def _watch(self, port: Port) -> None:
@@ -223,15 +223,15 @@ class LinkWatch:
         Here is seen who does not any more, and whether it works.
         """
         bus = self._buses.add(port)
-        bus.lookout.poll(poll)
+        bus.discovery.poll(poll)
         asked = PresenceCheck(port, self._is_held) if isinstance(port, CanPort) else None
         while not self._stop.is_set():
             if self._anew.is_set():
                 self._anew.clear()
                 self._look_for_all()
                 with suppress(LinkError):
-                    bus.lookout.discover()
-            failure = bus.lookout.failure
+                    bus.discovery.discover()
+            failure = bus.discovery.failure
             self._publish_state("up" if failure is None else "down", failure)
             if isinstance(port, CanPort) and failure is None:
                 port.tell_of_rivals(self._notice)
@@ -251,7 +251,7 @@ class LinkWatch:
         self._looked_for = set(self._known)
 
     def _is_held(self, uuid: str) -> bool:
-        return self._turns.holder(uuid) is not None
+        return self._node_locks.holder(uuid) is not None
 
     def on_sighting(self, sighting: Sighting) -> None:
         """A node answered on this bus; called from the look-out's thread."""
@@ -262,7 +262,7 @@ class LinkWatch:
             oldest, *_ = list(self._known)
             self._gone(oldest)
         if before is not None:
-            seen = self._roster.seen(uuid)
+            seen = self._directory.seen(uuid)
             here = seen.place == self.place  # it may have been on another bus meanwhile
             same = here and (before.address, before.identity.state) == (sighting.address, identity.state)
             retry = seen.problem is not None and abs(time.time() - seen.seen) > LOOK_AGAIN
@@ -300,7 +300,7 @@ class LinkWatch:
     def _lend(self) -> None:
         """Close the reader for as long as somebody has it."""
         self._close()
-        self._roster.forget_place(self.place)
+        self._directory.forget_place(self.place)
         self._publish_state("lent")
         self._free.set()
         while self._borrowers and not self._stop.is_set():
@@ -320,7 +320,7 @@ class LinkWatch:
             self._left(notice.uuid.hex())
         elif notice.kind == "reader-lost":
             self._publish_state("down", LinkError(notice.text))
-            self._roster.forget_place(self.place)
+            self._directory.forget_place(self.place)
         elif notice.kind == "reader-ready":
             self._publish_state("up")
         elif notice.kind == "waiting":
@@ -329,10 +329,10 @@ class LinkWatch:
             self._publish_notice(notice)
 
     def _left(self, uuid: str) -> None:
-        if self._roster.stranger(self.place, uuid, there=False) or self._turns.holder(uuid) is not None:
+        if self._directory.stranger(self.place, uuid, there=False) or self._node_locks.holder(uuid) is not None:
             return
-        if self._roster.seen(uuid).place == self.place:  # else it was carried to another link
-            self._roster.note(uuid, "left", present=False)
+        if self._directory.seen(uuid).place == self.place:  # else it was carried to another link
+            self._directory.note(uuid, "left", present=False)
 
     def _publish_notice(self, notice: Notice) -> None:
         """Something else that a person should know of, once."""
@@ -355,13 +355,13 @@ class LinkWatch:
             "says": contact.identity.state.name.lower(),
         }  # fmt: skip
         if contact.link.capabilities.tapped:
-            self._roster.note(uuid, "tapped", tapped=time.time(), **facts)
+            self._directory.note(uuid, "tapped", tapped=time.time(), **facts)
             self._serve(contact)
             return
         if not self._wanted(contact):
-            self._roster.stranger(self.place, uuid, there=True)
+            self._directory.stranger(self.place, uuid, there=True)
             return
-        self._roster.note(uuid, "came", **facts)
+        self._directory.note(uuid, "came", **facts)
         with self._guard:
             if uuid in self._pending:
                 return
@@ -382,7 +382,7 @@ class LinkWatch:
 
     def _tell_of_strangers(self) -> None:
         """How many there are that whitelist mode does not look at, where that is news, and not too often."""
-        count, now = self._roster.strangers(self.place), time.monotonic()
+        count, now = self._directory.strangers(self.place), time.monotonic()
         if count != self._strangers_told and now - self._strangers_at >= TELL_STRANGERS:
             self._strangers_told, self._strangers_at = count, now
             self._live.event("link", place=self.place, state="strangers", count=count)
@@ -394,7 +394,7 @@ class LinkWatch:
     def _serve(self, contact: Contact) -> None:
         uuid = contact.identity.uuid.hex()
         try:
-            with self._turns.hold(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
+            with self._node_locks.hold(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
                 if not self._taps.serve_node(node):
                     self._look(node)
         except FrozenError:  # its measurement verified it, and says how it does
@@ -402,29 +402,29 @@ class LinkWatch:
                 self._looked_for.add(uuid)
             return
         except NodeBusyError as error:
-            self._roster.note(uuid, problem=as_problem(error))
+            self._directory.note(uuid, problem=as_problem(error))
         except SessionLostError as lost:
-            self._roster.note(uuid, "problem", problem=as_problem(lost.cause))
+            self._directory.note(uuid, "problem", problem=as_problem(lost.cause))
         except TedsProvisionError as error:
-            self._roster.note(uuid, "problem", problem=as_problem(error))
+            self._directory.note(uuid, "problem", problem=as_problem(error))
         except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
             _log.exception("Looking at node %s failed.", uuid)
-            self._roster.note(
+            self._directory.note(
                 uuid, "problem", problem=as_problem(TedsProvisionError("Unexpected failure: see the log."))
             )
         finally:
             with self._guard:
                 self._pending.discard(uuid)
-            self._roster.refresh([uuid])
+            self._directory.refresh([uuid])
 
     def _look(self, node: Conversation) -> None:
         if not self._wanted(node.contact):
             return  # a tap shows who lies there, and no more
         found: NodeInspection = look(self._station, node)
         uuid = node.uuid.hex()
-        self._roster.show_sheet(uuid, found.sheet)
-        self._roster.refresh([uuid])
-        self._roster.note(
+        self._directory.show_sheet(uuid, found.sheet)
+        self._directory.refresh([uuid])
+        self._directory.note(
             uuid,
             "verified",
             verdict=found.judged.verified.verdict,
@@ -444,7 +444,7 @@ class LinkWatch:
         uuid = contact.identity.uuid.hex()
         try:
             with (
-                self._turns.hold(uuid, "the rest of its datasheet is read"),
+                self._node_locks.hold(uuid, "the rest of its datasheet is read"),
                 Conversation(contact, notice=self._notice) as node,
             ):
                 found = read_anew(self._station, node)
@@ -453,6 +453,6 @@ class LinkWatch:
         except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
             _log.exception("Reading the rest of node %s failed.", uuid)
             return
-        self._roster.refresh([uuid])
+        self._directory.refresh([uuid])
         if found is not None:
-            self._roster.note(uuid, "verified", verdict=found[1].verified.verdict, looked=time.time())
+            self._directory.note(uuid, "verified", verdict=found[1].verified.verdict, looked=time.time())

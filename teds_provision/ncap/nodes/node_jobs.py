@@ -127,7 +127,7 @@ class NodeJobs:
     """Errands, and the nodes that come. ``port_of`` gives the open port of a place."""
 
     def __init__(self, roster: NodeDirectory, turns: NodeLocks, port_of: PortOf) -> None:
-        self._roster, self._turns, self._port_of = roster, turns, port_of
+        self._directory, self._node_locks, self._port_of = roster, turns, port_of
         self._waiting: list[NodeJob[Any]] = []
         self._guard = threading.Lock()
 
@@ -140,7 +140,7 @@ class NodeJobs:
         """
         port = self._bus_of(uuid)
         if port is not None:
-            with self._turns.hold(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
+            with self._node_locks.hold(uuid, what), Conversation(self._find(port, uuid), notice=_quiet) as node:
                 try:
                     return work(node)
                 except SessionLostError as lost:
@@ -168,13 +168,13 @@ class NodeJobs:
         return self._bus_of(uuid) is not None
 
     def _bus_of(self, uuid: str) -> Port | None:
-        seen = self._roster.seen(uuid)
+        seen = self._directory.seen(uuid)
         port = self._port_of(seen.place) if seen.present and seen.place else None
         return port if port is not None and port.capabilities.many else None
 
     def _find(self, port: Port, uuid: str) -> Contact:
         wanted = bytes.fromhex(uuid)
-        address = self._roster.seen(uuid).address
+        address = self._directory.seen(uuid).address
         return port.find(lambda identity: identity.uuid == wanted, seconds=ON_A_BUS, notice=_quiet, address=address)
 
     # -- taps --------------------------------------------------------------------------------------------------------

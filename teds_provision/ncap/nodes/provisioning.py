@@ -63,7 +63,7 @@ class ProvisioningRun:
     steps: list[dict[str, Any]] = field(default_factory=list)
     error: dict[str, str] | None = None
     verdict: str | None = None
-    errand: NodeJob[Any] | None = None
+    job: NodeJob[Any] | None = None
 
     def as_json(self) -> dict[str, Any]:
         """api.md, `/nodes/UUID/provision`."""
@@ -82,7 +82,7 @@ class Provisioning:
         desk: NodeJobs,
         apart: Callable[[str, str], AbstractContextManager[None]] = lambda _uuid, _why: nullcontext(),
     ) -> None:
-        self._station, self._roster, self._live, self._desk = station, roster, live, desk
+        self._station, self._directory, self._live, self._node_jobs = station, roster, live, desk
         self._apart = apart
         self._runs: dict[str, ProvisioningRun] = {}
         self._guard = threading.Lock()
@@ -153,7 +153,7 @@ class Provisioning:
             finally:
                 ACTOR.reset(before)
 
-        if uuid != NEXT and self._desk.on_a_bus(uuid):
+        if uuid != NEXT and self._node_jobs.on_a_bus(uuid):
             self._publish(run)
             threading.Thread(
                 target=self._on_the_bus, args=(run, work, folder.cleanup), name=f"provision {uuid[:8]}", daemon=True
@@ -168,9 +168,9 @@ class Provisioning:
             run = self._runs.get(uuid)
         if run is None:
             raise NotFoundError(f"No provisioning was requested for node {uuid}.")
-        if run.errand is not None and self._desk.cancel(run.errand):
+        if run.job is not None and self._node_jobs.cancel(run.job):
             run.state, run.waits_for, run.until = "cancelled", None, None
-            run.errand.done.set()
+            run.job.done.set()
             self._publish(run)
         return run.as_json()
 
@@ -180,11 +180,11 @@ class Provisioning:
         self, run: ProvisioningRun, work: Callable[[Conversation], None], clean: Callable[[], None]
     ) -> None:
         run.state, run.waits_for, run.until = "waiting", "tap", time.time() + WAITING
-        errand = run.errand = self._desk.wait_for(None if run.uuid == NEXT else run.uuid, "provision", work, WAITING)
+        errand = run.job = self._node_jobs.wait_for(None if run.uuid == NEXT else run.uuid, "provision", work, WAITING)
         self._publish(run)
 
         def watch() -> None:
-            if not errand.done.wait(WAITING) and self._desk.cancel(errand):
+            if not errand.done.wait(WAITING) and self._node_jobs.cancel(errand):
                 problem = {
                     "code": "no-node",
                     "message": f"Node {run.uuid} was not placed on a reader within {WAITING:.0f} s.",
@@ -204,7 +204,7 @@ class Provisioning:
     ) -> None:
         try:
             with self._apart(run.uuid, "let go for provision"):
-                self._desk.with_node(run.uuid, "it is provisioned", work)
+                self._node_jobs.with_node(run.uuid, "it is provisioned", work)
             clean()
         except NodeRefusedError as refusal:
             if refusal.reason != Reason.NOT_PERMITTED:
@@ -240,10 +240,10 @@ class Provisioning:
             raise lost.cause from lost
         run.verdict = done.verified.verdict
         require_authentic(done.verified)
-        self._roster.show_sheet(uuid, None)
+        self._directory.show_sheet(uuid, None)
         with suppress(TedsProvisionError):
-            self._roster.refresh([uuid])
-        self._roster.note(uuid, "verified", verdict=run.verdict, heard=None, looked=time.time(), problem=None)
+            self._directory.refresh([uuid])
+        self._directory.note(uuid, "verified", verdict=run.verdict, heard=None, looked=time.time(), problem=None)
         run.state = "done"  # last: who hears it asks for the node next
         self._publish(run)
 
@@ -323,7 +323,7 @@ class AutoProvisioner:
         *,
         signs: bool = False,
     ) -> None:
-        self._station, self._roster, self._live = station, roster, live
+        self._station, self._directory, self._live = station, roster, live
         self._virtuals, self._adopts, self._signs = virtuals, adopts, signs
         self._refused: dict[str, TedsProvisionError] = {}
 
@@ -337,9 +337,11 @@ class AutoProvisioner:
         self._refused.pop(uuid, None)
         if uuid in self._virtuals:
             verified = self._virtual(node, uuid)
-            self._roster.show_sheet(uuid, None)
-            self._roster.refresh([uuid])
-            self._roster.note(uuid, "verified", problem=None, verdict=verified.verdict, heard=None, looked=time.time())
+            self._directory.show_sheet(uuid, None)
+            self._directory.refresh([uuid])
+            self._directory.note(
+                uuid, "verified", problem=None, verdict=verified.verdict, heard=None, looked=time.time()
+            )
             return True
         if (
             self._adopts()
@@ -383,10 +385,10 @@ class AutoProvisioner:
             self._refused[uuid] = error
             self._live.event("node", uuid=uuid, state="not adopted", problem=as_problem(error))
             return False
-        self._roster.show_sheet(uuid, None)
-        self._roster.refresh([uuid])
+        self._directory.show_sheet(uuid, None)
+        self._directory.refresh([uuid])
         verdict = done.verified.verdict
-        self._roster.note(uuid, "verified", problem=None, verdict=verdict, heard=None, looked=time.time())
+        self._directory.note(uuid, "verified", problem=None, verdict=verdict, heard=None, looked=time.time())
         return True
 
     def _virtual(self, node: Conversation, uuid: str) -> Verification:

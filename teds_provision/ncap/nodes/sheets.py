@@ -54,14 +54,14 @@ class Sheets:
     """Reads and writes. ``measured`` gives the datasheet of a node that a measurement holds, as its session has it."""
 
     def __init__(self, station: Station, roster: NodeDirectory, desk: NodeJobs, measured: MeasuredSheet) -> None:
-        self._station, self._roster, self._desk, self._measured = station, roster, desk, measured
+        self._station, self._directory, self._node_jobs, self._measured = station, roster, desk, measured
 
     def read(self, uuid: str) -> DatasheetRead:
         """From the node if it is on a bus, else as it was last read; raises NotFoundError, and what reading raises."""
         held = self._measured(uuid)
-        if held is None and self._desk.on_a_bus(uuid):
-            found = self._desk.with_node(uuid, "its datasheet is read", self._read)
-            self._roster.refresh([uuid])
+        if held is None and self._node_jobs.on_a_bus(uuid):
+            found = self._node_jobs.with_node(uuid, "its datasheet is read", self._read)
+            self._directory.refresh([uuid])
             return found
         kept = held or self._station.nodes.datasheet(bytes.fromhex(uuid))
         judged = verdict_of(self._station, bytes.fromhex(uuid))
@@ -123,7 +123,7 @@ class Sheets:
     def plan(self, uuid: str, content: str, *, accept: str | None = None, retype: bool = False) -> dict[str, Any]:
         """What writing this document would change; nothing is changed."""
         blocks = parsed(content)
-        plan = self._desk.with_node(
+        plan = self._node_jobs.with_node(
             uuid,
             "a datasheet is compared",
             lambda node: plan_sheet(self._station, node, blocks, accept_calibration=accept, retype=retype),
@@ -145,10 +145,10 @@ class Sheets:
             ]
             return {**_plan_json(done.plan), "steps": steps, "verdict": done.verified.verdict}
 
-        done = self._desk.with_node(uuid, "a datasheet is written", work)
-        self._roster.show_sheet(uuid, None)
-        self._roster.refresh([uuid])
-        self._roster.note(uuid, "written", verdict=done["verdict"], problem=None)
+        done = self._node_jobs.with_node(uuid, "a datasheet is written", work)
+        self._directory.show_sheet(uuid, None)
+        self._directory.refresh([uuid])
+        self._directory.note(uuid, "written", verdict=done["verdict"], problem=None)
         return {"uuid": uuid, "dry_run": False, **done}
 
 

@@ -67,14 +67,14 @@ class Clause12:
 
     def tims(self, _given: dict[str, str]) -> Fields:
         """Every node that is there."""
-        present = [uuid for uuid in self._daemon.roster.uuids() if self._daemon.roster.seen(uuid).present]
+        present = [uuid for uuid in self._daemon.directory.uuids() if self._daemon.directory.seen(uuid).present]
         numbers = [self._number(uuid) for uuid in present]
         return {"timIds": ",".join(map(str, numbers)), "uuids": ",".join(present)}
 
     def transducers(self, given: dict[str, str]) -> Fields:
         """The channels of one."""
         uuid = self._uuid(given)
-        channels = self._daemon.roster.channel_names(uuid)
+        channels = self._daemon.directory.channel_names(uuid)
         return {
             "timId": self._number(uuid),
             "channelIds": ",".join(str(number) for number, _ in channels),
@@ -84,7 +84,7 @@ class Clause12:
     def read_data(self, given: dict[str, str]) -> Fields:
         """The last value of a channel."""
         uuid, channel = self._uuid(given), _integer(given, "channelId")
-        if channel not in {number for number, _ in self._daemon.roster.channel_names(uuid)}:
+        if channel not in {number for number, _ in self._daemon.directory.channel_names(uuid)}:
             raise NotFoundError(f"Node {uuid} has no channel {channel}.")
         last = self._daemon.live.last(uuid, channel)
         ids = {"timId": self._number(uuid), "channelId": channel}

@@ -218,7 +218,7 @@ class Resources:
         if caller.kind != "socket":
             raise PolicyError("A measured node is only let go to a command on the station's own machine.")
         uuid = request.path_params["uuid"].lower()
-        measuring, until = self._daemon.measuring, time.monotonic() + LONGEST_LOAN
+        measuring, until = self._daemon.measurements, time.monotonic() + LONGEST_LOAN
         why = f"let go for {request.query_params.get('for', 'a command')[:40]}"
         loan = NodeLoan(uuid, why)
 
@@ -244,13 +244,13 @@ class Resources:
         limit = _integer(request, "limit", MOST_NODES, MOST_NODES)
         offset = _integer(request, "offset", 0, FURTHEST, least=0)
         caller: Caller = request.scope[CALLER]
-        text = await asyncio.to_thread(self._daemon.roster.nodes_text, limit, offset, reader=caller.read_only)
+        text = await asyncio.to_thread(self._daemon.directory.nodes_text, limit, offset, reader=caller.read_only)
         return Response(text, media_type="application/json")
 
     async def node(self, request: Request) -> Response:
         """GET /nodes/UUID."""
         uuid = await self._node_of(request)
-        node = await asyncio.to_thread(self._daemon.roster.node, uuid)
+        node = await asyncio.to_thread(self._daemon.directory.node, uuid)
         caller: Caller = request.scope[CALLER]
         return JSONResponse(for_reader(node) if caller.read_only else node)
 
@@ -260,7 +260,7 @@ class Resources:
         channel = _integer(request, "channel", 1, LAST_CHANNEL)
         points = _integer(request, "points", 600, MOST_POINTS)
         since, until = (_unix(request, name) for name in ("from", "until"))
-        past = self._daemon.live.past
+        past = self._daemon.live.history
         return JSONResponse(await asyncio.to_thread(past.channel_history, uuid, channel, since, until, points))
 
     async def teds(self, request: Request) -> Response:
@@ -316,8 +316,8 @@ class Resources:
         body = await body_of(request, bodies.SetPoint)
         uuid, number = await self._node_of(request), request.path_params["number"]
         if body.value is None or body.hold == 0:
-            return JSONResponse(await moving(self._daemon.holding.release_actuator, uuid, number))
-        return JSONResponse(await moving(self._daemon.holding.put, uuid, number, body.value, body.unit, body.hold))
+            return JSONResponse(await moving(self._daemon.leases.release_actuator, uuid, number))
+        return JSONResponse(await moving(self._daemon.leases.put, uuid, number, body.value, body.unit, body.hold))
 
     # -- groups and measurements -------------------------------------------------------------------------------------
 
@@ -341,7 +341,7 @@ class Resources:
 
     async def measurements(self, request: Request) -> Response:
         """GET, POST /measurements."""
-        measuring = self._daemon.measuring
+        measuring = self._daemon.measurements
         if request.method == "GET":
             return _shown(request, {"measurements": await asyncio.to_thread(measuring.all)})
         body = await body_of(request, bodies.NewMeasurement)
@@ -352,8 +352,8 @@ class Resources:
 
     async def measurement(self, request: Request) -> Response:
         """DELETE /measurements/ID."""
-        await changing(self._daemon.measuring.delete, request.path_params["id"])
-        return JSONResponse({"measurements": await asyncio.to_thread(self._daemon.measuring.all)})
+        await changing(self._daemon.measurements.delete, request.path_params["id"])
+        return JSONResponse({"measurements": await asyncio.to_thread(self._daemon.measurements.all)})
 
     # -- names, virtual transducers ----------------------------------------------------------------------------------
 

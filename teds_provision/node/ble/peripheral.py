@@ -61,7 +61,7 @@ class Peripheral:
 
     def __init__(self, node: BleHandler, address: StaticAddress, *, stranger_seconds: float = STRANGER_SECONDS) -> None:
         self._node, self._address, self._stranger_seconds = node, address, stranger_seconds
-        self._crew = WorkerPool()
+        self._workers = WorkerPool()
         self._lines: dict[int, CentralState] = {}
         self._tapped_until = 0.0
         self._advertising = False
@@ -110,7 +110,7 @@ class Peripheral:
         with suppress(Exception):
             await self._device.stop_advertising()
             await self._device.power_off()
-        await asyncio.to_thread(self._crew.end)
+        await asyncio.to_thread(self._workers.end)
 
     def tapped(self) -> None:
         """The node was tapped: it advertises for a minute at least."""
@@ -190,7 +190,7 @@ class Peripheral:
 
     def _connected(self, connection: Any) -> None:
         number = next(free for free in range(_FIRST_SOURCE, 256) if free not in self._lines)
-        line = self._lines[number] = CentralState(number, connection, self._crew)
+        line = self._lines[number] = CentralState(number, connection, self._workers)
         connection.on("disconnection", lambda _reason: self._disconnected(line))
         self._advertising = False  # a controller stops when somebody connects
         self._news.set()

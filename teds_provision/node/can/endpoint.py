@@ -46,7 +46,7 @@ class StationState:
     """
 
     def __init__(self, seat: CanEndpoint, station: int, turns: JobQueue) -> None:
-        self.seat, self.station, self.turns = seat, station, turns
+        self.endpoint, self.station, self.turns = seat, station, turns
         self.name = link_name(station)
         self.pairs: dict[int, Pair] = {}
         self.waiting = 0
@@ -63,7 +63,7 @@ class StationState:
     def begin_anew(self) -> None:
         """The pair of addresses is another one, or the bus was lost: session and stored reply are gone."""
         self._repetition.forget()
-        self.seat.handler.lost(self.name)
+        self.endpoint.handler.lost(self.name)
 
     def reply_left(self) -> None:
         """The reply is through, or was given up: from now on it is kept for who asks again."""
@@ -72,7 +72,7 @@ class StationState:
 
     def answer(self, request: EndpointRequest) -> bytes:
         """Run a request and return transaction ‖ reply; raises what the node raises."""
-        seat, body = self.seat, request.body
+        seat, body = self.endpoint, request.body
 
         def run(frame: bytes) -> bytes:
             tapped = seat.counts_as_tapped()
@@ -96,7 +96,7 @@ class CanEndpoint:
         send: Callable[[CanEndpoint, Frame], None],
         measuring: MeasuringHandler | None = None,
     ) -> None:
-        self.handler, self.counts_as_tapped, self._crew = handler, counts_as_tapped, crew
+        self.handler, self.counts_as_tapped, self._workers = handler, counts_as_tapped, crew
         self._send = send
         self.measuring = measuring
         self.address = handler.can_address()
@@ -117,7 +117,7 @@ class CanEndpoint:
         """The pair of ``own`` and ``station``, made where there is none yet."""
         line = self.lines.get(station)
         if line is None:
-            line = self.lines[station] = StationState(self, station, self._crew.turns())
+            line = self.lines[station] = StationState(self, station, self._workers.turns())
         pair = line.pairs.get(own)
         if pair is None:
             if line.pairs:

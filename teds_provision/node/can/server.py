@@ -44,7 +44,7 @@ class EndpointTable:
         *,
         echoes: bool,
     ) -> None:
-        self._seats, self._at_time, self._moved, self._tell, self._echoes = seats, at_time, moved, tell, echoes
+        self._endpoints, self._at_time, self._moved, self._tell, self._echoes = seats, at_time, moved, tell, echoes
         self._known: set[int] = set()
         self._at: dict[int, list[CanEndpoint]] = {}
         self._moves_due: dict[CanEndpoint, float] = {}
@@ -57,14 +57,14 @@ class EndpointTable:
     def find(self) -> None:
         """Look anew who has which."""
         self._at = {}
-        for seat in self._seats:
+        for seat in self._endpoints:
             self._at.setdefault(seat.address, []).append(seat)
 
     def heard(self, source: int) -> None:
         """A frame came from this address: it is taken."""
         if 1 <= source <= LAST_NODE and source not in self._known:
             self._known.add(source)
-            for seat in self._seats:
+            for seat in self._endpoints:
                 seat.claim.hear(source)
 
     def speaks(self, seat: CanEndpoint, identifier: int) -> None:
@@ -72,13 +72,13 @@ class EndpointTable:
         source = identifier & 0xFF
         if source not in seat.spoken_from:
             seat.spoken_from.add(source)
-            for other in self._seats:
+            for other in self._endpoints:
                 if other is not seat:
                     other.claim.hear(source)
 
     def announce_all(self) -> None:
         """The bus is there: each announces itself after its random wait."""
-        for seat in self._seats:
+        for seat in self._endpoints:
             seat.claim.start(time.monotonic())
             self._announce_when_due(seat)
 
@@ -165,8 +165,8 @@ class CanServer:
         self._tell = tell
         self._nodes: list[tuple[NodeHandler, Callable[[], bool], MeasuringHandler | None]] = []
         self._bus: Bus | None = None
-        self._crew: WorkerPool | None = None
-        self._seats: list[CanEndpoint] = []
+        self._workers: WorkerPool | None = None
+        self._endpoints: list[CanEndpoint] = []
         self._seat_of: dict[int, CanEndpoint] = {}
         self._addresses = self._seated()
         self._active: set[tuple[CanEndpoint, Pair]] = set()
@@ -197,10 +197,12 @@ class CanServer:
         """Open the bus and listen; raises NoReaderError or UsageError where it cannot."""
         self._bus = Bus(self._spec)
         self._stop.clear()
-        self._crew = WorkerPool()
+        self._workers = WorkerPool()
         self._active, self._pushing, self._later, self._everyone_due = set(), set(), [], {}
-        self._seats = [CanEndpoint(node, tapped, self._crew, self._out, more) for node, tapped, more in self._nodes]
-        self._seat_of = {id(seat.handler): seat for seat in self._seats}
+        self._endpoints = [
+            CanEndpoint(node, tapped, self._workers, self._out, more) for node, tapped, more in self._nodes
+        ]
+        self._seat_of = {id(seat.handler): seat for seat in self._endpoints}
         self._addresses = self._seated()
         self._addresses.announce_all()
         self._wake, woken = socket.socketpair()
@@ -214,13 +216,13 @@ class CanServer:
             self._wake.close()  # which the loop notices at once
             self._thread.join(timeout=3)
             self._thread = None
-        if self._crew is not None:
-            self._crew.end()
-            self._crew = None
-        for seat in self._seats:
+        if self._workers is not None:
+            self._workers.end()
+            self._workers = None
+        for seat in self._endpoints:
             for line in seat.lines.values():
                 line.begin_anew()
-        self._seats = []
+        self._endpoints = []
         self._addresses = self._seated()
         if self._bus is not None:
             self._bus.close()
@@ -228,7 +230,7 @@ class CanServer:
 
     def _seated(self) -> EndpointTable:
         echoes = bool(dict(self._spec.options).get("receive_own_messages"))
-        return EndpointTable(self._seats, self._at_time, self._moves, self._tell, echoes=echoes)
+        return EndpointTable(self._endpoints, self._at_time, self._moves, self._tell, echoes=echoes)
 
     def _moves(self, seat: CanEndpoint) -> None:
         """What is under way from its old address ends."""
@@ -338,7 +340,7 @@ class CanServer:
         if frame.identifier & 0x1FFFFF00 == FUNCTIONAL:
             body = read_single(frame.data)
             if body is not None and body[1:] == IDENTIFY.encode():  # nothing else that is asked of everyone is answered
-                for seat in self._seats:
+                for seat in self._endpoints:
                     self._everyone(seat, station, body[:1], fd=frame.fd)
             return
         ends = addresses(frame.identifier)
@@ -373,7 +375,7 @@ class CanServer:
     def _measuring_frame(self, station: int, frame: Frame) -> None:
         """A trigger, whose tick is that of its arrival for every node, or a Drive frame."""
         if trigger_station(frame.identifier) == station:
-            nodes = [seat.measuring for seat in self._seats if seat.measuring is not None]
+            nodes = [seat.measuring for seat in self._endpoints if seat.measuring is not None]
             for node, tick in [(node, node.tick(frame.at)) for node in nodes]:
                 node.trigger(link_name(station), frame.data, tick)
         elif (address := drive_address(frame.identifier)) is not None:
@@ -391,9 +393,9 @@ class CanServer:
             with self._lock:
                 line.waiting -= 1
         with self._lock:
-            if line.seat.address != line.seat.handler.can_address():  # 128.10
-                line.seat.address = line.seat.handler.can_address()
-                line.seat.claim.relocated()
+            if line.endpoint.address != line.endpoint.handler.can_address():  # 128.10
+                line.endpoint.address = line.endpoint.handler.can_address()
+                line.endpoint.claim.relocated()
                 self._addresses.find()
             if self._stop.is_set() or line.gone or line.pairs.get(pair.own) is not pair:
                 return  # lost meanwhile
@@ -403,7 +405,7 @@ class CanServer:
             except LinkError:
                 return  # the reading thread meets the same failure and deals with it
             line.replying = pair
-            self._note(line.seat, pair)
+            self._note(line.endpoint, pair)
 
     # -- everyone --------------------------------------------------------------------------------------------------
 
@@ -444,7 +446,7 @@ class CanServer:
         self._pushing.clear()
         self._later.clear()
         self._everyone_due.clear()
-        for seat in self._seats:
+        for seat in self._endpoints:
             seat.lose_lines()
 
     def _reopen(self, seconds: float) -> None:

@@ -40,7 +40,7 @@ class Page:
     """
 
     station: str
-    n: int
+    number: int
     hash: str
     previous: str
     home: str
@@ -102,7 +102,7 @@ class PageDraft:
     """What goes into the next page of a station, beside its events."""
 
     registry: str
-    n: int
+    number: int
     previous: str
     home: str
     created: datetime
@@ -118,7 +118,7 @@ def seal_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: Privat
         "format": PAGE.format,
         "registry": draft.registry,
         "station": fingerprint(key.point),
-        "n": draft.n,
+        "n": draft.number,
         "previous": draft.previous,
         "home": draft.home,
         "created": time_text(draft.created),

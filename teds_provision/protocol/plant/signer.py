@@ -16,7 +16,7 @@ class SignatureClaim(NamedTuple):
     """Who said of a datasheet's digest, on page ``n`` of its chain, that it signed it, or (``vouched``) vouches."""
 
     station: str
-    n: int
+    number: int
     vouched: bool
 
 
@@ -52,7 +52,7 @@ def signing(
     key here.
     """
     one = roster.by_key.get(signer)
-    own = [word.n for word in words if word.station == signer and not word.vouched]
+    own = [word.number for word in words if word.station == signer and not word.vouched]
     if isinstance(one, Member) and "sign" in one.roles:
         return SignerVerdict("passed", "" if own else "in no page yet")
     if any(word.vouched and "keeper" in roster.roles_of(word.station) for word in words):

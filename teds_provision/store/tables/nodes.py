@@ -272,7 +272,7 @@ class BulkRows:
     tombstones: Sequence[Tombstone] = ()
     groups: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
     """Nodes to add to measurement groups, by the group's name; a group that does not exist is created."""
-    marks: Mapping[bytes, Mapping[str, Any]] = field(default_factory=dict)
+    key_flags: Mapping[bytes, Mapping[str, Any]] = field(default_factory=dict)
     """Changes of marks (names, values of :class:`records.KeyFlags`), by UUID; the caller of ``put_bulk`` makes them."""
 
 
