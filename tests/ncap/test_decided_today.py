@@ -1,0 +1,189 @@
+"""Trust, bans and the whitelist as commands change them, each a process, beside `measure`, `ncap run` and `set`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
+from teds_provision.station.station import Station
+from tests.bench import PASSPHRASE, make_station
+from tests.e2e.desk import Running
+from tests.handover.desk import trust
+from tests.measure.hall import Hall, Placed, events, provisioned
+from tests.measure.test_actuator_safety import Journal, Ros2, time_of
+from tests.ncap.service import Service, unix, verdict, verified
+from tests.pace import until
+from tests.places import ros_domain
+
+pytestmark = [pytest.mark.link, pytest.mark.realtime]
+LIMIT = 2.0
+"""Seconds after the command in which the node's measurement ends (cli.md, "Today's verdict")."""
+SLACK = 1.5
+"""Seconds that the machine may need to run the threads and to hand over the lines."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A command of the person, the exit code of a measurement that it ends, and a part of the reason."""
+
+    words: tuple[str, ...]
+    code: int
+    why: str
+
+
+DECISIONS = {
+    "trust removed": Decision(("trust", "remove", "crane", "--yes"), 4, "not authentic now"),
+    "revoked": Decision(("revoke", "{uuid}", "--why", "stolen", "--yes"), 4, "was revoked: stolen"),
+    "unlisted": Decision(("whitelist", "remove", "{uuid}", "--yes"), 6, "is not on the whitelist"),
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    """A gripper that station `crane` signed and handed over as a copy to `bench`, which trusts it."""
+    hall = Hall(tmp_path_factory.mktemp("today"), {})
+    crane = make_station(hall.folder / "crane", "crane")
+    bench = Station.open(hall.station.home, ask=lambda prompt, confirm: PASSPHRASE)
+    try:
+        trust(bench, crane)
+        trust(crane, bench)
+        uuid = provisioned(crane, hall.folder / "handed", "gripper", "g", hall.desk.new_uuid())
+        bundle = hall.folder / "handed.jwe"
+        export_bundle(crane, plan_export(crane, ExportOrder(("bench",), (bytes.fromhex(uuid),))), bundle)
+        plan = plan_import(bench, bundle.read_bytes())
+        assert isinstance(plan, ImportPlan)
+        import_bundle(bench, plan)
+    finally:
+        crane.close()
+        bench.close()
+    hall.nodes["g"] = Placed(hall, hall.folder / "handed", uuid).start()
+    hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
+    yield hall
+    hall.close()
+
+
+_HOMES = count()
+
+
+@pytest.fixture
+def hall(made: Hall) -> Iterator[Hall]:
+    """The hall with a home in which nothing was decided yet."""
+    before = made.station
+    made.station = made.copy(f"home{next(_HOMES)}")
+    with made.visited():
+        yield made
+    made.station = before
+
+
+def decide(hall: Hall, decision: Decision) -> float:
+    """Run the command of a decision; returns when it had ended (unix)."""
+    hall.station.ask(*(word.format(uuid=hall.nodes["g"].uuid) for word in decision.words))
+    return time.time()
+
+
+def left_of(service: Running) -> list[dict[str, Any]]:
+    """Return the events by which measurements released a node."""
+    service.read(0.1)
+    lines = events(service.out)
+    return [line for line in lines if (line.get("event"), line.get("state")) == ("measurement", "left")]
+
+
+def require_in_time(decided: float) -> None:
+    took = time.time() - decided
+    assert took < LIMIT + SLACK, f"it ended after {took:.2f} s"
+
+
+def require_safe(journal: Journal, decided: float) -> None:
+    """Wait until the last state of the actuator is the safe one; its time is the node's."""
+    until(lambda: journal.states()[-1]["safe"], lambda: journal.states()[-3:])
+    took = time_of(journal.states()[-1]) - decided
+    assert took < LIMIT, f"in its safe state after {took:.2f} s"
+
+
+@pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)
+def test_measure_ends_with_the_reason_and_marks_its_recording(hall: Hall, decision: Decision, tmp_path: Path) -> None:
+    file = tmp_path / "run.csv"
+    running = hall.begin(hall.nodes["g"].uuid, "--rate", 20, "--to", file)
+    running.wait_for('"event":"data"')
+    decided = decide(hall, decision)
+    outcome = running.end()
+    require_in_time(decided)
+    assert outcome.code == decision.code, outcome
+    lines = events(outcome.out)
+    [refused] = [line for line in lines if line["event"] == "status" and line.get("state") == "refused"]
+    assert decision.why in refused["why"]
+    assert decision.why in lines[-1]["error"]["message"]
+    assert decision.why in file.read_text()
+
+
+@pytest.mark.parametrize("selected", ["uuids", "match"])
+@pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)
+def test_ncap_releases_the_node_moves_it_no_more_and_marks_its_recording(
+    hall: Hall, decision: Decision, selected: str
+) -> None:
+    uuid = hall.nodes["g"].uuid
+    recorded = hall.station.home / "recorded"
+    service = Service(hall.desk, hall.station).start("--record", recorded, "--dead-man", 10_000)
+    assert verdict(verified(service, uuid)) == "authentic"
+    journal = Journal.of(hall)
+    with service.client() as asked:
+        what: dict[str, Any] = {"uuids": [uuid]} if selected == "uuids" else {"match": "all"}
+        asked.request("POST", "/measurements", {**what, "rate": 20})
+        until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
+        asked.request("PUT", f"/nodes/{uuid}/channels/1", {"value": 0.05, "hold": 60})
+        journal.moves()
+        decided = decide(hall, decision)
+        assert service.process is not None
+        process = service.process
+        [left] = until(lambda: left_of(process), lambda: process.out)
+        require_in_time(decided)
+        assert left["uuid"] == uuid
+        assert decision.why in left["why"]
+        assert unix(left) - decided < LIMIT
+        require_safe(journal, decided)
+        recordings = [file for file in recorded.rglob("*") if file.is_file()]
+        assert recordings
+    service.end()
+    assert any(decision.why.encode() in file.read_bytes() for file in recordings), recordings
+
+
+@pytest.mark.parametrize("decision", DECISIONS.values(), ids=DECISIONS)
+def test_set_ends_and_its_actuator_is_safe(hall: Hall, decision: Decision) -> None:
+    words = ["set", hall.nodes["g"].uuid, 1, 0.05, "--dead-man", 10_000, "--can", hall.can]
+    acting, journal = hall.station.start("--json", *words), Journal.of(hall)
+    acting.wait_for('"applied"')
+    journal.moves()
+    decided = decide(hall, decision)
+    outcome = acting.end()
+    require_in_time(decided)
+    assert outcome.code == decision.code, outcome
+    assert decision.why in outcome.out
+    require_safe(journal, decided)
+
+
+def test_a_consumer_that_goes_on_moves_nothing_after_its_signer_lost_trust(hall: Hall) -> None:
+    """`measure --ros2`: set points by a topic end with the trust, though their publisher lives."""
+    pytest.importorskip("cyclonedds")
+    with ros_domain() as domain:
+        ros = Ros2(domain)
+        words = [hall.nodes["g"].uuid, "--rate", 20, *ros.words, "--dead-man", 10_000]
+        running = hall.begin(*words, environment=ros.environment)
+        running.wait_for('"event":"data"')
+        journal, publisher = Journal.of(hall), ros.publish()
+        try:
+            journal.moves()
+            decided = decide(hall, DECISIONS["trust removed"])
+            assert running.end().code == 4
+            require_in_time(decided)
+            require_safe(journal, decided)
+        finally:
+            publisher.kill()
+            publisher.wait()
