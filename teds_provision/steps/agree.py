@@ -178,7 +178,8 @@ def agreed_elsewhere(station: Station, node: Conversation) -> str:
     said = node.identity.epoch
     if said <= held:
         return ""
-    hint = f"it reports key epoch {said}, after {held} here: keyed elsewhere by tap (unverified)"
+    how = "keyed elsewhere by tap or rotated by another holder (unverified)"  # a plain Identify cannot tell them apart
+    hint = f"it reports key epoch {said}, after {held} here: {how}"
     try:
         octets = read_block(node, SECURITY)
         shown = security.decode(octets)

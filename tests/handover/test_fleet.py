@@ -171,7 +171,7 @@ def test_the_station_that_was_locked_out_is_told_of_a_tap_elsewhere_and_then_who
     with talk(board) as node:
         agree(other, node, identify(other, node), rotate=True)
     for words in (
-        "epoch 2, after 1 here: keyed elsewhere by tap",
+        "epoch 2, after 1 here: keyed elsewhere by tap or rotated by another holder",
         "which station did so will show once it signs",
     ):
         with pytest.raises(PolicyError, match=words):
