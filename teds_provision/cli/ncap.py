@@ -53,6 +53,7 @@ LEAVING: Final = 2.0  # seconds for them to leave at the end
 _MOMENTS: Final = frozenset({"time", "since", "started", "until", "tapped"})
 """Members of events and of the status that are moments."""
 _NO_LINK = "No link is configured, so no board is found. To add one: teds-provision ncap run --can socketcan:can0"
+_OF_LAST_SESSION = " (of its last session: the vault is locked)"
 _NEEDED = ("starlette", "uvicorn", "websockets")
 _FILE = FileToRead(exists=True)
 
@@ -273,9 +274,9 @@ def status(app: App) -> None:
 def _status(console: Console, found: dict[str, Any]) -> None:
     served = found["url"] or "no page (start it with --http)"
     console.print(f"{found['station']['name']}: {found['detection']} mode, {served}", markup=False)
-    problem = found.get("vault", {}).get("problem")
-    if problem:
-        console.print(f"The vault is locked: {problem['message']} {problem['hint']}", markup=False)
+    locked = found.get("vault", {}).get("problem")
+    if locked:
+        console.print(f"The vault is locked: {locked['message']} {locked['hint']}", markup=False)
     if all(link["virtual"] for link in found["links"]):
         console.print(_NO_LINK, markup=False)
     for link in found["links"]:
@@ -284,7 +285,9 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         there = "there" if node["present"] else "away"
         name = shown(node["name"]) or "no name"
         problem = f": {node['problem']['message']}" if node["problem"] else ""
-        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}{problem}", markup=False)
+        running = node["measuring"] is not None and node["measuring"]["state"] == "running"
+        stale = _OF_LAST_SESSION if locked and node["verdict"] is not None and not running else ""
+        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}{stale}{problem}", markup=False)
     for known in found.get("measurements", ()):
         what = f" of {known['match']}" if known.get("match") else ""
         why = f": {known['why']}" if known["why"] else ""

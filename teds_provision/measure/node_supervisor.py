@@ -26,6 +26,7 @@ from teds_provision.errors import (
     NotAuthenticError,
     PolicyError,
     TedsProvisionError,
+    VaultLockedError,
 )
 from teds_provision.links.ports import CancellableLink
 from teds_provision.measure.background_reread import BackgroundReread
@@ -65,6 +66,7 @@ LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
 AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
 SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
+UNLOCKED = 1.0  # seconds between looks whether the vault is open again
 BUSY = 2.0  # seconds in which a busy node is asked again at once; then it is tried again as after any other error
 
 
@@ -229,8 +231,27 @@ class NodeSupervisor:
                 told = True
                 self._set_state("waiting", why="a command of this station is using it")
 
+    def _wait_for_vault(self) -> None:
+        """Wait while another command's new master key locks this process out: each try would fail.
+
+        The node keeps its place in the measurement meanwhile, so that nothing takes it up again and again.
+        """
+        reported = False
+        while self._request.patient and not self._stop.is_set():
+            try:
+                self._station.unlock(self.uuid)
+                return
+            except VaultLockedError as locked:
+                if not reported:
+                    reported = True
+                    self._set_state("waiting", locked)
+            self._stop.wait(UNLOCKED)
+
     def _once(self) -> None:
         self._let_others_finish()
+        self._wait_for_vault()
+        if self._stop.is_set():
+            return
         standing = self._standing = NodeStanding(self._station, self.uuid)
         standing.require_measurable()
         seconds = (

@@ -52,6 +52,15 @@ def told(service: Service, event: str) -> list[dict[str, Any]]:
     return [line for line in map(json.loads, lines) if line.get("event") == event]
 
 
+def lock_out(service: Service) -> None:
+    """Change passphrase and master key so that the running daemon cannot open the vault."""
+    home, asked = service.station.home, service.client()
+    (home / master_socket.SOCKET).unlink()  # the new key cannot be handed over
+    assert set_passphrase(home, PASSPHRASE, NEW).code == 0
+    assert call(home, "vault", "rewrap", passphrase=NEW).code == 0
+    until(lambda: asked.status()["vault"]["state"] == "locked")
+
+
 def test_a_new_passphrase_and_two_new_master_keys_do_not_lock_a_running_ncap(running: Service) -> None:
     home, asked = running.station.home, running.client()
     hand = virtual(running)
@@ -69,9 +78,7 @@ def test_a_new_passphrase_and_two_new_master_keys_do_not_lock_a_running_ncap(run
 def test_an_ncap_that_is_locked_out_says_so_and_returns_to_work_when_unlocked(running: Service) -> None:
     home, asked = running.station.home, running.client()
     hand = virtual(running)
-    (home / master_socket.SOCKET).unlink()  # the new key cannot be handed over
-    assert set_passphrase(home, PASSPHRASE, NEW).code == 0
-    assert call(home, "vault", "rewrap", passphrase=NEW).code == 0
+    lock_out(running)
     locked = until(lambda: (found := asked.status()["vault"])["state"] == "locked" and found)
     assert locked["problem"]["code"] == "vault-locked"
     assert "unlock" in locked["problem"]["hint"]
@@ -83,6 +90,35 @@ def test_an_ncap_that_is_locked_out_says_so_and_returns_to_work_when_unlocked(ru
         measured_in_a_new_session(asked, hand)
     finally:
         call(home, "lock")
+    assert [line["state"] for line in told(running, "vault")] == ["locked", "open"]
+
+
+def test_nodes_of_a_locked_ncap_wait_quietly_and_are_measured_again_when_it_is_unlocked(running: Service) -> None:
+    home, asked = running.station.home, running.client()
+    nodes = [virtual(running), virtual(running, name="other")]
+    lock_out(running)
+    asked.request("POST", "/measurements", {"uuids": nodes[:1]})
+    asked.request("POST", "/measurements", {"match": "name:other"})
+
+    def in_state(state: str, why: str) -> bool:
+        reports = [asked.node(uuid)["measuring"] or {"state": "none", "why": ""} for uuid in nodes]
+        return all(report["state"] == state and why in report["why"] for report in reports)
+
+    until(lambda: in_state("waiting", "changed by another command"))
+    before = len(told(running, "node"))
+    for _ in range(3):  # each answer of a node is a reason to try it again
+        asked.discover()
+        told(running, "node")
+    assert in_state("waiting", "changed by another command")
+    assert {line["state"] for line in told(running, "node")[before:]} == {"came"}
+    assert all("changed by another command" in asked.node(uuid)["problem"]["message"] for uuid in nodes)
+    assert call(home, "ncap", "status").out.count("authentic (of its last session: the vault is locked)") == 2
+    try:
+        assert call(home, "unlock", "--for", "5m", passphrase=NEW).code == 0
+        until(lambda: in_state("running", ""))
+    finally:
+        call(home, "lock")
+    assert "its last session" not in call(home, "ncap", "status").out
     assert [line["state"] for line in told(running, "vault")] == ["locked", "open"]
 
 
