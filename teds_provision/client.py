@@ -66,7 +66,20 @@ _EXIT: Final = {
     "wrong-passphrase": 7, "bad-data": 8, "bug": 1,
     "bad-request": 2,
 }  # fmt: skip
-_EXIT_BY_STATUS: Final = {401: 6, 403: 6, 404: 3, 409: 6, 413: 8, 415: 8, 421: 6, 422: 6, 423: 6, 429: 6, 503: 5}
+_EXIT_BY_STATUS: Final = {
+    401: 6,
+    403: 6,
+    404: 3,
+    409: 6,
+    412: 6,
+    413: 8,
+    415: 8,
+    421: 6,
+    422: 6,
+    423: 6,
+    429: 6,
+    503: 5,
+}
 
 
 def _is_over(connection: http.client.HTTPConnection) -> bool:
@@ -113,6 +126,9 @@ class Client:
         self.url, self._token, self._timeout = url, token, timeout
         self._home = Path(home) if home else default_home()
         self._connection: http.client.HTTPConnection | None = None
+        self.etag: str | None = None
+        """ETag of the last answer, None if it had none."""
+        self._read: dict[str, str] = {}  # the ETag of the datasheet that was read last of each node
 
     def __enter__(self) -> Client:
         return self
@@ -130,9 +146,9 @@ class Client:
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
-    def request(self, method: str, path: str, body: Any = None) -> Any:
-        """One request below /api/v1; its JSON, or its text where it is none. Raises ApiError, LinkError."""
-        status, kind, octets = self._ask(method, path, None if body is None else json.dumps(body))
+    def request(self, method: str, path: str, body: Any = None, *, if_match: str | None = None) -> Any:
+        """One request below /api/v1; its JSON, or its text where it is noperation. Raises ApiError, LinkError."""
+        status, kind, octets = self._ask(method, path, None if body is None else json.dumps(body), if_match)
         try:
             value = json.loads(octets) if kind.startswith("application/json") else octets.decode()
         except ValueError as error:
@@ -143,10 +159,12 @@ class Client:
         message = str(told.get("message") or f"The base station answered {status}.")
         raise ApiError(status, str(told.get("code", "failed")), message, str(told.get("hint", "")))
 
-    def _ask(self, method: str, path: str, body: str | None) -> tuple[int, str, bytes]:
+    def _ask(self, method: str, path: str, body: str | None, if_match: str | None = None) -> tuple[int, str, bytes]:
         headers = {"Accept": "application/json"}
         if method not in ("GET", "HEAD"):
             headers["Content-Type"] = "application/json"
+        if if_match is not None:
+            headers["If-Match"] = if_match
         if self._token:
             headers["Authorization"] = f"Bearer {self._token}"
         again = self._connection is not None and method == "GET"  # kept open; the daemon may have closed it meanwhile
@@ -167,6 +185,7 @@ class Client:
             self._connection = self._open()
         self._connection.request(method, API + path, body, headers)
         answer = self._connection.getresponse()
+        self.etag = answer.getheader("ETag")
         return answer.status, answer.getheader("Content-Type", ""), answer.read()
 
     def _open(self) -> http.client.HTTPConnection:
@@ -232,7 +251,12 @@ class Client:
     def teds(self, node: str) -> Sheet:
         """A node's datasheet, decoded and checked."""
         found: Sheet = self.request("GET", f"/nodes/{quote(node, safe='')}/teds")
+        self._keep_tag(node, found["uuid"])
         return found
+
+    def _keep_tag(self, *names: str) -> None:
+        if self.etag is not None:
+            self._read |= dict.fromkeys(names, self.etag)
 
     def write_teds(
         self,
@@ -247,10 +271,18 @@ class Client:
 
         ``accept_calibration``: why a calibration that the guard refuses is right. ``retype``: the board may become one
         of another type than it says it is (else ApiError, ``wrong-board``).
+
+        If this client has read the datasheet (:meth:`teds`, or a dry run) since it last wrote it, that reading is the
+        condition: ApiError (412, ``changed``), and nothing is written, if the node has another datasheet by now.
         """
         query = "?dry_run=1" if dry_run else ""
         body = {"content": content, "accept_calibration": accept_calibration, "retype": retype}
-        found: SheetPlan = self.request("PUT", f"/nodes/{quote(node, safe='')}/teds{query}", body)
+        tag = None if dry_run else self._read.get(node)
+        found: SheetPlan = self.request("PUT", f"/nodes/{quote(node, safe='')}/teds{query}", body, if_match=tag)
+        if dry_run:
+            self._keep_tag(node, found["uuid"])
+        else:
+            self._read = {name: kept for name, kept in self._read.items() if name not in (node, found["uuid"])}
         return found
 
     def provision(

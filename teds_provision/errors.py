@@ -153,6 +153,12 @@ class FrozenError(PolicyError):
     code = "frozen"
 
 
+class DatasheetChangedError(PolicyError):
+    """A node has another datasheet by now than the one that a change was reviewed against."""
+
+    code = "changed"
+
+
 class CalibrationMisfitError(PolicyError):
     """A calibration that a node has does not fit the channel that it would be kept for."""
 

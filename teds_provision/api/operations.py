@@ -21,6 +21,10 @@ MOST_POINTS: Final = 3600
 """Bins of the past of a channel in one answer."""
 
 _TEXT: Final[Schema] = {"type": "string"}
+_DATASHEET_TAG: Final[Schema] = {
+    "type": "string",
+    "description": "ETag of the datasheet that was reviewed; if the node has another one by now: 412, nothing written",
+}
 _MOMENT: Final[Schema] = {"type": "string", "description": "ISO 8601, or unix seconds"}
 
 
@@ -39,6 +43,8 @@ class Operation:
     status: int = 200
     query: dict[str, Schema] = field(default_factory=dict)
     document: bool = False  # whether it may answer a document that is no JSON
+    header: dict[str, Schema] = field(default_factory=dict)  # optional headers of the request
+    tag: str = ""  # the condition under which the answer has an ETag, "" for never
 
 
 def _integer(least: int, most: int) -> Schema:
@@ -64,9 +70,10 @@ OPERATIONS: Final = (
                                    "points": _integer(1, MOST_POINTS)}),
     Operation("GET", "/nodes/{uuid}/teds", "Read a node's datasheet: decoded and checked, or as a document.",
               (answers.Sheet, answers.Document),
-              query={"format": {"type": "string", "enum": ["json", "xml", "hex"]}}, document=True),
+              query={"format": {"type": "string", "enum": ["json", "xml", "hex"]}}, document=True,
+              tag="always"),
     Operation("PUT", "/nodes/{uuid}/teds", "Write a datasheet, or show what that would change.", answers.SheetPlan,
-              bodies.SheetText, query={"dry_run": _TEXT}),
+              bodies.SheetText, query={"dry_run": _TEXT}, header={"If-Match": _DATASHEET_TAG}, tag="with dry_run"),
     Operation("GET", "/nodes/{uuid}/provision", "Follow a node's provisioning.", answers.Provisioning),
     Operation("POST", "/nodes/{uuid}/provision",
               "Provision a node (next: whichever is tapped next), or stop waiting for it.", answers.Provisioning,
@@ -117,6 +124,7 @@ REFUSALS: Final = {
     "404": "not found",
     "405": "method not allowed",
     "409": "frozen: being measured",
+    "412": "changed: the datasheet is no longer the one that If-Match names",
     "413": "body over 1 MiB",
     "415": "a request that changes something must be JSON",
     "421": "a foreign Host",
@@ -173,6 +181,10 @@ def _operation(operation: Operation, named: dict[str, Schema]) -> dict[str, Any]
     if operation.document:
         content |= {"application/xml": {"schema": _TEXT}, "text/plain": {"schema": _TEXT}}
     responses: dict[str, Any] = {str(operation.status): {"description": operation.does, "content": content}}
+    if operation.tag:
+        responses[str(operation.status)]["headers"] = {
+            "ETag": {"description": f"Names the datasheet that the node has ({operation.tag}).", "schema": _TEXT}
+        }
     if operation.status == 202:
         responses["200"] = responses["202"]  # a waiting that was cancelled
     responses |= {key: {"$ref": f"#/components/responses/{key}"} for key in REFUSALS}
@@ -183,6 +195,7 @@ def _operation(operation: Operation, named: dict[str, Schema]) -> dict[str, Any]
         "parameters": [
             *path,
             *({"name": name, "in": "query", "schema": kind} for name, kind in operation.query.items()),
+            *({"name": name, "in": "header", "schema": kind} for name, kind in operation.header.items()),
         ],
         "responses": responses,
     }

@@ -6,10 +6,10 @@ document does not name goes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from teds_provision.errors import BadDataError
+from teds_provision.errors import BadDataError, DatasheetChangedError
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
@@ -55,12 +55,14 @@ def plan_sheet(
     accept_calibration: str | None = None,
     retype: bool = False,
     record: bool = False,
+    expected: Collection[str] | None = None,
 ) -> SheetPlan:
     """What writing these TEDS would change, in a session of the node; changes nothing.
 
     Raises NotWhitelistedError, PolicyError (no key, the guard), BadDataError (damaged TEDS, another node's),
     WrongBoardError where the board says that it is of another type, unless ``retype``: no document names the type that
-    it was given before.
+    it was given before. DatasheetChangedError if ``expected`` is given and names no digest of the datasheet that the
+    node has.
     """
     station.policy.require_whitelisted(node.uuid)
     for (channel, code), teds in blocks.items():
@@ -75,6 +77,11 @@ def plan_sheet(
     if not node.sealed:
         require_session(station, node)
     present = take_snapshot(node)
+    if expected is not None and present.image.digest() not in expected:
+        raise DatasheetChangedError(
+            f"The datasheet of node {node.uuid.hex()} has changed since it was read.",
+            hint="Read it again, or repeat the dry run, and review the changes.",
+        )
     keep = {block: present.image.blocks[block] for block in present.read_only}
     image = Image(node.uuid, {**keep, **under(blocks, node.uuid)})
     told = () if retype else differences(present.image.blocks, image)
@@ -99,11 +106,20 @@ def write_sheet(
     *,
     accept_calibration: str | None = None,
     retype: bool = False,
+    expected: Collection[str] | None = None,
 ) -> SheetEditResult:
     """Plan, sign, write, read back and verify; raises as the steps do, and NotAuthenticError if the end is not good."""
     steps = Steps(reporter)
     with steps.step("build") as step:
-        plan = plan_sheet(station, node, blocks, accept_calibration=accept_calibration, retype=retype, record=True)
+        plan = plan_sheet(
+            station,
+            node,
+            blocks,
+            accept_calibration=accept_calibration,
+            retype=retype,
+            record=True,
+            expected=expected,
+        )
         step.result = DONE if plan.changes else NOTHING
         step.detail = f"{len(plan.image.blocks)} TEDS"
     present = plan.present

@@ -133,6 +133,35 @@ def test_a_datasheet_is_written_after_its_diff_was_shown(asked: Client, hand: st
     assert back["verdict"] == "authentic"
 
 
+def test_a_datasheet_that_another_client_wrote_after_the_review_is_not_overwritten(
+    service: Service, asked: Client, hand: str
+) -> None:
+    other, path = service.client(), f"/nodes/{hand}/teds"
+    document = asked.request("GET", f"{path}?format=xml")
+    name = asked.node(hand)["name"]
+    mine, others = (document.replace(f">{name}<", f">{word} {name}<") for word in ("my", "other"))
+    assert asked.write_teds(hand, mine, dry_run=True)["changes"]
+    reviewed = asked.etag
+    assert other.write_teds(hand, others)["verdict"] == "authentic", "one that has read nothing writes as before"
+    written = asked.node(hand)["sequence"]
+    for _ in range(2):  # repeating it is no way around the review
+        with pytest.raises(ApiError) as error:
+            asked.write_teds(hand, mine)
+        assert (error.value.status, error.value.code, error.value.exit_code) == (412, "changed", 6)
+    with pytest.raises(ApiError):
+        other.request("PUT", path, {"content": mine}, if_match=f'W/"1", {reviewed}')
+    assert (asked.node(hand)["sequence"], asked.node(hand)["name"]) == (written, f"other {name}")
+    tags = set()
+    for query in ("", "?format=xml", "?format=json", "?format=hex"):
+        asked.request("GET", path + query)
+        tags.add(asked.etag)
+    assert asked.write_teds(hand, document, dry_run=True)["changes"]
+    assert tags == {asked.etag}, "one tag for one datasheet"
+    assert asked.write_teds(hand, document)["verdict"] == "authentic"
+    assert asked.write_teds(hand, document)["verdict"] == "authentic", "what this client wrote itself is no surprise"
+    assert asked.request("PUT", path, {"content": document}, if_match="*")["verdict"] == "authentic"
+
+
 def test_a_datasheet_of_another_type_makes_no_board_another_one_unless_it_is_said(
     service: Service, asked: Client, hand: str
 ) -> None:

@@ -123,7 +123,10 @@ def test_nothing_is_written_that_was_not_shown(browser: Browser, lab: Lab, tmp_p
         row = page.get_by_role("table", name="What changes, in physical units").get_by_role("row", name="crane slew")
         row.wait_for()
         station.request("PUT", f"/nodes/{uuid}/teds", {"content": sheet.replace('"slew"', '"tower slew"')})
-        page.get_by_role("button", name="Sign and write to").click()
+        with page.expect_request(lambda sent: sent.method == "PUT") as first:
+            page.get_by_role("button", name="Sign and write to").click()
+        assert "dry_run" not in first.value.url, "the station compares, under the node's lock"
+        assert first.value.headers["if-match"]
         page.get_by_role("alert").filter(has_text="has changed since").wait_for()
         assert row.get_by_role("cell").all_inner_texts() == ["name", "tower slew", "→ crane slew"]
         assert station.node(uuid)["name"] == "tower slew"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -86,24 +86,24 @@ class Sheets:
         )
         return DatasheetRead(image, NodeVerdict(Verification(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
 
-    def document(self, uuid: str, form: str) -> tuple[str, str]:
-        """The datasheet as a document, and its media type; raises UsageError for a format that is none of ours."""
+    def document(self, uuid: str, form: str) -> tuple[str, str, str]:
+        """Return the datasheet as a document, its media type and its digest; raises UsageError for other formats."""
         if form not in FORMATS:
             raise UsageError(f"Unsupported datasheet format: {form!r}.", hint=f"Use {', '.join(FORMATS)}.")
         image = self.read(uuid).image
         blocks = [TedsBlock(channel, code, image.blocks[channel, code]) for channel, code in image]
         text = write_blocks(blocks, form)  # type: ignore[arg-type]
-        return (text if isinstance(text, str) else text.decode()), FORMATS[form]
+        return (text if isinstance(text, str) else text.decode()), FORMATS[form], image.digest()
 
-    def as_json(self, uuid: str) -> dict[str, Any]:
-        """api.md, `/nodes/UUID/teds`: verdict, checks, every TEDS decoded with findings, the calibrations' curves."""
+    def as_json(self, uuid: str) -> tuple[dict[str, Any], str]:
+        """Return what api.md says of `/nodes/UUID/teds`, and the digest of the datasheet."""
         found = self.read(uuid)
         blocks = found.image.blocks
         teds = [
             shown_to_json(describe(TedsBlock(channel, code, blocks[channel, code]), blocks))
             for channel, code in found.image
         ]
-        return {
+        shown = {
             "uuid": uuid,
             "read_now": found.now,
             **found.judged.to_json(),
@@ -111,6 +111,7 @@ class Sheets:
             "guard": self._guarded(found.image),
             "curves": curves(blocks),
         }
+        return shown, found.image.digest()
 
     def _guarded(self, image: Image) -> list[dict[str, str]]:
         try:
@@ -120,24 +121,55 @@ class Sheets:
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
-    def plan(self, uuid: str, content: str, *, accept: str | None = None, retype: bool = False) -> dict[str, Any]:
-        """What writing this document would change; nothing is changed."""
+    def plan(
+        self,
+        uuid: str,
+        content: str,
+        *,
+        accept: str | None = None,
+        retype: bool = False,
+        expected: Collection[str] | None = None,
+    ) -> tuple[dict[str, Any], str]:
+        """Return what writing this document would change, and the digest of the datasheet that it would change.
+
+        Nothing is changed. Raises DatasheetChangedError if ``expected`` is given and does not contain that digest.
+        """
         blocks = parsed(content)
         plan = self._node_jobs.with_node(
             uuid,
             "a datasheet is compared",
-            lambda node: plan_sheet(self._station, node, blocks, accept_calibration=accept, retype=retype),
+            lambda node: plan_sheet(
+                self._station, node, blocks, accept_calibration=accept, retype=retype, expected=expected
+            ),
         )
-        return {"uuid": uuid, "dry_run": True, **_plan_json(plan), "steps": [], "verdict": None}
+        shown = {"uuid": uuid, "dry_run": True, **_plan_json(plan), "steps": [], "verdict": None}
+        return shown, plan.present.image.digest()
 
-    def write(self, uuid: str, content: str, *, accept: str | None = None, retype: bool = False) -> dict[str, Any]:
-        """Write it: built, guarded, diffed, signed, written, verified."""
+    def write(
+        self,
+        uuid: str,
+        content: str,
+        *,
+        accept: str | None = None,
+        retype: bool = False,
+        expected: Collection[str] | None = None,
+    ) -> dict[str, Any]:
+        """Build, guard, compare, sign, write and verify it.
+
+        Raises DatasheetChangedError, and writes nothing, if ``expected`` is given and the node has another datasheet.
+        """
         blocks = parsed(content)
 
         def work(node: Conversation) -> dict[str, Any]:
             with self._station.node_lock(node.uuid):
                 done = write_sheet(
-                    self._station, node, blocks, SilentReporter(), accept_calibration=accept, retype=retype
+                    self._station,
+                    node,
+                    blocks,
+                    SilentReporter(),
+                    accept_calibration=accept,
+                    retype=retype,
+                    expected=expected,
                 )
             steps = [
                 {"name": step.name, "result": step.result, "seconds": step.seconds, "detail": step.detail}

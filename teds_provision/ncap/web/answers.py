@@ -18,6 +18,7 @@ from starlette.responses import JSONResponse, Response
 
 from teds_provision.api import schema
 from teds_provision.errors import (
+    DatasheetChangedError,
     FrozenError,
     LinkError,
     NodeBusyError,
@@ -41,6 +42,7 @@ _MOVING: Final = ThreadPoolExecutor(16, "moves an actuator")
 _STATUS: Final[tuple[tuple[type[TedsProvisionError], int], ...]] = (
     (NotFoundError, 404),
     (FrozenError, 409),
+    (DatasheetChangedError, 412),
     (NodeBusyError, 423),
     (LinkError, 503),
     (StoreError, 503),

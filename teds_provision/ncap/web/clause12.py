@@ -95,7 +95,7 @@ class Clause12:
     def read_teds(self, given: dict[str, str]) -> Fields:
         """One TEDS, its fields decoded."""
         uuid, channel, code = self._teds(given)
-        found = self._daemon.sheets.as_json(uuid)
+        found, _ = self._daemon.sheets.as_json(uuid)
         for block in found["teds"]:
             if (block.get("channel") or 0, block.get("access_code")) == (channel, code):
                 fields = {field.get("name", ""): field.get("text", "") for field in block["fields"]}

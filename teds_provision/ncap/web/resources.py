@@ -271,14 +271,20 @@ class Resources:
         if body is None:
             form = request.query_params.get("format")
             if form is None:
-                return JSONResponse(await reading(sheets.as_json, uuid))
-            text, kind = await reading(sheets.document, uuid, form)
-            disposition = f'attachment; filename="{uuid}.{form}"'
-            return Response(text, media_type=kind, headers={"content-disposition": disposition})
+                shown, digest = await reading(sheets.as_json, uuid)
+                return JSONResponse(shown, headers=_tagged(digest))
+            text, kind, digest = await reading(sheets.document, uuid, form)
+            disposition = {"content-disposition": f'attachment; filename="{uuid}.{form}"'}
+            return Response(text, media_type=kind, headers={**disposition, **_tagged(digest)})
         dry = request.query_params.get("dry_run", "0") not in ("0", "", "false")
-        step = sheets.plan if dry else sheets.write
-        accept, retype = body.accept_calibration, bool(body.retype)
-        return JSONResponse(await changing(lambda: step(uuid, body.content, accept=accept, retype=retype)))
+        content, accept, retype = body.content, body.accept_calibration, bool(body.retype)
+        expected = _expected(request)
+        if not dry:
+            return JSONResponse(
+                await changing(sheets.write, uuid, content, accept=accept, retype=retype, expected=expected)
+            )
+        shown, digest = await changing(sheets.plan, uuid, content, accept=accept, retype=retype, expected=expected)
+        return JSONResponse(shown, headers=_tagged(digest))
 
     async def provision(self, request: Request) -> Response:
         """GET, POST /nodes/UUID/provision; UUID ``next``: whichever node is tapped next."""
@@ -431,3 +437,16 @@ def _sentence(outcome: str, detail: dict[str, Any]) -> str:
         f"{key} {value}" for key, value in detail.items() if isinstance(value, str | int | float) and value
     )
     return f"{outcome}: {facts}" if facts else outcome
+
+
+def _tagged(digest: str) -> dict[str, str]:
+    """Return the headers of an answer about a datasheet with this digest."""
+    return {"etag": f'"{digest}"'}
+
+
+def _expected(request: Request) -> frozenset[str] | None:
+    """Return the digests that If-Match names; None if it is missing or accepts any datasheet (``*``)."""
+    named = [tag.strip() for value in request.headers.getlist("if-match") for tag in value.split(",")]
+    if not named or "*" in named:
+        return None
+    return frozenset(tag[1:-1] for tag in named if len(tag) > 1 and tag[0] == tag[-1] == '"')

@@ -13,7 +13,7 @@ export class Refusal extends Error {
   }
 }
 
-async function ask(method, path, body, { signal, keepalive } = {}) {
+async function ask(method, path, body, { signal, keepalive, match } = {}) {
   const limit = AbortSignal.timeout(PATIENCE);
   let answer;
   try {
@@ -22,7 +22,7 @@ async function ask(method, path, body, { signal, keepalive } = {}) {
       keepalive: keepalive ?? false,
       credentials: "same-origin",
       cache: "no-store",
-      headers: body === undefined ? {} : { "Content-Type": "application/json" },
+      headers: { ...(body !== undefined && { "Content-Type": "application/json" }), ...(match && { "If-Match": match }) },
       body: body === undefined ? undefined : JSON.stringify(body),
       signal: signal ? AbortSignal.any([signal, limit]) : limit,
     });
@@ -31,7 +31,8 @@ async function ask(method, path, body, { signal, keepalive } = {}) {
     throw new Refusal(0, "unreachable", "The base station is not responding.", "Is `teds-provision ncap run` still running?");
   }
   const said = await answer.json().catch(() => null);
-  if (answer.ok) return said ?? {};
+  const tag = answer.headers.get("ETag"); // of the datasheet that was shown: a write is for that one alone
+  if (answer.ok) return tag ? { ...said, tag } : (said ?? {});
   const why = said?.error ?? {};
   throw new Refusal(answer.status, why.code ?? String(answer.status), why.message ?? `Refused (${answer.status}).`, why.hint);
 }

@@ -133,20 +133,15 @@ export class WritePanel {
 
   async carry(name, body, reviewed) {
     try {
-      // Somebody else may have written to it since the changes were shown: nothing is written that nobody saw.
-      const plan = await change(`${paths.teds(this.uuid)}?dry_run=1`, body);
-      if (JSON.stringify(plan.changes) !== JSON.stringify(reviewed.changes)) {
-        this.plan(name, body, plan);
-        this.result.prepend(trouble({ message: "The datasheet on the node has changed since.", hint: "Review the changes again." }));
-        return;
-      }
-      const done = await change(paths.teds(this.uuid), body);
+      const done = await change(paths.teds(this.uuid), body, { match: reviewed.tag });
       fill(this.result, h("p", { class: "done" }, chip("good", "good", "Written"), ` Signed, written and verified${done.verdict ? `: ${done.verdict}` : ""}.`));
       this.go = null;
       say("Datasheet written and verified.");
       this.written();
     } catch (error) {
-      fill(this.result, trouble(error));
+      if (error.status !== 412) return fill(this.result, trouble(error));
+      await this.compare(name, body); // another client wrote since the changes were shown: nothing unseen is written
+      this.result.prepend(trouble({ message: "The datasheet on the node has changed since.", hint: "Review the changes again." }));
     }
   }
 
