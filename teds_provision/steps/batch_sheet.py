@@ -376,7 +376,7 @@ class Progress:
         name = hashlib.sha256(str(sheet.path.resolve()).encode()).hexdigest()[:32]
         self._path = home / FOLDER / f"{name}.json"
         self._there = kept = self._read_progress()
-        self.rows = {row.number: self._attempted(row, kept.get(str(row.number))) for row in sheet.rows}
+        self.rows = {row.number: self._attempted(row, found) for row, found in self._matched(kept)}
         self.worst: TedsProvisionError | None = None
         self._tried: frozenset[int] = frozenset()
         self._turned_away: dict[int, str] = {}
@@ -388,6 +388,22 @@ class Progress:
             return {}
         rows = told.get("rows") if isinstance(told, dict) else None
         return rows if isinstance(rows, dict) else {}
+
+    def _matched(self, kept: dict[str, Any]) -> Iterator[tuple[SheetRow, Any]]:
+        """Yield each row of the sheet with what was kept of it, also if the row has moved within the sheet since."""
+        left = {key: found for key, found in kept.items() if isinstance(found, dict)}
+        matched: dict[int, Any] = {}
+        for row in self.sheet.rows:
+            if left.get(str(row.number), {}).get("digest") == row.digest:
+                matched[row.number] = left.pop(str(row.number))
+        moved: dict[str, list[str]] = {}
+        for key, found in left.items():
+            moved.setdefault(str(found.get("digest")), []).append(key)
+        for row in self.sheet.rows:
+            if row.number not in matched and moved.get(row.digest):
+                matched[row.number] = left.pop(moved[row.digest].pop(0))
+        for row in self.sheet.rows:  # a row with other cells replaces the one that had its number
+            yield row, matched[row.number] if row.number in matched else left.get(str(row.number))
 
     def _attempted(self, row: SheetRow, kept: Any) -> RowOutcome:
         try:

@@ -171,6 +171,37 @@ def test_a_row_is_done_again_after_its_calibration_profile_or_name_changed(stati
     assert renamed.again == ("Row 1: provisioned again, because its row in the sheet has changed.",)
 
 
+def test_a_row_stays_done_when_rows_before_it_are_added_removed_or_sorted(station: Station, tmp_path: Path) -> None:
+    """Progress was matched by the number of the row: one line more at the top opened every finished row again."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
+    for row in progress.sheet.rows[:2]:
+        progress.assign_row(row, board_of(row.number))
+        progress.rows[row.number].result = "passed"
+    progress.save()
+    for text, open_rows, boards in (
+        ("name\nnew\na\nb\nc\n", [1, 4], [None, 1, 2, None]),
+        ("name\nc\nb\na\n", [1], [None, 2, 1]),
+        ("name\nb\n", [], [2]),
+    ):
+        later = Progress(station.home, read(station, tmp_path, text))
+        assert ([row.number for row in later.open], later.again) == (open_rows, ()), text
+        had = [None if number is None else board_of(number).hex() for number in boards]
+        assert [later.board_of(row) for row in later.sheet.rows] == had, text
+
+
+def test_equal_rows_that_moved_are_each_done_once(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "uuid,profile\n,load-cell\n,load-cell\n"))
+    for row in progress.sheet.rows:
+        progress.assign_row(row, board_of(row.number))
+        progress.rows[row.number].result = "passed"
+    progress.save()
+    rows = "uuid,profile\n,limit-switch\n,load-cell\n,load-cell\n,load-cell\n"
+    later = Progress(station.home, read(station, tmp_path, rows))
+    assert [row.number for row in later.open] == [1, 4]
+    boards = {later.board_of(row) for row in later.sheet.rows[1:3]}
+    assert boards == {board_of(1).hex(), board_of(2).hex()}
+
+
 @pytest.mark.parametrize("same", [True, False])
 def test_a_row_finished_by_an_older_version_is_done_again_if_its_board_differs(
     station: Station, tmp_path: Path, same: bool
