@@ -164,11 +164,14 @@ class Store(
         """Return what is wrong with the file: a cut last page, or what SQLite finds; None if nothing (for doctor)."""
         try:
             page = int(self._database.execute("PRAGMA page_size")[0][0])
-            if self._database.path.stat().st_size % page:  # SQLite reads zeros for the octets that are missing
+            file = str(self._database.execute("PRAGMA database_list")[0][2])  # "" for the private one of a backup
+            if file and Path(file).stat().st_size % page:  # SQLite reads zeros for the octets that are missing
                 return "The file ends within a page."
             found = str(self._database.execute("PRAGMA quick_check(1)")[0][0])
         except StoreError as failure:
             return failure.message
+        except OSError as error:
+            return f"The file cannot be read: {error.strerror}."
         return None if found == "ok" else found
 
     def _identifier(self, *, create: bool) -> str:
