@@ -136,7 +136,7 @@ def test_of_an_exchange_the_link_knows_when_it_left_and_came() -> None:
             return ClockReply(SECOND, SECOND + 1000, 0, 1, 20, 0).encode()
 
         clock = ClockMap()
-        node = SimpleNamespace(contact=SimpleNamespace(link=link), send=send)
+        node = SimpleNamespace(contact=SimpleNamespace(link=link), request=send)
         exchange_clock(node, clock)  # type: ignore[arg-type]  # what it asks of a conversation
         return clock.exchanges[0]
 
@@ -153,7 +153,7 @@ def test_streams_of_a_clock_that_always_lies_have_the_time_of_their_arrival() ->
     streams = NodeStreams(WallClock.now(), lambda _block: None)
     sent = 10 * 3600 * SECOND  # its tick
     lying = ClockReply(sent + 1, sent, 0, 1, 20, 0).encode()
-    node = SimpleNamespace(contact=SimpleNamespace(link=object()), send=lambda *_: lying)
+    node = SimpleNamespace(contact=SimpleNamespace(link=object()), request=lambda *_: lying)
     streams.tell_time(SimpleNamespace(node=node))  # type: ignore[arg-type]  # what it asks of a conversation
     assert "before it received" in streams.clock.lie
     assert streams.clock.host_of(sent) == pytest.approx(time.monotonic(), abs=10)

@@ -32,7 +32,7 @@ class Node:
     def __init__(self, driven: Answer) -> None:
         self.driven, self.asked, self.values = driven, 0, 0
 
-    def send(self, command: Command, _doing: str, *, within: float | None = None) -> bytes:
+    def request(self, command: Command, _doing: str, *, within: float | None = None) -> bytes:
         if (command.command_class, command.function) == (128, Function.DRIVE):
             self.asked += 1
             return self.driven()

@@ -57,7 +57,7 @@ class AtHand:
     away: bool = False
     asked: list[SignRequest] = field(default_factory=list)
 
-    def ask(self, request: SignRequest) -> bytes | None:
+    def request_signature(self, request: SignRequest) -> bytes | None:
         self.asked.append(request)
         return None if self.away else answer(self.station, request.octets)
 
@@ -335,7 +335,7 @@ def test_the_line_takes_no_word_but_the_offices(desk: Desk) -> None:
         def __init__(self, lie: Callable[[SignRequest], bytes]) -> None:
             self.lie = lie
 
-        def ask(self, request: SignRequest) -> bytes | None:
+        def request_signature(self, request: SignRequest) -> bytes | None:
             return self.lie(request)
 
     def forged(request: SignRequest) -> bytes:
