@@ -147,7 +147,11 @@ class Plant:
             return None
         counted = {station: chain.counted[0] for station, chain in self.tables.chains().items()}
         behind = any(
-            n > counted.get(about, 0) and held.member(who) is not None and "keeper" in held.roles_of(about)
+            n > counted.get(about, 0)
+            and about != self._identity.fingerprint  # a keeper knows its own chain
+            and held.member(who) is not None
+            and bool(held.roles_of(who) - {"audit"})
+            and "keeper" in held.roles_of(about)
             for who, about, n, _ in self.tables.heads()
         )
         added = frozenset(trusted.fingerprint for trusted in self.tables.trusted() if trusted.role == "station")
