@@ -282,7 +282,8 @@ def moved(hall: Hall) -> float:
 def test_a_node_that_was_away_for_long_is_measured_as_soon_as_it_announces_itself(hall: Hall) -> None:
     """Tried again after an hour here, in place of 1 to 30 s: only its Announce brings it back."""
     patient = (
-        "import runpy, sys; from teds_provision.measure import node_supervisor as n; n.FIRST_PAUSE = n.LAST_PAUSE = 3600.0;"
+        "import runpy, sys; from teds_provision.measure import node_supervisor as n;"
+        "n.FIRST_PAUSE = n.LAST_PAUSE = 3600.0;"
         "sys.argv[0] = 'teds-provision'; runpy.run_module('teds_provision', run_name='__main__')"
     )
     node = hall.nodes["g"]
