@@ -51,7 +51,6 @@ from teds_provision.store.background_writer import BackgroundWriter
 from teds_provision.store.database import has_store
 from teds_provision.store.dump import dump
 from teds_provision.store.records import Direction
-from teds_provision.vault import master_socket
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
@@ -488,7 +487,7 @@ def rewrap(station: Station) -> RewrapResult:
     if identity.rewrapping != vault.masters()[-1]:
         if vault.masters()[-1] <= identity.master:  # else a run was cut before it noted the one that it had made
             vault.add_master()
-        master_socket.hand_over(station.home, vault.master_keys())  # before a row needs the new one
+        vaults.master_socket.hand_over(station.home, vault.master_keys())  # before a row needs the new one
         identity.begin_rewrapping(vault.masters()[-1])
     damaged = 0
 
@@ -506,7 +505,7 @@ def rewrap(station: Station) -> RewrapResult:
     station.row_macs.rewrap(vault)
     station.plant.rewrap(vault)
     vault.retire_masters()
-    master_socket.hand_over(station.home, vault.master_keys())
+    vaults.master_socket.hand_over(station.home, vault.master_keys())
     with station.transaction():
         identity.end_rewrapping()
         station.audit("vault", None, "rewrapped", keys=count - damaged, damaged=damaged)
