@@ -79,7 +79,7 @@ FAILED = (
     "lost", "declined",
     "not-", "not ", "no-", "node-", "other-key", "address-conflict", "frozen", "garbled", "link", "store", "vault",
     "wrong-", "calibration-misfit", "usage", "bad-data", "bug",
-    "conflict", "fork", "newer-format", "office-refused", "registry", "roster-expired", "two-histories",
+    "changed", "conflict", "fork", "newer-format", "office-refused", "registry", "roster-expired", "two-histories",
 )  # fmt: skip
 """How the outcome of an act begins that did not do what it should: words, and the codes of the errors that end one."""
 

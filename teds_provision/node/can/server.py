@@ -416,9 +416,15 @@ class CanServer:
         number = self._everyone_due[line] = next(self._number)
 
         def answer() -> None:
-            if self._everyone_due.get(line) == number and not line.gone and seat.address == own:
-                del self._everyone_due[line]
-                self._answer_everyone(seat, station, own, transaction, fd=fd)
+            if self._everyone_due.get(line) != number or line.gone or seat.address != own:
+                return
+            if line.replying is not None:
+                # A reply ends within N_Bs even if its station was killed. Answers queued behind it would be late for
+                # good: each would wait for the one before, and the station drops what answers an older question.
+                self._at_time(time.monotonic() + _SPREAD_SECONDS, answer)
+                return
+            del self._everyone_due[line]
+            self._answer_everyone(seat, station, own, transaction, fd=fd)
 
         self._at_time(time.monotonic() + self._spread(), answer)
 
@@ -427,7 +433,7 @@ class CanServer:
         return random.uniform(0, _SPREAD_SECONDS)
 
     def _answer_everyone(self, seat: CanEndpoint, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
-        """It leaves the stored reply alone, and waits while a reply of this line is under way."""
+        """Send the answer; the stored reply stays, and no reply of this line is under way."""
         line, pair = seat.pair(station, own)
         self._end_answer_to_everyone(line, pair)
         pair.speak(fd=fd)
