@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 else:  # numpy and what measuring needs are loaded when the demo gets there
     blocks, buses_room, held_actuator, runner, sinks, verified_session, request = (
         late(f"teds_provision.measure.{name}")
-        for name in ("blocks", "buses", "held_actuator", "runner", "sinks", "trusting", "request")
+        for name in ("blocks", "buses", "held_actuator", "runner", "sinks", "verified_session", "request")
     )
 
 
