@@ -40,6 +40,12 @@ class InternalError(TedsProvisionError):
     code = "bug"
 
 
+class IncompleteInstallationError(TedsProvisionError):
+    """A package that the tool requires is not installed (exit 1)."""
+
+    code = "incomplete-installation"
+
+
 class UsageError(TedsProvisionError):
     """The command line itself is wrong (exit 2)."""
 

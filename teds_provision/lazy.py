@@ -80,6 +80,40 @@ else:
     pathlib, shlex, tomllib, util = late("pathlib"), late("shlex"), late("tomllib"), late("importlib.util")
 
 _TOOL: Final = "teds-provision"
+REQUIRED: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
+    {
+        "click": ("click", "8.2.1"),
+        "cryptography": ("cryptography", "44.0.0"),
+        "rich": ("rich", "13.7"),
+        "nfcpy": ("nfc", "1.0.4"),
+        "python-can": ("can", "4.5"),
+        "can-isotp": ("isotp", "2.0.6"),
+        "msgpack": ("msgpack", "1.0"),
+        "keyring": ("keyring", "25.2"),
+        "platformdirs": ("platformdirs", "4.2"),
+        "numpy": ("numpy", "1.26"),
+        "defusedxml": ("defusedxml", "0.7.1"),
+    }
+    | ({"backports.zstd": ("backports.zstd", "1.0")} if sys.version_info < (3, 14) else {})
+)
+"""Packages that every installation has, as in pyproject.toml: module and oldest version by name of the package."""
+
+
+def missing_packages() -> list[str]:
+    """Return the names of required packages that are not installed; imports none of them."""
+    return [name for name, (module, _) in REQUIRED.items() if not _is_installed(module)]
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return util.find_spec(module) is not None
+    except (ModuleNotFoundError, ValueError):  # what contains it is missing, or it was taken out of sys.modules
+        return False
+
+
+def package_of(module: str) -> str:
+    """Return the name of the required package that brings a module; the module's own name for any other package."""
+    return next((name for name, (brought, _) in REQUIRED.items() if brought == module), module)
 
 
 def how_to_install(extra: str) -> str:

@@ -17,8 +17,14 @@ from teds_provision.cli.config_file import Defaults, anchored, config_path, read
 from teds_provision.cli.context import App, nowhere, print_message
 from teds_provision.cli.option_names import PARAMETERS
 from teds_provision.cli.table import COMMANDS, SECTIONS
-from teds_provision.errors import BadDataError, NotFoundError, StoreError, TedsProvisionError
-from teds_provision.lazy import late
+from teds_provision.errors import (
+    BadDataError,
+    IncompleteInstallationError,
+    NotFoundError,
+    StoreError,
+    TedsProvisionError,
+)
+from teds_provision.lazy import install_command, late, missing_packages, package_of
 
 if TYPE_CHECKING:
     import difflib
@@ -162,11 +168,27 @@ def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
     who answers on its links now, what is wrong, and the next command.
     """
     ctx.obj = App(as_json=as_json, **options)
+    if ctx.invoked_subcommand != "doctor":
+        require_packages()
     broken = ctx.meta.get(_BROKEN)
     if broken is not None and ctx.invoked_subcommand != "doctor":  # which tells it, and looks at all the rest
         raise broken
     if ctx.invoked_subcommand is None:
         start.start(ctx.obj, ctx)
+
+
+def require_packages() -> None:
+    """Raise IncompleteInstallationError if a required package is missing, before a command signs or writes anything."""
+    missing = missing_packages()
+    if missing:
+        raise _incomplete(*missing)
+
+
+def _incomplete(*packages: str) -> IncompleteInstallationError:
+    return IncompleteInstallationError(
+        f"The installation is incomplete: {', '.join(packages)} missing.",
+        hint=f"Install it: {install_command(*packages)}",
+    )
 
 
 def run(arguments: list[str]) -> int:
@@ -252,6 +274,9 @@ def _untold(arguments: list[str], error: OSError) -> int:
 
 def _bug(arguments: list[str], error: Exception) -> int:
     _traceback(arguments)
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("teds_provision"):
+        lacks = _incomplete(package_of(error.name))
+        return _fail(arguments, lacks.exit_code, lacks.code, lacks.message, lacks.hint)
     hint = "This is a bug. Please report it with the output of --debug."
     return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
 

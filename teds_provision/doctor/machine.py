@@ -15,22 +15,11 @@ from teds_provision import store as store_room
 from teds_provision import vault
 from teds_provision.doctor.checks import Finding, System, check
 from teds_provision.errors import StoreError
-from teds_provision.lazy import install_command
+from teds_provision.lazy import REQUIRED, install_command
 from teds_provision.store.database import has_store
 
 _MIN_PYTHON: Final = (3, 11)
-_LIBRARIES: Final = {
-    "click": "8.2.1",
-    "cryptography": "44.0.0",
-    "nfcpy": "1.0.4",
-    "ndeflib": "0.3.3",
-    "python-can": "4.5",
-    "can-isotp": "2.0.6",
-    "msgpack": "1.0",
-    "keyring": "25.2",
-    "numpy": "1.26",
-    "defusedxml": "0.7.1",
-}
+_LIBRARIES: Final = {name: least for name, (_, least) in REQUIRED.items()} | {"ndeflib": "0.3.3"}  # nfcpy needs it
 _LIBUSB: Final = ("libusb-1.0.so.0", "libusb-1.0.dylib", "libusb-1.0.dll")
 _FIRST_YEAR: Final = 2025
 _LAST_YEAR: Final = 2099

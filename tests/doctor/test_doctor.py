@@ -22,6 +22,7 @@ from teds_provision.doctor import machine as doctor_machine
 from teds_provision.doctor.checks import CHECKS, Finding, System, examine, exit_code
 from teds_provision.doctor.links import READERS
 from teds_provision.doctor.station import holds_private_key
+from teds_provision.lazy import REQUIRED
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.store import Draft, KeyFlags, KeyRecord, NodeRecord, StationRecord, Store, StoreLock, WhitelistEntry
 from teds_provision.teds.image import Image
@@ -239,7 +240,8 @@ def test_a_bus_that_was_asked_for_opens(system: System) -> None:
 def test_the_versions_asked_for_are_those_of_the_project() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]  # nfcpy brings ndeflib, tests name it
-    declared = dict(text.split(">=") for text in wanted if ">=" in text)
+    declared = dict(text.partition(";")[0].split(">=") for text in wanted if ">=" in text)
+    assert {text.split(">=")[0] for text in project["dependencies"]} == REQUIRED.keys()
     assert {name: declared[name] for name in doctor_machine._LIBRARIES} == doctor_machine._LIBRARIES
 
 
