@@ -33,6 +33,8 @@ _BLOCKS: Final[Mapping[int, str]] = {
     AccessCode.NAME: "name",
     AccessCode.PHY: "PHY TEDS",
     AccessCode.SECURITY: "Security TEDS",
+    AccessCode.ORIGIN: "Origin TEDS",
+    AccessCode.CERTIFICATE: "Certificate TEDS",
 }
 _LABELS: Final = {
     "LowLimit": "low limit",

@@ -21,6 +21,7 @@ from teds_provision.teds.codec.uuid import unpack_uuid
 from teds_provision.teds.formats import TedsBlock
 from teds_provision.teds.formats.jsonform import teds_to_json
 from teds_provision.teds.formats.tree import shortest
+from teds_provision.teds.origin import read_origin
 from teds_provision.teds.sheet import channel_from, described
 from teds_provision.teds.units import WrittenUnit, display_unit, format_value, name_of_units
 
@@ -185,6 +186,8 @@ def summary_of(decoded: DecodedTeds, context: Context, now: datetime) -> tuple[L
             return tuple(_calibration(decoded, context, now))
         case AccessCode.SECURITY:
             return tuple(_security(decoded, context))
+        case AccessCode.ORIGIN:
+            return tuple(_origin(decoded))
         case _:
             return ()
 
@@ -250,6 +253,15 @@ def _security(decoded: DecodedTeds, context: Context) -> Iterator[Line]:
             security.decode(decoded.octets)
         except BadDataError as error:
             yield "form", f"not canonical, so never authentic: {error.message}"
+
+
+def _origin(decoded: DecodedTeds) -> Iterator[Line]:
+    try:
+        origin = read_origin(decoded.octets)
+    except BadDataError as error:
+        yield "form", f"not the Origin TEDS of the profile: {error.message}"
+        return
+    yield "wrapped", f"{origin.text}: the node's proof ends at the wrapper, not at the sensor"
 
 
 def _keys(decoded: DecodedTeds) -> Iterator[Line]:

@@ -251,24 +251,24 @@ def _tail(decoded: DecodedTeds) -> bytes:
 
 _VERSIONS: Final = {(2007, 1): 2, (2024, 2): 1}
 _UUID_OCTETS: Final = {2007: 10, 2024: 16}
+_ONE_FORM: Final = frozenset({AccessCode.SECURITY, AccessCode.ORIGIN, AccessCode.CERTIFICATE})
 
 
 def convert(decoded: DecodedTeds, edition: Edition, *, uuid: bytes | None = None) -> tuple[bytes, list[Finding]]:
     """Convert a decoded TEDS to an edition, framed or bare as it came; findings say what was changed or lost.
 
     A UUID of one edition cannot be said in the other: ``uuid`` gives the new one, else the field is left out (an error
-    finding). The profile's Security TEDS (access code 128) has one form only and is returned as it is. Raises
-    BadDataError for octets that have no fields to convert, or no TEDSID.
+    finding). The profile's own TEDS (access codes 128, 130, 131) have one form only and are returned as they are.
+    Raises BadDataError for octets that have no fields to convert, or no TEDSID.
     """
     if decoded.edition is None or decoded.access_code is None or decoded.verdict in {"malformed", "message"}:
         raise BadDataError(f"This cannot be converted: it is no TEDS of known edition (verdict {decoded.verdict}).")
     if decoded.edition == edition:
         return decoded.octets, []
     conversion = _Conversion(decoded, table(decoded.access_code), edition, uuid)
-    if decoded.access_code == AccessCode.SECURITY:
-        conversion.add_finding(
-            "note", "one-form", "The Security TEDS of the profile has one form in both editions.", None
-        )
+    if decoded.access_code in _ONE_FORM:
+        message = f"The {decoded.name} of the profile has one form in both editions."
+        conversion.add_finding("note", "one-form", message, None)
         return decoded.octets, conversion.findings
     return conversion.octets(), conversion.findings
 

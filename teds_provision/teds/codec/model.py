@@ -12,7 +12,8 @@ from typing import Final, Literal, NamedTuple
 class AccessCode(IntEnum):
     """Access code of a TEDS class (teds.md, "Access codes"); the TEDSID of each TEDS repeats it.
 
-    128 is ours: the Security TEDS of the profile. 16 is what the 2024 edition calls by the same name.
+    128, 130 and 131 are ours: the Security TEDS of the profile, Origin and Certificate. 16 is what the 2024 edition
+    calls by the first one's name.
     """
 
     META = 1
@@ -33,6 +34,8 @@ class AccessCode(IntEnum):
     SECURITY_2024 = 16
     TIME_SYNC = 17
     SECURITY = 128
+    ORIGIN = 130
+    CERTIFICATE = 131
 
 
 TEXT_BASED: Final = frozenset(

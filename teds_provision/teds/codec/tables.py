@@ -39,6 +39,8 @@ NAMES: Final[Mapping[int, str]] = {
     AccessCode.SECURITY_2024: "SecurityTEDS2024",
     AccessCode.TIME_SYNC: "TimeSyncTEDS",
     AccessCode.SECURITY: "SecurityTEDS",
+    AccessCode.ORIGIN: "OriginTEDS",
+    AccessCode.CERTIFICATE: "CertificateTEDS",
 }
 
 # Octets of the kinds of value that have a fixed number of them; UUID, TEDSID and TimeInstance depend on the edition.
@@ -437,6 +439,22 @@ _PHY_TEXT_SECURITY: Final[dict[int, dict[str, Any]]] = {
     },
 }
 
+# The two TEDS of the profile whose content is lines of text (text_lines.py).
+_LINES: Final[dict[int, dict[str, Any]]] = {
+    AccessCode.ORIGIN: {
+        "rows": (
+            _row(4, "Lines", "text", "R", meaning="kind, name and digest of the description of the wrapped sensor"),
+        ),
+        "source": 'teds.md, "130 OriginTEDS"',
+    },
+    AccessCode.CERTIFICATE: {
+        "rows": (
+            _row(4, "Lines", "text", "R", meaning="number, laboratory, date and digest of a calibration certificate"),
+        ),
+        "source": 'teds.md, "131 CertificateTEDS"',
+    },
+}
+
 
 # Reads the field table of the Calibration TEDS from ``calibration_fields.toml`` (unverified numbers).
 
@@ -474,7 +492,7 @@ def table(access_code: int) -> Table:
         return calibration_table()
     if access_code in TEXT_BASED:
         return Table(access_code, name, TEXT, source='teds.md, "Text-based TEDS (2, 4, 6, 10, 11, 14, 15)"')
-    entry = TABLES.get(access_code) or _PHY_TEXT_SECURITY.get(access_code)
+    entry = TABLES.get(access_code) or _PHY_TEXT_SECURITY.get(access_code) or _LINES.get(access_code)
     if entry is None:
         return Table(access_code, name, verified=False)
     return Table(access_code, name, **entry)

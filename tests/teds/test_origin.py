@@ -1,0 +1,113 @@
+"""The Origin TEDS: one way to write it, everything else is refused, and it marks the node that carries it."""
+
+from __future__ import annotations
+
+import string
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision import teds
+from teds_provision.errors import BadDataError
+from teds_provision.teds.codec.frame import frame, raw_tuple
+from teds_provision.teds.codec.text_lines import MOST_OCTETS, compose_lines, read_lines
+from teds_provision.teds.formats import TedsBlock
+from teds_provision.teds.origin import ORIGIN, Origin, origin_of, read_origin
+from teds_provision.teds.show import describe
+
+DIGEST = "5a" * 32
+TORQUE = Origin("dbc", "Torque", DIGEST)
+NAMES = st.text(st.characters(exclude_categories=("C", "Z")), min_size=1, max_size=40)
+ORIGINS = st.one_of(
+    st.builds(
+        Origin,
+        st.sampled_from(["dbc", "eds"]),
+        NAMES,
+        st.text(string.digits + "abcdef", min_size=64, max_size=64),
+    ),
+    st.builds(Origin, st.just("iio"), NAMES),
+)
+
+
+@given(ORIGINS)
+def test_what_is_written_is_read_back_and_the_decoder_has_nothing_against_it(origin: Origin) -> None:
+    octets = origin.encode()
+    assert read_origin(octets) == origin
+    decoded = teds.decode(octets)
+    assert decoded.verdict == "clean"
+    assert teds.recompose(decoded) == octets
+    assert decoded.get("Lines") == octets[12:-2].decode()
+    assert origin_of({ORIGIN: octets}) == origin
+
+
+@given(st.binary(max_size=300))
+def test_octets_end_in_an_origin_or_in_an_error_of_ours(octets: bytes) -> None:
+    assert origin_of({ORIGIN: octets}) is None or read_origin(octets).encode() == octets
+    framed = frame(bytes.fromhex("030400820101") + raw_tuple(4, octets[:255]))
+    assert origin_of({ORIGIN: framed}) is None or read_origin(framed).encode() == framed
+
+
+@given(ORIGINS, st.data())
+def test_a_changed_octet_is_refused_or_says_something_else(origin: Origin, data: st.DataObject) -> None:
+    block = bytearray(origin.encode()[4:-2])
+    at = data.draw(st.integers(0, len(block) - 1))
+    block[at] ^= data.draw(st.integers(1, 255))
+    changed = frame(bytes(block))
+    try:
+        found = read_origin(changed)
+    except BadDataError:
+        return
+    assert found != origin
+    assert found.encode() == changed
+
+
+def test_the_octets_are_those_of_the_page() -> None:
+    lines = b"kind=dbc\nname=Torque\nsha256=" + DIGEST.encode() + b"\n"
+    assert TORQUE.encode() == frame(bytes.fromhex("030400820101") + bytes([4, len(lines)]) + lines)
+    assert Origin("iio", "bmp280").encode()[12:-2] == b"kind=iio\nname=bmp280\n"
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        b"kind=dbc\nname=Torque\n",  # a file has a digest
+        b"name=Torque\nkind=iio\n",
+        b"kind=iio\nname=bmp280",
+        b"kind=iio\nname=bmp280\nmore=1\n",
+        b"kind=iio\nname=\n",
+        b"kind=usb\nname=bmp280\n",
+        b"kind=iio\nname=a\rb\n",
+        b"kind=iio\nname=\xff\n",
+        b"kind=dbc\nname=Torque\nsha256=" + DIGEST.upper().encode() + b"\n",
+        b"kind=iio\nname=bmp280\nsha256=" + DIGEST.encode() + b"\n",
+    ],
+)
+def test_other_lines_mark_nothing(lines: bytes) -> None:
+    teds_of_a_stranger = frame(bytes.fromhex("030400820101") + raw_tuple(4, lines))
+    assert origin_of({ORIGIN: teds_of_a_stranger}) is None
+    with pytest.raises(BadDataError):
+        read_origin(teds_of_a_stranger)
+
+
+def test_what_it_cannot_hold_is_refused() -> None:
+    with pytest.raises(BadDataError, match="at most 255 octets"):
+        Origin("dbc", "x" * 200, DIGEST).encode()
+    with pytest.raises(BadDataError, match="printable"):
+        Origin("iio", "two\nlines").encode()
+    fitting = MOST_OCTETS - len("certificate=\n")
+    assert read_lines(131, compose_lines(131, {"certificate": "x" * fitting}), ["certificate"])
+    with pytest.raises(BadDataError):
+        compose_lines(131, {"certificate": "x" * (fitting + 1)})
+
+
+def test_show_says_that_the_node_is_wrapped() -> None:
+    shown = describe(TedsBlock(*ORIGIN, TORQUE.encode()))
+    assert shown.title == "channel 0 · OriginTEDS (130)"
+    assert dict(shown.summary)["wrapped"].startswith("CAN message Torque (dbc): the node's proof ends at the wrapper")
+
+
+def test_the_other_edition_has_the_same_form() -> None:
+    octets, findings = teds.convert(teds.decode(TORQUE.encode()), 2024)
+    assert octets == TORQUE.encode()
+    assert [finding.code for finding in findings] == ["one-form"]
