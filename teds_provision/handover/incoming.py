@@ -471,7 +471,7 @@ def prove_node(station: Station, node: Conversation) -> NodeProof:
 
     Raises TedsProvisionError: link, other key, unknown key.
     """
-    due = station.keys.rotation_due(node.uuid) is not None
+    due = station.keys.rotates_now(node.uuid)
     identify(station, node)
     held = require_session(station, node)
     station.audit("handover", node.uuid, "taken over", epoch=held.record.epoch, rotated=due)

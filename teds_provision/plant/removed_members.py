@@ -10,24 +10,22 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import Final
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.plant.apply_pages import counted_places, merged_views
 from teds_provision.protocol.handover.strict_json import load_exact
-from teds_provision.protocol.plant import event
-from teds_provision.protocol.plant.claim import Claim, Key
+from teds_provision.protocol.plant import event, sharing
+from teds_provision.protocol.plant.claim import Claim, had_key
 from teds_provision.protocol.plant.roster import RemovedMember, Roster, open_roster
-from teds_provision.station.node_keys import STOLEN
+from teds_provision.station.node_keys import REMOVED, STOLEN, deferred
 from teds_provision.station.station import Station
 from teds_provision.store import KeyRecord
 
-WHY: Final = "registry: "
-"""Begins the reason of a rotation that is due because somebody left."""
 OTHERS: Final = timedelta(hours=24)
-"""So long the station that made a key has to rotate it, before others do."""
+"""So long the station whose turn it is has to rotate a key, before others do."""
 EVERY: Final = timedelta(hours=1)
 _PAGE: Final = 500
 _COMMAND: Final = "registry sync"
@@ -76,7 +74,7 @@ def last(station: Station) -> RemovalReview | None:
 
 def rotations_due(station: Station) -> int:
     """How many nodes this station has to rotate because somebody left."""
-    return sum(why.startswith(WHY) for why in station.keys.rotations_due().values())
+    return sum(why.startswith(REMOVED) for why in station.keys.rotations_due().values())
 
 
 def _pages(station: Station) -> Iterable[list[bytes]]:
@@ -110,32 +108,44 @@ def _mark(
     now: datetime,
     ours: Mapping[str, datetime],
 ) -> None:
-    """Mark those of a page of nodes whose key somebody had who left."""
+    """Mark those of a page of nodes whose key a station that left has had, and note whose turn the rotation is."""
     claims = station.plant.tables.claims_of(list(keys))
     marked = station.keys.due_among(list(keys))
     wanted: dict[bytes, str] = {}
     for uuid, key in keys.items():
         already = station.keys.rotation_due(uuid) or "" if uuid in marked else None
-        if already is not None and (already.startswith(STOLEN) or not already.startswith(WHY)):
+        if already is not None and (already.startswith(STOLEN) or not already.startswith(REMOVED)):
             continue
         said = {fingerprint: Claim.from_json(text) for fingerprint, text in claims.get(uuid, {}).items()}
         had = beyond.get((uuid, key.epoch, key.key_id), set()) | {
-            holder.fingerprint for holder in station.keys.holders(uuid) if roster.removed_one(holder.fingerprint)
+            holder for holder in station.keys.holders_of_key(key) if roster.removed_one(holder)
         }
         known = [
             removed
             for removed in roster.removed
-            if removed.fingerprint in had or _had(removed, (key.epoch, key.key_id), said)
+            if removed.fingerprint in had or had_key(removed.fingerprint, (key.epoch, key.key_id), said)
         ]
-        why = _why_due(known, key, said, now, ours)
-        if why is not None:
+        own_turn = bool(known) and _own_turn(station, roster, uuid, key)
+        why = _why_due(known, key, said, now, ours, own_turn=own_turn)
+        if why is not None and why != already:
             wanted[uuid] = why
-    wanted = {uuid: why for uuid, why in wanted.items() if uuid not in marked or why.startswith(STOLEN)}
     if wanted:
         with station.durable(_COMMAND):
             for uuid, why in wanted.items():
                 station.keys.demand_rotation(uuid, why)
                 station.audit("registry", uuid, "rotation due", why=why)
+
+
+def _own_turn(station: Station, roster: Roster, uuid: bytes, key: KeyRecord) -> bool:
+    """True if this station rotates a key before others do.
+
+    It made the key; or no member that holds the key did, and of those this one has the lowest fingerprint.
+    """
+    if key.source == "agreement":
+        return True
+    view = merged_views(station, roster, [uuid])[uuid]
+    turn = sharing.rotator(view, (key.epoch, key.key_id), station.fingerprint)
+    return turn == station.fingerprint
 
 
 def _why_due(
@@ -144,32 +154,28 @@ def _why_due(
     said: Mapping[str, Claim],
     now: datetime,
     ours: Mapping[str, datetime],
+    *,
+    own_turn: bool,
 ) -> str | None:
-    """Why a key that these removed stations have held is to be replaced; a stolen one goes before all others.
+    """Return why a key that these removed stations have held is to be replaced; a stolen one goes before all others.
 
-    Who was retired and says that it forgot the key needs no rotation. A key that another station agreed is that
-    station's to rotate; this one does it when the removal has been known here for ``OTHERS``.
+    A station that was retired and reports that it forgot the key needs no rotation. If it is another station's turn,
+    the rotation is deferred until the removal has been known here for ``OTHERS``.
     """
-    why = None
+    why: str | None = None
     for removed in known:
         forgot = said[removed.fingerprint].forgot if removed.fingerprint in said else -1
         if removed.why == "retired" and forgot >= key.epoch:
             continue
-        if key.source == "agreement" or now - ours.get(removed.fingerprint, now) >= OTHERS:
-            if removed.why == "stolen":
-                return f"{STOLEN}{removed.name} has held this key"
-            why = f"{WHY}{removed.name} ({removed.why}) has held this key"
+        text = f"station {removed.name} ({removed.why}) has held this key"
+        begins = ours.get(removed.fingerprint, now) + OTHERS
+        if not own_turn and now < begins:
+            why = why or deferred(begins.astimezone(UTC), text)
+        elif removed.why == "stolen":
+            return f"{STOLEN}{removed.name} has held this key"
+        else:
+            why = f"{REMOVED}{text}"
     return why
-
-
-def _had(removed: RemovedMember, key: Key, said: Mapping[str, Claim]) -> bool:
-    """Whether by anybody's claims of a node somebody who left has held this key of it."""
-    own = said.get(removed.fingerprint)
-    if own is not None and key in ((own.agreed or ())[:2], own.took, *((e, k) for _, _, e, k, _ in own.gave)):
-        return True
-    return any(
-        (peer, e, k) == (removed.fingerprint, *key) for claim in said.values() for _, peer, e, k, _ in claim.gave
-    )
 
 
 def _beyond(station: Station, roster: Roster) -> dict[tuple[bytes, int, str], set[str]]:

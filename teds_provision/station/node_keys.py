@@ -32,10 +32,18 @@ _NO_MARKS: Final = KeyFlags()
 
 RESTORED = "restored from a backup"
 """Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
+REMOVED: Final = "registry: "
+"""Begins the reason of a rotation that is due because a station was removed from the plant."""
+_FROM: Final = f"{REMOVED}from "
 STOLEN = "registry: stolen: "
 """Begins the reason of a rotation for which a running session ends at once: a thief has that key."""
 CONFIRM_MAY_ARRIVE = timedelta(minutes=2)
 """For how long after an agreement its Confirm may still reach the node: 60 s of the profile, and a bus that is slow."""
+
+
+def deferred(begins: datetime, why: str) -> str:
+    """Return the reason of a rotation that another station is to do first; this one does it from ``begins`` on."""
+    return f"{_FROM}{begins:%Y-%m-%dT%H:%M:%SZ}: {why}"
 
 
 @dataclass(frozen=True)
@@ -313,8 +321,15 @@ class NodeKeys:
     # -- rotations and other holders -------------------------------------------------------------------------------
 
     def rotation_due(self, uuid: bytes) -> str | None:
-        """Why the next session with a node has to rotate its key first; None where it has not."""
+        """Return why a node's key is to be rotated, None if it is not; :meth:`rotates_now`: by this station, today."""
         return self._store.key_flags(uuid).rotation
+
+    def rotates_now(self, uuid: bytes) -> bool:
+        """True if the next session with a node has to rotate its key first, and no other station is to do so before."""
+        why = self.rotation_due(uuid)
+        if why is None or not why.startswith(_FROM):
+            return why is not None
+        return utc_now() >= why[len(_FROM) :].partition("Z")[0] + "Z"
 
     def rotations_due(self) -> dict[bytes, str]:
         """Why a rotation is due, for every node that has one."""
@@ -349,6 +364,17 @@ class NodeKeys:
         for holder in self._store.holders(uuid):
             self._store.remove_holder(uuid, holder.fingerprint)
 
+    def end_removal_mark(self, record: KeyRecord) -> None:
+        """End a rotation that a removal demanded: a session was opened under a key that no removed station has had.
+
+        Another holder has rotated the node. What only a page after the removed station's last one shows, the next
+        review of removals finds.
+        """
+        if (self.rotation_due(record.uuid) or "").startswith(REMOVED) and not self._plant.removed_had(
+            record.uuid, record.epoch, record.key_id, self.holders_of_key(record)
+        ):
+            self._set_flags(record.uuid, rotation=None)
+
     def former(self, uuid: bytes) -> str | None:
         """Fingerprint of the board that the link keys were agreed with, once its pin was let go."""
         return self._store.key_flags(uuid).former
@@ -360,6 +386,10 @@ class NodeKeys:
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Who else holds keys: of this node, or of all."""
         return self._store.holders(uuid)
+
+    def holders_of_key(self, record: KeyRecord) -> set[str]:
+        """Return the stations that were noted as holders since this key came; earlier ones had the key before it."""
+        return {holder.fingerprint for holder in self._store.holders(record.uuid) if holder.since >= record.created}
 
     def put_holder(self, holder: Holder) -> None:
         """Note that another station holds a key of this node."""

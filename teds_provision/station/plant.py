@@ -24,12 +24,12 @@ from teds_provision.store.tables.plant import PlantRecord
 
 if TYPE_CHECKING:
     from teds_provision.protocol import keys
-    from teds_provision.protocol.plant import document, event, roster, signer
+    from teds_provision.protocol.plant import claim, document, event, roster, signer
     from teds_provision.protocol.plant.roster import Role
     from teds_provision.vault import Vault
 else:  # cryptography: not for commands that only list
     keys, event = late("teds_provision.protocol.keys"), late("teds_provision.protocol.plant.event")
-    document = late("teds_provision.protocol.plant.document")
+    claim, document = late("teds_provision.protocol.plant.claim"), late("teds_provision.protocol.plant.document")
     roster, signer = late("teds_provision.protocol.plant.roster"), late("teds_provision.protocol.plant.signer")
 
 
@@ -139,6 +139,18 @@ class Plant:
                 f"The plant's stations know two keys for node {uuid.hex()}: {disputed}.",
                 hint=f"A keeper must pin one of them, or you do: whitelist add {uuid.hex()} --fingerprint F",
             )
+
+    def removed_had(self, uuid: bytes, epoch: int, key_id: str, holders: Collection[str]) -> bool:
+        """Return True if a removed station is among ``holders`` or, by claims that count, has had this link key."""
+        held = self.roster
+        if held is None or not held.removed:
+            return False
+        claims = self.tables.claims_of([uuid]).get(uuid, {})
+        said = {station: claim.Claim.from_json(text) for station, text in claims.items()}
+        return any(
+            removed.fingerprint in holders or claim.had_key(removed.fingerprint, (epoch, key_id), said)
+            for removed in held.removed
+        )
 
     def signer_rules(self) -> SignerRules | None:
         """Whose signatures count; None where none was joined."""

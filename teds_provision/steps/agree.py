@@ -113,6 +113,8 @@ def _activate(station: Station, record: KeyRecord) -> None:
         pinned = station.pins.pinned(uuid)
         if is_whole(pinned):
             station.plant.record_event("agreed", uuid, fingerprint=pinned, epoch=record.epoch, key_id=record.key_id)
+    elif record.state == "pending":
+        station.keys.end_removal_mark(record)
     station.audit("key", uuid, "active", key_id=record.key_id, epoch=record.epoch)
 
 
@@ -125,7 +127,7 @@ def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
         return None
     held = open_session(station, node)
     entry = station.pins.entry(node.uuid)
-    due = station.keys.rotation_due(node.uuid) is not None and entry is not None and entry.fingerprint is not None
+    due = station.keys.rotates_now(node.uuid) and entry is not None and entry.fingerprint is not None
     if held is None or not due or entry is None:
         return held
     try:
@@ -248,7 +250,7 @@ def _agree(
         if newcomer is not None:  # a session under a key of ours is open: it comes onto the list at once
             with station.durable("agree"):
                 _enlist(station, newcomer)
-        if demanded or station.keys.rotation_due(node.uuid) is not None:
+        if demanded or station.keys.rotates_now(node.uuid):
             return _new_key(station, node, who, entry, returning=returning, demanded=True)
         return AgreeResult(held.record.epoch, held.record.key_id, fresh=again)
     if not new:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from teds_provision import plant
-from teds_provision.plant import removed_members
 from teds_provision.plant.folder_transport import FolderTransport
+from teds_provision.station.node_keys import REMOVED
 from teds_provision.station.station import Station
 from teds_provision.store import WhitelistEntry
 from teds_provision.store.tables.plant import Alarm
@@ -42,7 +42,7 @@ def test_the_plant_is_shown_with_conflicts_alarms_and_what_is_to_rotate(browser:
         for station in (south, north):
             plant.sync.sync(station, FolderTransport(stick))
         plant.owner.join(north, signed, url=f"{plant.membership.FILES}{stick}", told=[])
-        north.keys.demand_rotation(bytes(10), f"{removed_members.WHY}west (lost) has held this key")
+        north.keys.demand_rotation(bytes(10), f"{REMOVED}station west (lost) has held this key")
         north.plant.tables.put_alarm(
             Alarm("rolled-back", south.fingerprint, 3, "page 3 was there, and now 1 is the last")
         )

@@ -15,8 +15,10 @@ from teds_provision.errors import KeyStolenError
 from teds_provision.measure.standing import NodeStanding
 from teds_provision.plant import removed_members
 from teds_provision.protocol.plant.roster import Share, Why
+from teds_provision.station.node_keys import REMOVED, deferred
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
+from teds_provision.store import Holder
 from tests.bench import talk
 from tests.plant.handing import board_of
 from tests.plant.stations import Plant, ask
@@ -50,7 +52,7 @@ class Scene:
         self.sync(self.north)
 
     def marks(self, station: Station) -> list[bytes]:
-        return [uuid for uuid, why in station.keys.rotations_due().items() if why.startswith(removed_members.WHY)]
+        return [uuid for uuid, why in station.keys.rotations_due().items() if why.startswith(REMOVED)]
 
 
 @pytest.fixture
@@ -84,16 +86,79 @@ def test_who_made_a_key_that_a_thief_has_rotates_it_at_the_next_contact(scene: S
     assert scene.marks(scene.west) == [other]
 
 
-def test_who_has_a_copy_rotates_it_a_day_later(scene: Scene) -> None:
+def test_the_only_holder_of_a_key_that_a_lost_station_made_rotates_it_at_once(scene: Scene) -> None:
     uuid = scene.keyed_by(scene.west)
     scene.remove(scene.west, "lost")
     scene.sync(scene.south)
-    assert scene.marks(scene.south) == []
-    later(scene.south, 23)
-    assert scene.marks(scene.south) == []
-    later(scene.south, 25)
     assert scene.marks(scene.south) == [uuid]
-    assert scene.south.keys.rotation_due(uuid) == "registry: west (lost) has held this key"
+    assert scene.south.keys.rotation_due(uuid) == "registry: station west (lost) has held this key"
+    assert scene.south.keys.rotates_now(uuid)
+
+
+def test_of_two_holders_the_first_rotates_what_a_thief_made_and_the_other_goes_on_with_the_new_key(
+    scene: Scene,
+) -> None:
+    """Both mark at once; one rotates and shares; the other takes its copy and ends its mark without a rotation."""
+    to = (scene.south.fingerprint, scene.north.fingerprint)
+    scene.plant.change(plant.owner.shared(scene.north, Share(("all", ""), to)))
+    scene.sync(scene.north, scene.west)
+    board = board_of(scene.west, os.urandom(10))
+    scene.sync(scene.west, scene.south, scene.north, scene.west, scene.south, scene.north)
+    first, other = sorted((scene.north, scene.south), key=lambda station: station.fingerprint)
+    assert all(station.keys.held(board.uuid) for station in (first, other))
+    with talk(board) as node:
+        session_if_keyed(other, node)  # its key is active: the copy has been used
+    other.keys.put_holder(Holder(board.uuid, scene.west.fingerprint, "2026-01-31T12:00:00Z"))  # not this very second
+    running = [NodeStanding(station, board.uuid) for station in (first, other)]
+    scene.remove(scene.west, "stolen")
+    scene.sync(scene.south)
+    assert scene.marks(first) == scene.marks(other) == [board.uuid]
+    with pytest.raises(KeyStolenError):
+        running[0].require()
+    running[1].require()
+    due = other.keys.rotation_due(board.uuid)
+    assert due is not None
+    assert due.endswith("Z: station west (stolen) has held this key")
+    epoch = other.keys.active_epoch(board.uuid)
+    with talk(board) as node:
+        session_if_keyed(other, node)
+    assert other.keys.active_epoch(board.uuid) == epoch, "it is the other station's turn"
+
+    with talk(board) as node:
+        session_if_keyed(first, node)
+    assert first.keys.active_epoch(board.uuid) == epoch + 1
+    assert scene.marks(first) == []
+    scene.sync(first, other)
+    with talk(board) as node:
+        session_if_keyed(other, node)
+    assert other.keys.active_epoch(board.uuid) == epoch + 1, "the thief never had this key"
+    assert scene.marks(other) == []
+    later(other, 30)
+    assert scene.marks(other) == []
+
+
+def test_whose_turn_it_is_not_rotates_a_day_later(scene: Scene) -> None:
+    to = (scene.south.fingerprint, scene.north.fingerprint)
+    scene.plant.change(plant.owner.shared(scene.north, Share(("all", ""), to)))
+    scene.sync(scene.north, scene.west)
+    uuid = board_of(scene.west, os.urandom(10)).uuid
+    scene.sync(scene.west, scene.south, scene.north, scene.west, scene.south, scene.north)
+    other = max((scene.north, scene.south), key=lambda station: station.fingerprint)
+    scene.remove(scene.west, "stolen")
+    scene.sync(scene.south)
+    for hours, now in ((0, False), (23, False), (25, True)):
+        later(other, hours)
+        assert scene.marks(other) == [uuid]
+        assert other.keys.rotates_now(uuid) == now
+    assert other.keys.stolen(uuid)
+
+
+def test_a_deferred_rotation_begins_at_its_time_without_another_sync(scene: Scene) -> None:
+    uuid = scene.keyed_by(scene.west)
+    at = datetime.now(UTC)
+    for begins, now in ((at + timedelta(minutes=1), False), (at - timedelta(minutes=1), True)):
+        scene.south.keys.demand_rotation(uuid, deferred(begins, "station west (lost) has held this key"))
+        assert scene.south.keys.rotates_now(uuid) == now
 
 
 def test_a_clock_that_was_ahead_does_not_keep_anybody_from_looking_again(scene: Scene) -> None:

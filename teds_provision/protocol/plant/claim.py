@@ -7,6 +7,7 @@ for and nothing of the order in which chains arrived: the greatest key, the last
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Final
 
@@ -108,3 +109,11 @@ class Claim:
         claim.undone = set(kept.get("undone", ()))
         claim.groups = {group: (member, at) for group, (member, at) in kept.get("groups", {}).items()}
         return claim
+
+
+def had_key(station: str, key: Key, claims: Mapping[str, Claim]) -> bool:
+    """Return True if by any station's claims of a node this one has held a link key of it."""
+    own = claims.get(station)
+    if own is not None and key in ((own.agreed or ())[:2], own.took, *((e, k) for _, _, e, k, _ in own.gave)):
+        return True
+    return any((peer, e, k) == (station, *key) for claim in claims.values() for _, peer, e, k, _ in claim.gave)

@@ -59,6 +59,15 @@ def sharer(roster: Roster, view: MergedClaims, key: tuple[int, str], silent: Abs
     return next((station for station in holders if station not in silent), None) if gone else None
 
 
+def rotator(view: MergedClaims, key: tuple[int, str], me: str) -> str:
+    """Return the station that rotates a key (epoch, key id) first once another one that held it was removed.
+
+    The member that made the key if it still holds it, else the holder with the lowest fingerprint. ``me`` holds it.
+    """
+    holders = sorted({me} | {station for station, held in view.held.items() if held == key})
+    return next((station for station in holders if station in view.made), holders[0])
+
+
 def silent(created: Mapping[str, datetime | None], now: datetime) -> set[str]:
     """Stations whose newest page that counts was made more than :data:`SILENT` before now."""
     return {station for station, at in created.items() if at is None or now - at > SILENT}
