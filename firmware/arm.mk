@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # Cross builds for Cortex-M0+, M4 and M33: sizes of the library, stack of each function, images for qemu. Included by Makefile.
 
 ARM := arm-none-eabi-

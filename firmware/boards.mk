@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # The Zephyr port and the example boards, compiled and run on this machine over a stand-in for the kernel and its drivers
 # (port/zephyr/standin): `make boards`. On Zephyr: zephyr/CMakeLists.txt.
 

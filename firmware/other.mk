@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # The C tests on other machines: 32 bits of this one, and big-endian s390x under qemu-user. BearSSL comes from its source.
 # And what cppcheck and clang-tidy say. `make -C firmware others`, `make -C firmware analyse`.
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Key agreement (security-teds.md, 3): Request, Confirm, and the hashes, keys and signatures under them.
  *
  * NIST SP 800-56A ECC CDH over two one-time keys and the station's static one, HKDF of RFC 5869. The node's identity

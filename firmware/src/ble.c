@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* BLE (wire.md): commands and replies as frames `transaction 2, total 2, offset 2, piece` over two characteristics. The
  * GATT server, its connections and advertising are the chip's stack; when to advertise and whom to drop is said here. */
 #include "inside.h"

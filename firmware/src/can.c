@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* CAN (wire.md): lines to stations, one long request at a time, replies, Identify asked of everyone, Announce and Claim,
  * and what leaves next. */
 #include "inside.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The commit of a datasheet (security-teds.md, 5): every check in its order, then one transaction; and the other changes
  * of the durable state. */
 #include "inside.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Drive (operation.md, 4 and 6): values for actuators by message, without a reply. Whatever is wrong with a message, it is
  * dropped without a word; a good tag uses its counter up all the same. */
 #include "inside.h"

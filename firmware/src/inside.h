@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* What the files of src/ ask of each other. Not for boards. */
 #ifndef TEDS_INSIDE_H
 #define TEDS_INSIDE_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* ISO 15765-2 for one pair of addresses: cutting a message into frames, flow control. No CAN identifiers here.
  *
  * Its own 2 KB instead of an operating system's: the profile wants a reply for each pair of addresses, refusals from a

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* NDEF messages, their framing alone (NFC Forum NDEF 1.0, 3.2): what a reader wrote, and the records that a node gives. */
 #include "inside.h"
 

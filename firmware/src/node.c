@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* One node: which command may be run when (security-teds.md, 4), routing, and the commands that need little. */
 #include "inside.h"
 
@@ -497,7 +498,7 @@ int teds_node_init_as_built(teds_node *node, uint32_t built, const teds_config *
     memset(node, 0, sizeof *node);
     node->config = config;
     node->port = port;
-    if (port->unit == 0 || port->unit > 32 || (port->unit & (port->unit - 1)) != 0 ||
+    if (port->p256_make == NULL || port->unit == 0 || port->unit > 32 || (port->unit & (port->unit - 1)) != 0 ||
         port->slot_octets < TEDS_STAGING + 256u || port->identity_octets < 192 ||
         (TEDS_NFC && config->nfc.present && config->nfc.max_ndef != 0 && config->nfc.max_ndef < 160)) {
         return TEDS_E_USAGE;

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #include "octets.h"
 
 void teds_put16(uint8_t *at, uint16_t value)

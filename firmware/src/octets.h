@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Octets: integers by shifts alone (any byte order of the chip), comparing and wiping secrets, CRC-32. */
 #ifndef TEDS_OCTETS_H
 #define TEDS_OCTETS_H

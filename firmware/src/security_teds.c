@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The Security TEDS (security-teds.md, 1): the initial one, and the canonical form of a signed one. Octets alone. */
 #include "inside.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Sessions (security-teds.md, 4): Open, Sealed, their lives and ends. Sessions and half-open Opens are tables apart, so
  * that nobody's plain question, and nobody's Open, ends a session. */
 #include "inside.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Streams and trigger (operation.md, 3, 4, 5): Subscribe, Stop, samples when they are due, data messages sealed and cut
  * into frames, Arm. A stream has one message being filled and one that waits; a waiting one is dropped when the next is
  * full: newest wins. One message at a time is being sent. */

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Where a node's state and TEDS lie: two slots of flash that take turns, a staging arena in RAM; Query, Read, Write and
  * Update over them (security-teds.md, 4 and 5).
  *

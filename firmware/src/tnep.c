@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* NFC (wire.md): the node's half of TNEP 1.0 over an NDEF message, and the pieces of a request and its reply.
  *
  * One buffer is the NDEF file: the reader's message is read from it, the answer is put there. While a command runs it is

@@ -1,4 +1,9 @@
-/* Sizes of a node, set when it is built (-DTEDS_STAGING=8192 or a teds_user_config.h). All of it is RAM in teds_node. */
+/* SPDX-License-Identifier: Apache-2.0 */
+/** @file
+ * Sizes and options of a node, set when it is compiled: `-DTEDS_STAGING=8192`, or a `teds_user_config.h` with
+ * `-DTEDS_USER_CONFIG`. All of it is RAM in teds_node. Compile the library and the board with the same values:
+ * teds_node_init compares them and returns #TEDS_E_BUILD if they differ.
+ */
 #ifndef TEDS_CONFIG_H
 #define TEDS_CONFIG_H
 
@@ -6,30 +11,31 @@
 #include "teds_user_config.h"
 #endif
 
-/* maxMessage of wire.md: the longest whole command or reply frame, 512 to 4094. */
 #ifndef TEDS_MAX_MESSAGE
+/** Longest whole command or reply frame, 512 to 4094 octets (maxMessage of the profile). */
 #define TEDS_MAX_MESSAGE 1024
 #endif
 
-/* The staging arena: all TEDS images between their first Write and the commit, 4 octets of bookkeeping each. */
 #ifndef TEDS_STAGING
+/** Octets of the staging arena: all TEDS images between their first Write and the commit, and 4 octets for each. */
 #define TEDS_STAGING 4096
 #endif
 
-/* Sessions, and half-open Opens, over all links; two or more. */
 #ifndef TEDS_SESSIONS
+/** Sessions at once over all links, and as many half-open Opens: two or more. */
 #define TEDS_SESSIONS 2
 #endif
 
-/* Stored replies: one for each session and one for everyone else, so that a stranger's question meets room. A board on
- * CAN alone may save that one (TEDS_REPLIES=TEDS_SESSIONS): while every place is a session's, further stations get 17. */
 #ifndef TEDS_REPLIES
+/** Stored replies: one for each session and one for every other station, so that a stranger's question finds room.
+ * A board on CAN alone may save that one (`TEDS_REPLIES=TEDS_SESSIONS`): while each place belongs to a session, further
+ * stations are refused with 17. */
 #define TEDS_REPLIES (TEDS_SESSIONS + 1)
 #endif
 
-/* Stations that a node keeps ISO-TP state for at once (sources F1 to F7): each session keeps its own, and one more than
- * sessions is for everybody else. With all seven, every station has one. */
 #ifndef TEDS_CAN_LINES
+/** Stations (sources F1 to F7) that the node keeps ISO-TP state for at once. Each session keeps its own, and one more
+ * than sessions serves all other stations; with seven, each station has one. */
 #if TEDS_SESSIONS < 3
 #define TEDS_CAN_LINES 4
 #elif TEDS_SESSIONS < 6
@@ -39,71 +45,80 @@
 #endif
 #endif
 
-/* 1: answers CAN FD in FD. 0: classic frames alone. */
 #ifndef TEDS_CAN_FD
+/** 1: answers CAN FD in FD. 0: classic frames alone. */
 #define TEDS_CAN_FD 1
 #endif
 
-/* What flow control asks a station for: frames in a block (0: no limit), STmin as on the wire (ISO 15765-2). */
 #ifndef TEDS_CAN_BLOCK
+/** Block size that flow control asks a station for, in frames; 0: no limit (ISO 15765-2). */
 #define TEDS_CAN_BLOCK 16
 #endif
+
 #ifndef TEDS_CAN_STMIN
+/** STmin that flow control asks a station for, as sent on the wire: 00 to 7F ms, or F1 to F9 (100 to 900 us). */
 #define TEDS_CAN_STMIN 0
 #endif
 
-/* 1: measures (operation.md). 0: provisioning alone; every command of operation.md gets 1. */
 #ifndef TEDS_OPERATION
+/** 1: measures and drives (docs/operation.md). 0: provisioning alone; each command of operation is refused with 1. */
 #define TEDS_OPERATION 1
 #endif
 
-/* Channels of the board, at most 32. */
 #ifndef TEDS_CHANNELS
+/** TransducerChannels of the board, at most 32. */
 #define TEDS_CHANNELS 8
 #endif
 
-/* Streams over all sessions, at least 1. */
 #ifndef TEDS_STREAMS
+/** Streams at once over all sessions, 1 to 127. */
 #define TEDS_STREAMS 2
 #endif
 
-/* Data sets of all channels of one Drive, octets. */
 #ifndef TEDS_DRIVE_OCTETS
+/** Octets of the data sets of all channels of one Drive, 1 to 200. */
 #define TEDS_DRIVE_OCTETS 32
 #endif
 
-/* Event sensors of the board; events of each that wait for the main loop, and the longest data set of one. */
 #ifndef TEDS_EVENT_CHANNELS
+/** Event sensors of the board. */
 #define TEDS_EVENT_CHANNELS 1
 #endif
+
 #ifndef TEDS_EVENTS
+/** Events of each event sensor that may wait for the main loop, 1 to 254. */
 #define TEDS_EVENTS 4
 #endif
+
 #ifndef TEDS_EVENT_OCTETS
+/** Octets of the longest data set of an event sensor, 1 to 219. */
 #define TEDS_EVENT_OCTETS 8
 #endif
 
-/* Octets of the port's running SHA-256 (br_sha256_context 112, psa_hash_operation_t of Mbed TLS 2.28 232). */
 #ifndef TEDS_SHA256_OCTETS
+/** Octets of the port's running SHA-256: 112 for br_sha256_context, 232 for psa_hash_operation_t of Mbed TLS 2.28. */
 #define TEDS_SHA256_OCTETS 112
 #endif
 
-/* 1: with NFC (a Type 4 tag, TNEP); teds_config says whether this board has an antenna. 0: the wired bus counts as tapped
- * in factory state (security-teds.md, 2). */
 #ifndef TEDS_NFC
+/** 1: NFC (a Type 4 tag, TNEP); teds_config states if this board has an antenna. 0: no NFC, and the wired bus counts as
+ * tapped in factory state. */
 #define TEDS_NFC 0
 #endif
 
-/* The longest NDEF message. With 64 octets more than a command frame no command goes in pieces; RAM, so less will do. */
 #ifndef TEDS_MAX_NDEF
+/** Longest NDEF message, 160 to 32000 octets. With 64 octets more than a command frame, no command is sent in pieces;
+ * it is RAM, so less will do. */
 #define TEDS_MAX_NDEF (TEDS_MAX_MESSAGE + 64)
 #endif
 
-/* 1: Bluetooth LE, its framing. Connections at once: two or more, so that a stranger does not hold the only one. */
 #ifndef TEDS_BLE
+/** 1: Bluetooth LE, its framing. */
 #define TEDS_BLE 0
 #endif
+
 #ifndef TEDS_BLE_CONNECTIONS
+/** Bluetooth LE connections at once, 2 to 20: two or more, so that a stranger cannot hold the only one. */
 #define TEDS_BLE_CONNECTIONS 2
 #endif
 

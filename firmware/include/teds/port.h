@@ -1,7 +1,10 @@
-/* What a board gives to its node: flash, randomness, cryptography, a clock, its channels.
+/* SPDX-License-Identifier: Apache-2.0 */
+/** @file
+ * What a board gives to its node: flash, randomness, a clock, cryptography, channels.
  *
- * Function pointers and a `user` each, so that two nodes live in one process. Functions that return int give 0 when it
- * was done, anything else when it was not; the node then refuses with reason 11 and changes nothing.
+ * The port is a structure of function pointers, each of which gets `user`, so that two nodes run in one process.
+ * Functions that return int return 0 if they did what was asked, and anything else if not: the node then refuses the
+ * command with reason 11 and has changed nothing. A blank port to copy is port/template/board.c.
  */
 #ifndef TEDS_PORT_H
 #define TEDS_PORT_H
@@ -12,120 +15,173 @@
 
 #include "teds/config.h"
 
-/* Areas of flash: the identity is written once, the slots take turns. */
-enum { TEDS_IDENTITY = 0, TEDS_SLOT_A = 1, TEDS_SLOT_B = 2 };
+#ifdef __cplusplus
+extern "C" {
+#endif
 
-/* A private key as the port knows it: the scalar of a key in software, the slot of a secure element, a PSA key id.
- * The node stores that of its identity key in the identity area and never looks inside. */
-typedef struct teds_key_ref {
-    uint8_t octets[32];
-} teds_key_ref;
-
-/* What a key is made for. A signing key is kept for good; an agreeing one lives for one Request or one Open. */
-enum { TEDS_KEY_SIGNS = 0, TEDS_KEY_AGREES = 1 };
-
-typedef union teds_sha256 {
-    uint64_t align;
-    void *align_pointer;
-    uint8_t octets[TEDS_SHA256_OCTETS];
-} teds_sha256;
-
-typedef struct teds_part {
-    const uint8_t *octets;
-    size_t length;
-} teds_part;
-
-/* Kinds of a channel as ChanType has them. */
-enum { TEDS_SENSOR = 0, TEDS_ACTUATOR = 1, TEDS_EVENT_SENSOR = 2 };
-
-/* A channel as the firmware knows it (operation.md, 1: the TEDS does not command the hardware). */
-typedef struct teds_channel {
-    uint8_t number; /* 1 to 255, ascending in the table */
-    uint8_t kind;
-    uint8_t model;  /* DatModel */
-    uint8_t octets; /* ModLenth */
-    uint8_t halt;   /* ActHalt; of actuators */
-    uint32_t shortest; /* shortest period, ns */
-} teds_channel;
-
+/** Areas of flash. The identity is written once; the two slots take turns. */
 enum {
-    TEDS_POWER_BATTERY = 1,
-    TEDS_POWER_CHARGING = 2,
-    TEDS_POWER_FULL = 4,
-    TEDS_POWER_IN_FIELD = 8,
-    TEDS_POWER_TOO_LOW = 16
+    TEDS_IDENTITY = 0, /**< UUID and identity key */
+    TEDS_SLOT_A = 1,   /**< state and TEDS, one of the two */
+    TEDS_SLOT_B = 2    /**< state and TEDS, the other one */
 };
 
+/** A private key as the port knows it: the scalar of a key in software, the slot of a secure element, a PSA key id.
+ * The node stores the one of its identity key in the identity area and never interprets it. */
+typedef struct teds_key_ref {
+    uint8_t octets[32]; /**< meaning: the port's */
+} teds_key_ref;
+
+/** Purpose of a new key. */
+enum {
+    TEDS_KEY_SIGNS = 0, /**< the identity key: signs, is kept for life */
+    TEDS_KEY_AGREES = 1 /**< a one-time key: one Request or one Open */
+};
+
+/** Room for the port's running SHA-256, aligned for any member. */
+typedef union teds_sha256 {
+    uint64_t align;                     /**< alignment only */
+    void *align_pointer;                /**< alignment only */
+    uint8_t octets[TEDS_SHA256_OCTETS]; /**< the port's own structure */
+} teds_sha256;
+
+/** One of several octet strings that are hashed one after another. */
+typedef struct teds_part {
+    const uint8_t *octets; /**< its first octet */
+    size_t length;         /**< its octets */
+} teds_part;
+
+/** Kinds of a channel, as ChanType numbers them. */
+enum {
+    TEDS_SENSOR = 0,      /**< has a value whenever it is asked */
+    TEDS_ACTUATOR = 1,    /**< takes a set point */
+    TEDS_EVENT_SENSOR = 2 /**< has a value when something happens (teds_sensor_event) */
+};
+
+/** A channel as the firmware knows it: the TEDS describes the hardware and never commands it. */
+typedef struct teds_channel {
+    uint8_t number;    /**< 1 to 255, ascending in the table */
+    uint8_t kind;      /**< #TEDS_SENSOR, #TEDS_ACTUATOR or #TEDS_EVENT_SENSOR */
+    uint8_t model;     /**< DatModel */
+    uint8_t octets;    /**< ModLenth: octets of a data set */
+    uint8_t halt;      /**< ActHalt of an actuator */
+    uint32_t shortest; /**< shortest sampling period, ns */
+} teds_channel;
+
+/** Flags of teds_power. */
+enum {
+    TEDS_POWER_BATTERY = 1,  /**< the board has a battery */
+    TEDS_POWER_CHARGING = 2, /**< it is being charged */
+    TEDS_POWER_FULL = 4,     /**< it is full */
+    TEDS_POWER_IN_FIELD = 8, /**< a reader's field is present */
+    TEDS_POWER_TOO_LOW = 16  /**< too low for a commit */
+};
+
+/** State of the supply. */
 typedef struct teds_power {
-    uint8_t flags;
-    uint8_t level;       /* %, FF unknown */
-    uint16_t voltage;    /* mV, FFFF unknown */
-    int16_t current;     /* mA, + charges, 7FFF unknown */
-    int8_t temperature;  /* degrees Celsius, 7F unknown */
+    uint8_t flags;      /**< TEDS_POWER_… */
+    uint8_t level;      /**< %, FF if unknown */
+    uint16_t voltage;   /**< mV, FFFF if unknown */
+    int16_t current;    /**< mA, positive while it charges, 7FFF if unknown */
+    int8_t temperature; /**< degrees Celsius, 7F if unknown */
 } teds_power;
 
+/** A board, as the node sees it. It must outlive the node. */
 typedef struct teds_port {
+    /** First argument of each function. With port/bearssl it points to a structure that begins with a teds_bearssl. */
     void *user;
 
-    /* -- flash. Areas of whole erase pages; a slot holds TEDS_STAGING + 256 octets or more. ------------------- */
-    uint32_t slot_octets;
-    uint32_t identity_octets; /* 192 or more */
-    uint8_t unit;   /* 1, 2, 4, 8, 16 or 32: writes are whole units, ascending, each unit once after an erase */
-    uint8_t erased; /* 0xFF or 0x00 */
+    /** @name Flash
+     * Areas of whole erase pages at fixed addresses; raw flash, without a file system or a key-value store. */
+    /** @{ */
+    uint32_t slot_octets;     /**< octets of each slot, #TEDS_STAGING + 256 or more */
+    uint32_t identity_octets; /**< octets of the identity area, 192 or more */
+    uint8_t unit;             /**< octets of a write unit: 1, 2, 4, 8, 16 or 32 */
+    uint8_t erased;           /**< an erased octet: FF or 00 */
+    /** Erase an area, all of it. */
     int (*erase)(void *user, int area);
+    /** Write whole units, ascending; the node writes each unit once after an erase. Return when it is in flash. */
     int (*write)(void *user, int area, uint32_t at, const uint8_t *octets, size_t length);
+    /** Read from any octet on. */
     int (*read)(void *user, int area, uint32_t at, uint8_t *out, size_t length);
+    /** @} */
 
-    /* -- randomness: fails rather than be weak; good from the first moment after a start ---------------------- */
+    /** Draw random octets for keys and nonces. Good from the first call after a start; fails rather than be weak. */
     int (*random)(void *user, uint8_t *out, size_t length);
 
-    /* -- the clock: ns since the start, never back, never wrapped while the node is up ------------------------- */
+    /** @name Clock */
+    /** @{ */
+    /** Return ns since the start: never back, and without a wrap while the node runs. */
     uint64_t (*now)(void *user);
-    uint32_t step;  /* of that clock, ns */
-    uint16_t drift; /* ppm */
+    uint32_t step;  /**< resolution of the clock, ns */
+    uint16_t drift; /**< its tolerance, ppm */
+    /** @} */
 
-    /* -- cryptography ------------------------------------------------------------------------------------------ */
+    /** @name Cryptography
+     * teds_bearssl_fill or teds_psa_fill fill these in. Constant time, wherever a secret is involved. */
+    /** @{ */
+    /** Start a SHA-256 in `state`. */
     void (*sha256_start)(void *user, teds_sha256 *state);
+    /** Add octets to it. */
     void (*sha256_update)(void *user, teds_sha256 *state, const uint8_t *octets, size_t length);
+    /** Finish it. */
     void (*sha256_finish)(void *user, teds_sha256 *state, uint8_t out[32]);
-    /* HMAC-SHA-256 of the parts one after another. */
+    /** HMAC-SHA-256 of the parts one after another. */
     int (*hmac)(void *user, const uint8_t *key, size_t key_length, const teds_part *parts, size_t count,
                 uint8_t out[32]);
+    /** Make a P-256 key for `use`; return a reference to it, and its public point (04, x, y). */
     int (*p256_make)(void *user, int use, teds_key_ref *key, uint8_t point[65]);
-    /* Whether 65 octets that begin with 04 are a point of the curve. */
+    /** True if 65 octets, 04 first, are a point of the curve. */
     bool (*p256_good)(void *user, const uint8_t point[65]);
-    /* x-coordinate of the ECDH of an agreeing key. */
+    /** ECDH of an agreeing key with a good point: the x-coordinate. */
     int (*p256_ecdh)(void *user, const teds_key_ref *key, const uint8_t peer[65], uint8_t out[32]);
-    /* ECDSA over a SHA-256, r and s of 32 octets each; s may be high, the node turns it. */
+    /** ECDSA over a SHA-256: r and s, 32 octets each. s may be high, the node replaces it by n - s. */
     int (*p256_sign)(void *user, const teds_key_ref *key, const uint8_t hash[32], uint8_t out[64]);
-    /* Whether it verifies; the node has refused a high s before. */
+    /** True if the signature is good. The node has refused a high s before. */
     bool (*p256_verify)(void *user, const uint8_t point[65], const uint8_t hash[32], const uint8_t signature[64]);
-    /* An agreeing key is used up; its octets are wiped by the node afterwards. NULL where nothing is to be done. */
+    /** Drop an agreeing key after its one use; the node wipes the reference. NULL if there is nothing to drop. */
     void (*p256_drop)(void *user, teds_key_ref *key);
-    /* AES-128-CCM, nonce of 13 octets, no associated data. seal: in and out may be the same place, the tag follows the
-     * text. open: in (text and tag) and out do not overlap, in is never written. */
+    /** AES-128-CCM, nonce of 13 octets, no associated data: text, then the tag. `in` and `out` may be the same. */
     int (*ccm_seal)(void *user, const uint8_t key[16], const uint8_t nonce[13], const uint8_t *in, size_t length,
                     uint8_t *out, size_t tag_length);
+    /** The reverse: true if the tag is good. `in` (text and tag) and `out` do not overlap; `in` is never written, since
+     * the node tries the keys of a session and of a half-open one on the same octets. */
     bool (*ccm_open)(void *user, const uint8_t key[16], const uint8_t nonce[13], const uint8_t *in, size_t length,
                      uint8_t *out, size_t tag_length);
+    /** @} */
 
-    /* -- channels; all return at once. NULL where the board has none of that ----------------------------------- */
-    const teds_channel *channels;
-    size_t channel_count;
-    /* The value of a sensor; false where it is not valid (out of range, warming up, fault). */
+    /** @name Channels
+     * All functions return at once. NULL if the board has none of that. */
+    /** @{ */
+    const teds_channel *channels; /**< constant table of the hardware */
+    size_t channel_count;         /**< its entries */
+    /** Read a sensor's value for `tick`; false if it is not valid (out of range, warming up, fault). */
     bool (*sample)(void *user, uint8_t channel, uint64_t tick, uint8_t *out);
-    /* Actuators: whether the hardware bears a raw value; give it; its present set point; its safe state; the hardware
-     * timer of its dead-man, armed for ms (0: off) and kicked by each good value. */
+    /** True if the hardware takes this raw value. */
     bool (*bears)(void *user, uint8_t channel, const uint8_t *octets);
+    /** Apply a value that `bears` accepted. */
     void (*set)(void *user, uint8_t channel, const uint8_t *octets);
+    /** Return the present set point. */
     void (*set_point)(void *user, uint8_t channel, uint8_t *out);
+    /** Bring an actuator to its safe state. */
     void (*safe)(void *user, uint8_t channel);
+    /** Arm the dead-man for `ms` (0: off): a hardware timer that calls the safe state by itself. */
     void (*arm)(void *user, uint8_t channel, uint16_t ms);
+    /** Restart the dead-man: a good value came. */
     void (*kick)(void *user, uint8_t channel);
+    /** Start a self-test. */
     void (*self_test)(void *user, uint8_t channel);
+    /** True while a self-test runs. */
     bool (*testing)(void *user, uint8_t channel);
+    /** True if a channel is faulty. */
     bool (*fault)(void *user, uint8_t channel);
+    /** Return the state of the supply. */
     void (*power)(void *user, teds_power *out);
+    /** @} */
 } teds_port;
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

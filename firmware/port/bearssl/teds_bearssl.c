@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #include "teds_bearssl.h"
 
 #include <bearssl.h>
@@ -172,8 +173,11 @@ static bool ccm_open(void *user, const uint8_t key[16], const uint8_t nonce[13],
     return good;
 }
 
-void teds_bearssl_fill(teds_port *port)
+int teds_bearssl_fill(teds_port *port, const teds_bearssl *context)
 {
+    if (context == NULL || port->user != context || context->random == NULL) {
+        return -1; /* p256_make would call whatever `user` begins with */
+    }
     port->sha256_start = sha256_start;
     port->sha256_update = sha256_update;
     port->sha256_finish = sha256_finish;
@@ -186,4 +190,5 @@ void teds_bearssl_fill(teds_port *port)
     port->p256_drop = NULL;
     port->ccm_seal = ccm_seal;
     port->ccm_open = ccm_open;
+    return 0;
 }

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* --can: INTERFACE:CHANNEL[?key=value&…], as the station's option; udp_multicast and socketcand. */
 #define _DEFAULT_SOURCE
 #include "host.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Channels without hardware: what a source gives for a time. Integers of up to 8 octets, big-endian. */
 #define _POSIX_C_SOURCE 200809L
 #include "host.h"

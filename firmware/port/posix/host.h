@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The host port: a node as a program. One file of flash, one CAN bus over UDP multicast or socketcand, a
  * simulated NFC reader. */
 #ifndef TEDS_HOST_H

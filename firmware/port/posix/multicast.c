@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* python-can's udp_multicast: each frame is one datagram, a msgpack map of the fields of can.Message. */
 #define _DEFAULT_SOURCE
 #include "host.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A simulated reader: nfcpy's udp driver, the tag's side. A datagram is `106A hex` or `RFOFF`, loopback alone. */
 #define _DEFAULT_SOURCE
 #include "host.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* What a frame takes on a wire or on air, to the bit, and holding it back so long: for benches.
  *
  * CAN as ISO 11898-1 has it, with the stuff bits of what is sent; NFC as ISO/IEC 14443-3 Type A at 106 kbit/s.

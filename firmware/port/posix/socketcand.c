@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* socketcand (linux-can): lines of text over TCP, raw mode. Classic frames alone: it knows no FD. */
 #define _POSIX_C_SOURCE 200809L
 #include "host.h"

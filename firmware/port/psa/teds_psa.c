@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #include "teds_psa.h"
 
 #include <psa/crypto.h>

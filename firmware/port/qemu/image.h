@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A bare Cortex-M under qemu: the start, the clock, the serial line. Machines: microbit (Cortex-M0, the instructions of
  * an M0+), mps2-an386 (Cortex-M4) and mps2-an505 (Cortex-M33). With -icount shift=0 an instruction takes a nanosecond, so
  * that the clock counts instructions. */

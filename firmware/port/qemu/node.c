@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A node under qemu: a whole port, on a serial line that carries CAN frames (serial.h). */
 #include "image.h"
 #include "octets.h"
@@ -89,11 +90,10 @@ static int start(const uint8_t seed[32], const uint8_t uuid[10])
     port.now = now;
     port.step = IMAGE_TICK_PICOSECONDS / 1000u;
     port.drift = 100;
-    teds_bearssl_fill(&port);
     port.channels = channels;
     port.channel_count = 1;
     port.sample = sample;
-    return teds_node_init(&node, &config, &port);
+    return teds_bearssl_fill(&port, &own.crypto) != 0 ? TEDS_E_USAGE : teds_node_init(&node, &config, &port);
 }
 
 static void take(const uint8_t *packet, size_t length)

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #include "serial.h"
 
 #define UART(offset) (*(volatile uint32_t *)(uintptr_t)(0x40004000u + (offset)))

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The serial line of qemu's mps2-an386 with packets on it, framed as SLIP does (RFC 1055): a kind, then octets.
  *
  *   in   FRAME id4 fd data…   a CAN frame            POWER seed32 uuid10   power comes: randomness and identity

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* What each step of a node costs, counted: instructions of the whole command from frame to reply, and the stack below it.
  *
  * A node lives through the published first agreement, session and datasheet (tests/vectors/profile/kat.json), with their
@@ -100,7 +101,7 @@ static void fill(void)
     port.now = now;
     port.step = 1;
     port.drift = 100;
-    teds_bearssl_fill(&port);
+    (void)teds_bearssl_fill(&port, &crypto);
     port.channels = channels;
     port.channel_count = 1;
     port.sample = sample;

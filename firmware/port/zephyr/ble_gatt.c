@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The profile's GATT service on Zephyr's Bluetooth host: connectable advertising while the node says so, a write and a
  * notify characteristic for commands, one for data messages and set points. The host's callbacks fill a queue; the
  * node's thread empties it.

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The controller of `chosen` zephyr,canbus: its callback fills a queue, the node's thread empties it.
  *
  * One frame is with the controller at a time. With several mailboxes some controllers send frames of one identifier in

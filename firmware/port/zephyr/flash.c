@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Three raw partitions. No file system and no NVS: none has a transaction over several keys (docs/internals). */
 #include "teds_zephyr.h"
 

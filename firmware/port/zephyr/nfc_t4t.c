@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A Type 4 tag by Nordic's nfc_t4t_lib (nRF Connect SDK; its licence is for Nordic's chips), in raw mode: it does ISO-DEP
  * and hands over APDUs.
  */

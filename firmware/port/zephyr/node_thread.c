@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The thread that owns the node. Everything else wakes it: the CAN callback, a reader, a connection, an event. */
 #include "teds_psa.h"
 #include "teds_zephyr.h"

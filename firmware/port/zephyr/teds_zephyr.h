@@ -1,49 +1,60 @@
-/* A node on Zephyr: one thread that owns it, a message queue from the CAN callback, flash partitions, PSA Crypto.
+/* SPDX-License-Identifier: Apache-2.0 */
+/** @file
+ * A node on Zephyr: one thread that owns it, a message queue from the CAN callback, flash partitions, PSA Crypto.
  *
  * The application fills in its channels and starts it. Devicetree: `chosen` zephyr,canbus; fixed partitions labelled
  * teds_identity, teds_slot_a, teds_slot_b, each of whole erase pages, slots of CONFIG_TEDS_NODE_STAGING + 256 or more.
- * Written from Zephyr's headers (3.5 and later) and compiled against stubs of them: no board has run it yet.
  */
 #ifndef TEDS_ZEPHYR_H
 #define TEDS_ZEPHYR_H
 
 #include "teds/node.h"
 
-/* What an application says of its board; channel functions as in teds_port, called from the node's thread. The rest of
- * the port is filled in here. Both must outlive the node. */
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/** What an application hands over of its board. Both must outlive the node. */
 typedef struct teds_zephyr_board {
-    teds_port *port;
-    teds_config *config; /* an UUID of zeros: made of the chip's own number (hwinfo) */
+    teds_port *port;     /**< channel functions as in teds_port, called from the node's thread; the rest is filled in here */
+    teds_config *config; /**< a UUID of zeros is replaced by one made of the chip's own number (hwinfo) */
 } teds_zephyr_board;
 
-/* Fill in the port, start the node and its thread. 0, TEDS_E_…, or Zephyr's negative errno where a device is not ready. */
+/** Fill in the port, start the node and its thread. Return 0, TEDS_E_…, or Zephyr's negative errno if a device is not
+ * ready. */
 int teds_zephyr_start(const teds_zephyr_board *board);
 
-/* ns since the start; the port's clock, for ticks of events. Also from an interrupt. */
+/** Return ns since the start: the port's clock, for ticks of events. Also from an interrupt. */
 uint64_t teds_zephyr_now(void);
 
-/* A pad was held for five seconds: the effect of Reset, soon, on the node's thread. Also from an interrupt. */
+/** A pad was held for five seconds: the effect of Reset, soon, on the node's thread. Also from an interrupt. */
 void teds_zephyr_reset_by_hand(void);
 
-/* teds_sensor_event, and the node's thread is woken. From an interrupt or a thread. */
+/** teds_sensor_event, and wake the node's thread. From an interrupt or a thread. */
 void teds_zephyr_event(uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid);
 
-/* Frames of the bus that found no room on their way to the node, since the start. */
+/** Return the frames of the bus that found no room on their way to the node, since the start. */
 uint32_t teds_zephyr_dropped(void);
 
+/** @cond INSIDE */
 /* -- between the files of this port ---------------------------------------------------------------------------------- */
 
 int teds_zephyr_flash(teds_port *port);
 int teds_zephyr_can_start(void);
-/* Give the node what came and the controller what may leave; true where something moved. */
+/* Give the node what came and the controller what may leave; true if something moved. */
 bool teds_zephyr_can_work(teds_node *node);
 /* A frame is with the controller, which calls back when it has left. */
 bool teds_zephyr_can_busy(void);
 int teds_zephyr_nfc_start(void);
 bool teds_zephyr_nfc_work(teds_node *node);
-int teds_zephyr_ble_start(teds_config *config); /* and say the address that a tap tells */
+int teds_zephyr_ble_start(teds_config *config); /* and set the address that a tap shows */
 bool teds_zephyr_ble_work(teds_node *node);
 /* Wake the node's thread. Also from an interrupt. */
 void teds_zephyr_wake(void);
+/** @endcond */
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

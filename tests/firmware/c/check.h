@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* What a test says: a line for each thing that is wrong, and how many there were. */
 #ifndef TEDS_CHECK_H
 #define TEDS_CHECK_H

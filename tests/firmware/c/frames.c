@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* ISO-TP, Announce and Claim as the bus sees them: frames in, frames out, time in the test's hands. */
 #include "check.h"
 #include "inside.h"

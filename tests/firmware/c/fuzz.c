@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Fuzzed under ASan and UBSan with cryptography that says yes: whatever comes, nothing is read or written beyond.
  *
  * All of a node is one object, so a sanitizer does not see one array of it run into the next: what says how far each is

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #include "memory.h"
 
 #include "inside.h"
@@ -341,7 +342,7 @@ memory_board *memory_new(const uint8_t uuid[10], uint8_t unit, uint8_t erased, m
     board->port.now = clock_now;
     board->port.step = 1;
     board->port.drift = 50;
-    teds_bearssl_fill(&board->port);
+    (void)teds_bearssl_fill(&board->port, &board->crypto);
     board->port.p256_make = scalar;
     board->port.channels = board->channels;
     board->port.sample = sample;

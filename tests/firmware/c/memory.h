@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A node over flash in memory, with a clock and randomness that a test gives: for C tests, fuzzers, and by ctypes. */
 #ifndef TEDS_MEMORY_H
 #define TEDS_MEMORY_H

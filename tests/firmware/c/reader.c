@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The Zephyr port of NFC over the stand-in kernel: what a reader does while the node's thread is busy with a command. */
 #include "check.h"
 #include "inside.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A board that saves a stored reply: as many places as sessions. While both are sessions' a stranger is told so. */
 #include "check.h"
 #include "inside.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The published vectors (`make vectors-c`), in C alone: canonical forms, every transcript, every exchange on CAN. */
 #include "check.h"
 #include "inside.h"

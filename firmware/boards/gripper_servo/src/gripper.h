@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A gripper on a hobby servo: its set point, its safe state and its dead-man; opening and force. */
 #ifndef GRIPPER_H
 #define GRIPPER_H

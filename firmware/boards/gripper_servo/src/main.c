@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A gripper: one actuator with a dead-man, two sensors (profiles/gripper.toml). */
 #include "gripper.h"
 #include "teds_zephyr.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #include "hx711.h"
 
 #include <zephyr/drivers/gpio.h>

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* An HX711 by two pins: 24 bits of a bridge, 80 times a second (RATE high). */
 #ifndef HX711_H
 #define HX711_H

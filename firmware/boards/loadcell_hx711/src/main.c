@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A load cell on an HX711: one sensor, 24 bits in 3 octets, 80 Hz (profiles/load-cell.toml). */
 #include "hx711.h"
 #include "teds_zephyr.h"

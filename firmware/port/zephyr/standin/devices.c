@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Devices of the stand-in: flash in a file, CAN over the host port's bus, a bridge behind an HX711, a servo with two
  * voltages. One JSON line when the bus is up, one for each change of the servo.
  *

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The stand-in kernel: POSIX threads behind the names of Zephyr's. */
 #define _GNU_SOURCE
 #include <string.h>

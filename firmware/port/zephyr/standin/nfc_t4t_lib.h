@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Prototypes of Nordic's library (sdk-nrfxlib, nfc/include/nfc_t4t_lib.h): to compile against, nothing is behind them. */
 #ifndef STANDIN_NFC_T4T_LIB_H
 #define STANDIN_NFC_T4T_LIB_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* What the port and the example boards use of Zephyr's kernel, over POSIX threads: they compile and run on this machine.
  * Names and types are those of Zephyr's headers (3.7), what is behind them is ours (kernel.c). No time is kept as on a
  * chip, no interrupt interrupts: a stand-in for the kernel, never for a board.

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #ifndef STANDIN_BT_CONN_H
 #define STANDIN_BT_CONN_H
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Of Zephyr's Bluetooth host what ble_gatt.c names: to compile against, nothing is behind it. */
 #ifndef STANDIN_BT_UUID_H
 #define STANDIN_BT_UUID_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #ifndef STANDIN_CAN_H
 #define STANDIN_CAN_H
 

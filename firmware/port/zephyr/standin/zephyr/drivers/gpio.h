@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #ifndef STANDIN_GPIO_H
 #define STANDIN_GPIO_H
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #ifndef STANDIN_FLASH_MAP_H
 #define STANDIN_FLASH_MAP_H
 
