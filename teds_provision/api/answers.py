@@ -84,6 +84,13 @@ class Channel(TypedDict):
     actuator: ActuatorState | None
 
 
+class PastSegment(TypedDict):
+    """A stretch in which the values of a channel have one meaning: one unit, one calibration, one zero."""
+
+    id: Annotated[int, Meta(description="ascending; a channel keeps its numbers until the station is restarted")]
+    unit: Annotated[str, Meta(description="SI unit of its values; empty for counts")]
+
+
 class Past(TypedDict):
     """The last hour of a channel, thinned; a bin in which nothing happened is left out."""
 
@@ -99,6 +106,8 @@ class Past(TypedDict):
     count: Annotated[list[int], Meta(description="samples that came")]
     invalid: list[int]
     lost: list[int]
+    segment: Annotated[list[int], Meta(description="id of the segment that the bin is in")]
+    segments: Annotated[list[PastSegment], Meta(description="a new one begins after a recalibration, zero or retype")]
 
 
 class Invalid(TypedDict):

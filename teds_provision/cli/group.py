@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
+from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, yes_option
 from teds_provision.station.groups import Groups
 
 if TYPE_CHECKING:
@@ -23,10 +23,11 @@ def group() -> None:
     """Manage groups of nodes that are measured together. A group cannot change while it is measured."""
 
 
-def _print_groups(app: App, groups: Sequence[Group]) -> None:
+def _print_groups(app: App, groups: Sequence[Group], *, ended: Sequence[str] = ()) -> None:
     lines = [f"{group.name}: {', '.join(uuid.hex() for uuid in group.uuids) or 'no nodes yet'}" for group in groups]
+    found = [{"name": group.name, "uuids": [uuid.hex() for uuid in group.uuids]} for group in groups]
     app.emit(
-        {"groups": [{"name": group.name, "uuids": [uuid.hex() for uuid in group.uuids]} for group in groups]},
+        {"groups": found} | ({"ended": list(ended)} if ended else {}),
         "\n".join(lines) or "There are no groups yet. To create one: teds-provision group create NAME UUID …",
     )
 
@@ -92,17 +93,35 @@ def _change(
         _print_groups(app, [change(station.groups, name, uuids)])
 
 
-@command("teds-provision group delete hand", name="delete")
+@command("teds-provision group delete hand", "teds-provision group delete hand --yes", name="delete")
 @click.argument("name")
+@yes_option
 @dry_run_option
 @pass_app
-def delete(app: App, name: str, *, dry_run: bool) -> None:
-    """Delete a group; its nodes are not affected."""
+def delete(app: App, name: str, *, yes: bool, dry_run: bool) -> None:
+    """Delete a group; its nodes are not affected.
+
+    If measurements are kept for the group (by the page or the API), they are deleted with it, after a question.
+    """
     station = app.station()
-    if not dry_run:
-        with station.lock("group delete", app.note):
-            station.groups.delete(name)
-    _print_groups(app, station.groups.all())
+    kept = [measurement.id for measurement in station.measurements.of_group(name)]
+    what = f"measurement{'s' if len(kept) > 1 else ''} {', '.join(kept)}"
+    if dry_run:
+        app.note(f"Would delete group {name}{f' and its {what}' if kept else ''}.")
+        _print_groups(app, station.groups.all(), ended=kept)
+        return
+    asked = yes or (bool(kept) and app.interactive)
+    if asked and kept:
+        app.confirm(f"Delete group {name} and its {what}?", yes=yes)
+    with station.lock("group delete", app.note), station.transaction():
+        found, ended = station.measurements.delete_group(name, also=kept if asked else ())
+        for measurement_id in ended:
+            station.audit("measure", None, "ended", id=measurement_id, group=name)
+        if found:
+            station.audit("group", None, "deleted", group=name, measurements=list(ended))
+    if ended:
+        app.note(f"Also deleted: {what}.")
+    _print_groups(app, station.groups.all(), ended=ended)
 
 
 for subcommand in (create, add, remove, delete):

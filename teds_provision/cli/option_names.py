@@ -50,7 +50,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "ncap token add": frozenset({"read-only"}),
     "group add": frozenset({"dry-run"}),
     "group create": frozenset({"dry-run"}),
-    "group delete": frozenset({"dry-run"}),
+    "group delete": frozenset({"yes", "dry-run"}),
     "group remove": frozenset({"dry-run"}),
     "names frame": frozenset({"dry-run"}),
     "names reset": frozenset({"dry-run"}),

@@ -347,7 +347,7 @@ class Daemon:
             {
                 "name": group.name,
                 "uuids": [uuid.hex() for uuid in group.uuids],
-                "measuring": self.measurements.group_is_measured(group.name),
+                "measuring": bool(self.measurements.measured_as(group.name)),
             }
             for group in self.station.groups.all()
         ]
@@ -370,17 +370,20 @@ class Daemon:
         self._group_changed(name)
 
     def drop_group(self, name: str) -> None:
-        """Delete a group; raises NotFoundError, FrozenError while it is measured."""
-        with self.station.lock("group delete"):
+        """Delete a group; raises NotFoundError, FrozenError while it is measured or a measurement is kept for it."""
+        with self.station.durable("group delete"):
             self.station.groups.get(name)
             self._require_thawed(name)
-            self.station.groups.delete(name)
+            self.station.measurements.delete_group(name)
+            self.station.audit("group", None, "deleted", group=name)
         self._group_changed(name)
 
     def _require_thawed(self, name: str) -> None:
-        if self.measurements.group_is_measured(name):
+        measured = self.measurements.measured_as(name)
+        if measured:
             raise FrozenError(
-                f"Group {name!r} is being measured and cannot be changed now.", hint="End the measurement first."
+                f"Group {name!r} is being measured ({', '.join(measured)}) and cannot be changed now.",
+                hint="End the measurement first.",
             )
 
     def _group_changed(self, name: str) -> None:

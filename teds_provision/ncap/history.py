@@ -4,6 +4,9 @@ Bins of 1 s for an hour, and of 10 ms for the last minute. A bin holds the least
 many samples came, how many of them were not valid, and (those of 1 s) how many were lost. One channel takes 98.4 kB at
 most, whatever its rate: 14 octets a second of the hour, 8 a bin of the minute. A thousand channels stay below 100 MB;
 what was silent for an hour is forgotten.
+
+If a channel's datasheet gives its values another meaning (unit, calibration, zero), a new segment begins: no bin holds
+values of two segments. The bin in which it begins drops what the segment before left there.
 """
 
 from __future__ import annotations
@@ -11,7 +14,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import NotFoundError
@@ -21,7 +25,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from teds_provision.measure.blocks import Block
+    from teds_provision.measure.blocks import Block, ChannelFacts
+    from teds_provision.teds.calibration.model import Calibration
+    from teds_provision.teds.codec.model import Units
 else:
     np = late("numpy")
 
@@ -52,13 +58,20 @@ class _Bins:
         # samples, invalid, lost; what never happened takes no memory
         self._counts: list[NDArray[Any] | None] = [np.zeros(size, counts), *([None] * (1 if coarse else 2))]
         self._type, self._most = counts, np.iinfo(counts).max
+        self._starts: list[tuple[int, int]] = []  # first bin and number of each segment, both ascending
 
-    def add(self, numbers: NDArray[Any], low: NDArray[Any], high: NDArray[Any], counts: NDArray[Any]) -> None:
-        """Take in bins, ascending and each once; ``counts`` has a row each for samples, invalid and lost ones."""
+    def add(
+        self, numbers: NDArray[Any], low: NDArray[Any], high: NDArray[Any], counts: NDArray[Any], segment: int
+    ) -> None:
+        """Take in bins of a segment, ascending and each once.
+
+        ``counts`` has a row each for samples, invalid and lost ones.
+        """
         first, last = int(numbers[0]), int(numbers[-1])
         if self.newest >= 0 and first < self.newest - _LATE / self.width:
             self._forget(first, self.newest)  # the clock was put back: that time is written anew
             self.newest = first - 1
+        self._extend_to(first, segment)
         if last > self.newest:
             self._forget(max(self.newest + 1, last - self.size + 1), last)
             self.newest = last
@@ -73,6 +86,28 @@ class _Bins:
                 held = self._counts[row] = np.zeros(self.size, self._type)
             if held is not None:
                 held[slots] = np.minimum(held[slots].astype(np.int64) + more, self._most)
+
+    def _extend_to(self, first: int, segment: int) -> None:
+        """Let a segment begin at bin ``first`` at the latest; older segments lose their bins from there on."""
+        if self._starts and self._starts[-1][1] == segment and self._starts[-1][0] <= first:
+            return
+        own = self._starts[-1][0] if self._starts and self._starts[-1][1] == segment else self.newest + 1
+        if first < own:
+            self._forget(first, own - 1)
+        oldest = self.newest - self.size + 1
+        kept = [start for start in self._starts if start[0] < first and start[1] != segment]
+        gone = sum(start <= oldest for start, _ in kept[1:])  # segments without a bin in the ring
+        self._starts = [*kept[gone:], (first, segment)]
+
+    @property
+    def segments(self) -> set[int]:
+        """The segments that may have bins here."""
+        return {segment for _, segment in self._starts}
+
+    def segments_of(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return the segment of each bin."""
+        at = np.searchsorted([first for first, _ in self._starts], numbers, side="right") - 1
+        return np.array([segment for _, segment in self._starts], np.int64)[at]
 
     def _forget(self, first: int, last: int) -> None:
         """Empty these bins and those between them."""
@@ -108,10 +143,45 @@ class _Bins:
         return numbers[some], self._low[slots], self._high_of(slots), counts
 
 
+@dataclass(frozen=True)
+class _Meaning:
+    """What a value of a channel means: values of two meanings are not compared."""
+
+    unit: str = ""
+    units: Units | None = None
+    calibration: Calibration | None = None
+    turn: tuple[float | None, float | None] | None = None  # limits between which its values wrap
+    unsigned: bool = False
+
+    @classmethod
+    def from_facts(cls, facts: ChannelFacts) -> _Meaning:
+        """Return it; a calibration that was only dated or documented again is the same one."""
+        calibration = facts.calibration
+        if calibration is not None:
+            calibration = replace(calibration, date=None, zeroed=None, interval=None, points=(), by="")
+        turn = (facts.low, facts.high) if facts.full_turn else None
+        return cls(facts.unit, facts.units, calibration, turn, facts.unsigned)
+
+
 class _Channel:
-    def __init__(self) -> None:
+    def __init__(self, meaning: _Meaning) -> None:
         self.hour = _Bins(1.0, HOUR, coarse=False)
         self.minute = _Bins(FINE, round(MINUTE / FINE), coarse=True)
+        self.segment, self.meaning = 0, meaning
+        self._units = {0: meaning.unit}
+
+    def begin_segment(self, meaning: _Meaning) -> None:
+        """Let what comes from now on be of another segment."""
+        self.segment, self.meaning = self.segment + 1, meaning
+        self._units = {
+            segment: unit
+            for segment, unit in self._units.items()
+            if any(segment in bins.segments for bins in (self.hour, self.minute))
+        } | {self.segment: meaning.unit}
+
+    def unit(self, segment: int) -> str:
+        """Return the SI unit of a segment."""
+        return self._units[segment]
 
 
 @dataclass
@@ -126,8 +196,9 @@ class History:
     """The last hour of all channels. ``block`` may be called from any thread and returns at once."""
 
     def __init__(self) -> None:
-        self._waiting: deque[Block] = deque()
+        self._waiting: deque[Block | tuple[ChannelFacts, ...]] = deque()
         self._channels: dict[Key, _Channel] = {}
+        self._meanings: dict[Key, _Meaning] = {}
         self._streams: dict[tuple[str, int], _Stream] = {}
         self._turn = threading.Lock()
         self._end = threading.Event()
@@ -143,6 +214,10 @@ class History:
         self._end.set()
         if self._thread is not None:
             self._thread.join(5.0)
+
+    def learn(self, facts: Iterable[ChannelFacts]) -> None:
+        """Take the facts of channels whose blocks come from now on: with another meaning a new segment begins."""
+        self._waiting.append(tuple(facts))
 
     def block(self, block: Block) -> None:
         """Samples of a stream; a test pattern is no measurement."""
@@ -166,7 +241,21 @@ class History:
     def _take_in(self) -> None:
         with self._turn:
             while self._waiting:
-                self._put(self._waiting.popleft())
+                item = self._waiting.popleft()
+                if isinstance(item, tuple):
+                    self._meanings.update((facts.key, _Meaning.from_facts(facts)) for facts in item)
+                else:
+                    self._put(item)
+
+    def _channel(self, key: Key) -> _Channel:
+        """Return a channel, in the segment of what its values mean now."""
+        meaning = self._meanings.get(key, _Meaning())
+        channel = self._channels.get(key)
+        if channel is None:
+            channel = self._channels[key] = _Channel(meaning)
+        elif channel.meaning != meaning:
+            channel.begin_segment(meaning)
+        return channel
 
     def _put(self, block: Block) -> None:
         at = np.asarray(block.time, np.float64)
@@ -186,11 +275,10 @@ class History:
             gone = np.zeros(len(starts), np.int64)
             gone[0] = lost
             for column, number in enumerate(block.channels):
-                one = self._channels.get((block.uuid, number))
-                if one is None:
-                    one = self._channels.setdefault((block.uuid, number), _Channel())
+                one = self._channel((block.uuid, number))
                 bins = one.minute if fine else one.hour
-                bins.add(numbers, low[:, column], high[:, column], np.stack([total, invalid[:, column], gone]))
+                counts = np.stack([total, invalid[:, column], gone])
+                bins.add(numbers, low[:, column], high[:, column], counts, one.segment)
 
     # -- what is asked -----------------------------------------------------------------------------------------------
 
@@ -205,7 +293,8 @@ class History:
 
         ``bin`` is their width in s, ``time`` their beginnings; a bin in which nothing happened is left out. ``low`` and
         ``high`` are SI values, None where none was valid. The last minute is given in bins of 10 ms if no more is asked
-        for. Raises NotFoundError where nothing of the channel was measured within the hour.
+        for. ``segment`` is the ``id`` of each bin's segment, ``segments`` has the SI ``unit`` of each: values of two
+        segments have different meanings. Raises NotFoundError if nothing of the channel was measured in that hour.
         """
         self._take_in()
         end = time.time() if until is None else until
@@ -222,10 +311,12 @@ class History:
             first, last = (int(np.floor(moment / bins.width + _EDGE)) for moment in (begin, end))
             first, last = max(first, bins.newest - bins.size + 1), min(last, bins.newest)
             numbers, low, high, counts = bins.between(first, last)
+            segments = bins.segments_of(numbers)
+            known = {int(segment): one.unit(int(segment)) for segment in dict.fromkeys(segments.tolist())}
             rate = _rate(one.hour)
         each = max(1, -(-(last - first + 1) // max(1, points)))
         if len(numbers) and each > 1:
-            numbers, low, high, counts = _together(numbers // each, low, high, counts)
+            numbers, segments, low, high, counts = _together(numbers // each, segments, low, high, counts)
         width = bins.width * each
         return {
             "uuid": uuid,
@@ -240,6 +331,8 @@ class History:
             "count": counts[0].tolist(),
             "invalid": counts[1].tolist(),
             "lost": counts[2].tolist(),
+            "segment": segments.tolist(),
+            "segments": [{"id": segment, "unit": unit} for segment, unit in known.items()],
         }
 
 
@@ -260,13 +353,14 @@ def _bins_of(times: NDArray[Any], width: float) -> tuple[NDArray[Any], NDArray[A
 
 
 def _together(
-    numbers: NDArray[Any], low: NDArray[Any], high: NDArray[Any], counts: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Bins of the same number made one."""
-    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
+    numbers: NDArray[Any], segments: NDArray[Any], low: NDArray[Any], high: NDArray[Any], counts: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return one bin for those of the same number and segment."""
+    changes = np.diff(numbers, prepend=numbers[0] - 1) | np.diff(segments, prepend=segments[0])
+    starts = np.flatnonzero(changes)
     with np.errstate(invalid="ignore"):
         least, most = np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
-    return numbers[starts], least, most, np.add.reduceat(counts, starts, axis=1)
+    return numbers[starts], segments[starts], least, most, np.add.reduceat(counts, starts, axis=1)
 
 
 def _plain(values: NDArray[Any]) -> list[float | None]:

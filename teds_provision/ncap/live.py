@@ -138,6 +138,7 @@ class Live:
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
         """What is known of channels: no line is drawn from one end of a full turn to the other."""
         every = list(facts)
+        self.history.learn(every)
         turning = {facts.key for facts in every if facts.full_turn}
         self._turning = (self._turning - {facts.key for facts in every}) | turning
 

@@ -337,10 +337,10 @@ class MeasurementSupervisor:
         measurement = job.measurement if job is not None else None
         return measurement.facts if measurement is not None else None
 
-    def group_is_measured(self, name: str) -> bool:
-        """Whether a measurement of this group runs."""
+    def measured_as(self, group: str) -> list[str]:
+        """Return the IDs of the measurements of a group that run, or try to."""
         with self._guard:
-            return any(running.kept.group == name for running in self._running.values())
+            return [key for key, running in self._running.items() if running.kept.group == group]
 
     def _job_of(self, uuid: str) -> MeasurementJob | None:
         with self._guard:

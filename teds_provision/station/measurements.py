@@ -12,10 +12,11 @@ import hashlib
 import os
 import secrets
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 
 from teds_provision.errors import FrozenError, NotFoundError, PolicyError, StoreError, UsageError
 from teds_provision.station.groups import Groups
@@ -103,6 +104,31 @@ class Measurements:
             None,
         )
         return None if found is None else replace(found, id="", owner=COMMAND, pid=None, started=None)
+
+    def of_group(self, group: str) -> list[KeptMeasurement]:
+        """Return those that are kept for a group, and would be deleted with it."""
+        return [measurement for measurement in self.all() if measurement.lasting and measurement.group == group]
+
+    def delete_group(self, group: str, *, also: Collection[str] = ()) -> tuple[bool, tuple[str, ...]]:
+        """Delete a group and the kept measurements of it; False if there is no such group, and the IDs of those.
+
+        ``also`` are the measurements that may go with it. Raises FrozenError while it is measured, or if another one is
+        kept for it.
+        """
+        with self._groups.frozen(group):  # measured now: refused for that, whatever may go with it
+            kept = [measurement.id for measurement in self.of_group(group)]
+        with self._store.together():
+            if set(kept) - set(also):
+                several = len(kept) > 1
+                raise FrozenError(
+                    f"Group {group!r} has {len(kept)} kept measurement{'s' if several else ''} ({', '.join(kept)}), "
+                    f"which would be deleted with it.",
+                    hint=f"Delete {'them' if several else 'it'} first, or: group delete {quote(group)} --yes",
+                )
+            found = self._groups.delete(group)
+            for measurement_id in kept:
+                self._store.remove_measurement(measurement_id)
+            return found, tuple(kept)
 
     def nodes_of(self, measurement: KeptMeasurement) -> tuple[bytes, ...]:
         """UUIDs of its nodes, 10 octets each; raises NotFoundError where its group is gone."""

@@ -411,7 +411,7 @@ class Progress:
         except TypeError:  # no row yet, or of another version of this tool
             return RowOutcome(row.digest, row.content)
         if found.digest != row.digest:
-            again = "its row in the sheet has changed" if found.result == "passed" else ""
+            again = "the sheet changed" if found.result == "passed" else ""
             return RowOutcome(row.digest, row.content, again)
         if found.result == "passed":
             again = self._why_again(row, found)
@@ -423,9 +423,9 @@ class Progress:
         """Return why a row that has passed is done once more, "" if it stays done."""
         if found.content is None:  # finished by an older version, which kept no digests
             same = found.uuid is not None and self._has_it(row, bytes.fromhex(found.uuid))
-            return "" if same else "its board has another datasheet than the sheet gives"
+            return "" if same else "the datasheet differs from the one that the sheet gives"
         changed = [what for what, digest in row.content.items() if found.content.get(what) != digest]
-        return f"its {' and '.join(changed)} changed" if changed else ""
+        return f"the {' and '.join(changed)} changed" if changed else ""
 
     @property
     def again(self) -> tuple[str, ...]:

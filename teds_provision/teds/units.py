@@ -157,6 +157,22 @@ SPECIAL_ROWS: Final = (
 SPECIAL: Final = {
     text: (units, scale, offset) for texts, units, scale, offset in SPECIAL_ROWS for text in texts.split()
 }
+_FULL_NAMES: Final = {
+    name: symbol
+    for names, symbol in (
+        ("radian rads", "rad"), ("steradian", "sr"), ("degree degs", "degree"), ("turn rotation", "turn"),
+        ("meter metre", "m"), ("gram gramme", "g"), ("second sec", "s"), ("minute", "min"), ("hour", "h"),
+        ("ampere amp", "A"), ("kelvin", "K"), ("celsius centigrade", "degC"), ("fahrenheit", "degF"), ("mole", "mol"),
+        ("candela", "cd"), ("lumen", "lm"), ("lux", "lx"), ("newton", "N"), ("pascal", "Pa"), ("joule", "J"),
+        ("watt", "W"), ("volt", "V"), ("ohm", "ohm"), ("farad", "F"), ("henry henries", "H"), ("tesla", "T"),
+        ("weber", "Wb"), ("coulomb", "C"), ("hertz", "Hz"), ("percent", "%"), ("count", "count"), ("rpm", "rpm"),
+    )
+    for name in names.split()
+}  # fmt: skip
+"""Names as words, for a suggestion: the symbol of each is read everywhere, with or without ``pint``."""
+_PREFIXES: Final = {"kilo": "k", "mega": "M", "hecto": "h", "centi": "c", "milli": "m", "micro": "u", "nano": "n",
+                    "pico": "p", "femto": "f"}  # fmt: skip
+_WORD: Final = re.compile(r"[^\W\d_]{3,}")
 
 
 __all__ = [
@@ -373,9 +389,32 @@ def _representable(text: str, exponents: dict[str, Fraction]) -> None:
             )
 
 
+def _in_symbols(text: str) -> str:
+    """Return a unit in words as one in symbols, such as ``N*m`` for ``Newton-meters``; "" if it is none.
+
+    Words without a symbol stay: ``m/fortnight`` is no suggestion, because it does not parse.
+    """
+    written = _WORD.sub(lambda word: _symbol(word[0].lower()) or word[0], text).replace("-", "*").strip()
+    try:
+        parses = written in NAMED or written in TABLE or written in SPECIAL or _compound(written) is not None
+    except BadDataError:  # an exponent that no TEDS can hold
+        return ""
+    return written if parses and written != text else ""
+
+
+def _symbol(word: str) -> str:
+    singular = word if word in _FULL_NAMES else word.removesuffix("s")
+    if singular in _FULL_NAMES:
+        return _FULL_NAMES[singular]
+    prefix = next((prefix for prefix in _PREFIXES if singular.startswith(prefix)), "")
+    base = _FULL_NAMES.get(singular.removeprefix(prefix), "") if prefix else ""
+    return _PREFIXES[prefix] + base if base else ""
+
+
 def _unknown(text: str) -> BadDataError:
-    near = get_close_matches(text[:64], [*NAMED, *TABLE, *SPECIAL], n=1, cutoff=0.6)
-    guess = f'Did you mean "{near[0]}"? ' if near else ""
+    nearest = get_close_matches(text[:64], [*NAMED, *TABLE, *SPECIAL], n=1, cutoff=0.6)
+    near = _in_symbols(text[:64]) or "".join(nearest)
+    guess = f'Did you mean "{near}"? ' if near else ""
     return BadDataError(
         f'"{text}" is not a unit.', hint=f'{guess}Write it like "degree", "N", "mm", "degC", "m/s²", "mV/V" or "count".'
     )

@@ -325,7 +325,7 @@ def test_every_board_of_a_sheet_counts_whatever_the_time_out_and_a_corrected_cal
     *lines, last = lines_of(outcome)
     assert [results(line)["write"] for line in lines] == ["done"] * 3, outcome
     assert (outcome.code, last["totals"]["passed"]) == (0, 3)
-    assert report.read_text().count("because its calibration changed") == 3
+    assert report.read_text().count("because the calibration changed") == 3
     assert "Rows 1, 2, 3: provisioned again" in outcome.err
 
     nodes[2].stop()

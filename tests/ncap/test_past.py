@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from teds_provision.errors import NotFoundError
-from teds_provision.measure.blocks import Block
+from teds_provision.measure.blocks import Block, ChannelFacts
 from teds_provision.ncap.history import HOUR, History
+from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 
 NODE = "8d4d9da65281f7000000"
 NOW = float(int(time.time()))
@@ -127,11 +129,45 @@ def test_a_channel_takes_less_than_a_hundred_thousand_octets() -> None:
     ramp(past, NOW - 70, 70)
     past.channel_history(NODE, 1)
     channel = past._channels[NODE, 1]
-    rings = [ring for bins in vars(channel).values() for ring in (bins._low, bins._high, *bins._counts)]
+    rings = [ring for bins in (channel.hour, channel.minute) for ring in (bins._low, bins._high, *bins._counts)]
     held = sum(ring.nbytes for ring in rings if ring is not None)
     assert held <= 78_000, "nothing was lost, nothing invalid"
     past.block(block(NOW, [[1.0]] * 100, index=9000, valid=[[False]] * 100))
     past.channel_history(NODE, 1)
-    rings = [ring for bins in vars(channel).values() for ring in (bins._low, bins._high, *bins._counts)]
+    rings = [ring for bins in (channel.hour, channel.minute) for ring in (bins._low, bins._high, *bins._counts)]
     held = sum(ring.nbytes for ring in rings if ring is not None)
     assert held <= 98_400
+
+
+def test_no_bin_holds_values_of_two_calibrations() -> None:
+    """A zero, a recalibration or a retype begins a new segment, at a reload and however many bins are asked for."""
+    past = History()
+    angle, zeroed, warm = (
+        replace(ChannelFacts(NODE, "", 1, "a", unit=unit), calibration=calibration)
+        for unit, calibration in (("rad", line()), ("rad", line(zero=0.5)), ("K", line()))
+    )
+    past.learn([angle])
+    past.block(block(NOW - 9, [[1.0]] * 150, index=0))
+    past.learn([replace(angle, calibration=line(by="again"))])  # documented again, and no other values
+    past.block(block(NOW - 7.5, [[1.0]] * 10, run=1))
+    past.learn([zeroed])
+    past.block(block(NOW - 7.4, [[0.5]] * 40, run=2))  # within the second in which the zero was set
+    past.learn([warm])
+    past.block(block(NOW - 5, [[300.0]] * 100, run=3))
+    for points in (3600, 3, 1):
+        said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=points)
+        assert (said["low"], said["high"]) == ([1.0, 0.5, 300.0],) * 2, points
+        assert said["segment"] == [0, 1, 2]
+        assert said["segments"] == [{"id": 0, "unit": "rad"}, {"id": 1, "unit": "rad"}, {"id": 2, "unit": "K"}]
+        assert said["count"] == [100, 40, 100], "the second of the change has what came after it"
+    fine = past.channel_history(NODE, 1, NOW - 7.45, NOW - 6, points=3600)
+    assert set(zip(fine["segment"], fine["low"], strict=True)) == {(0, 1.0), (1, 0.5)}
+    past.block(block(NOW - 8.5, [[301.0]] * 10, run=4))  # the clock was put back
+    said = past.channel_history(NODE, 1, NOW - 3000, NOW, points=3600)
+    assert (said["low"], said["segment"]) == ([1.0, 301.0], [0, 2]) or said["low"] == [301.0]
+
+
+def line(zero: float = 0.0, by: str = "") -> Calibration:
+    """A calibration of channel 1."""
+    part = CalibrationInput(1, 1, (0.0, 65536.0), (0.0,))
+    return Calibration(1, "linear", (part,), (0.0, 1e-4), zero_offset=zero, by=by)

@@ -158,17 +158,17 @@ def test_a_row_is_done_again_after_its_calibration_profile_or_name_changed(stati
     file.write_text(CERTIFICATE.format(high=490))
     again = Progress(station.home, read(station, tmp_path, text))
     assert [(row.number, again.board_of(row)) for row in again.open] == [(1, board_of(1).hex())]
-    assert again.again == ("Row 1: provisioned again, because its calibration changed.",)
+    assert again.again == ("Row 1: provisioned again, because the calibration changed.",)
     file.write_text(CERTIFICATE.format(high=500))
     assert Progress(station.home, read(station, tmp_path, text)).open == [], "it is as it was"
 
     base.write_text('name = "base"\nextends = "load-cell"\n[channel.1]\nuncertainty = 0.4\n')
     assert Progress(station.home, read(station, tmp_path, text)).again == (
-        "Row 1: provisioned again, because its profile changed.",
+        "Row 1: provisioned again, because the profile changed.",
     )
     base.write_text('name = "base"\nextends = "load-cell"\n')
     renamed = Progress(station.home, read(station, tmp_path, text.replace("a,", "b,", 1)))
-    assert renamed.again == ("Row 1: provisioned again, because its row in the sheet has changed.",)
+    assert renamed.again == ("Row 1: provisioned again, because the sheet changed.",)
 
 
 def test_a_row_stays_done_when_rows_before_it_are_added_removed_or_sorted(station: Station, tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_a_row_finished_by_an_older_version_is_done_again_if_its_board_differs(
 
     again = Progress(station.home, progress.sheet, has_it)
     assert (asked, len(again.open)) == ([board_of(1)], 0 if same else 1)
-    assert ("another datasheet" in "".join(again.again)) is not same
+    assert ("the datasheet differs" in "".join(again.again)) is not same
 
 
 def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Path) -> None:

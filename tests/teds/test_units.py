@@ -148,6 +148,31 @@ def test_what_is_no_unit_is_refused_with_its_text_and_a_cure(text: str) -> None:
     assert caught.value.hint
 
 
+@pytest.mark.parametrize(
+    ("text", "symbol"),
+    [
+        ("radian", "rad"),
+        ("radians/s", "rad/s"),
+        ("Degrees", "degree"),
+        ("Celsius", "degC"),
+        ("newton", "N"),
+        ("newton-meters", "N*m"),
+        ("metres", "m"),
+        ("kilonewton", "kN"),
+        ("hertz", "Hz"),
+        ("m/second^2", "m/s^2"),
+    ],
+)
+def test_the_symbol_of_a_unit_in_words_is_suggested(text: str, symbol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(u, "_registry", lambda: None)  # as without the extra
+    u.parse_unit.cache_clear()
+    with pytest.raises(BadDataError) as caught:
+        u.parse_unit(text)
+    assert caught.value.hint.startswith(f'Did you mean "{symbol}"?')
+    assert u.parse_unit(symbol).units
+    u.parse_unit.cache_clear()
+
+
 def test_a_near_miss_is_suggested() -> None:
     with pytest.raises(BadDataError) as caught:
         u.parse_unit("degre")

@@ -7,8 +7,12 @@ const HOUR = 3600; // s
 const FINE = 58; // s of which the station has bins of 10 ms, less what may pass until it answers
 const LIVE = 120; // s that the live curves show
 
-const NOTHING = { bin: 1, time: [], low: [], high: [], count: [], invalid: [], lost: [], rate: null };
-const LISTS = ["time", "low", "high", "count", "invalid", "lost"];
+const NOTHING = { bin: 1, time: [], low: [], high: [], count: [], invalid: [], lost: [], segment: [], segments: [], rate: null };
+const LISTS = ["time", "low", "high", "count", "invalid", "lost", "segment"];
+
+/** SI unit of the newest segment of these bins; undefined where there are none. */
+const newestUnit = (bins) => unitOf(bins, bins.segment.at(-1));
+const unitOf = (bins, segment) => bins.segments.find((one) => one.id === segment)?.unit;
 
 /** Bins of a channel between two moments, SI; none where nothing was measured. */
 export async function between(uuid, number, from, until, points) {
@@ -42,12 +46,18 @@ export class Hour {
       const kept = back || old < 0 ? [0, 0] : [old, held.findLastIndex((time) => time < first) + 1];
       const bins = { ...this.bins, bin: 1, rate: fresh.rate };
       for (const list of LISTS) bins[list] = [...this.bins[list].slice(...kept), ...fresh[list]];
+      bins.segments = [...this.bins.segments.filter((one) => !fresh.segments.some((other) => other.id === one.id)), ...fresh.segments];
       this.bins = bins;
     } catch {
       // told by the connection
     } finally {
       this.asking = false;
     }
+  }
+
+  /** SI unit of the values that come now; undefined where none came yet. */
+  get unit() {
+    return newestUnit(this.bins);
   }
 
   /** Lost and invalid samples between two moments. */
@@ -67,10 +77,15 @@ export async function seed(uuid, number) {
   const time = now();
   const [rough, fine] = await Promise.all([between(uuid, number, time - LIVE, time - FINE, LIVE), between(uuid, number, time - FINE, time + 1, HOUR)]);
   const points = [];
+  const unit = newestUnit(fine.time.length ? fine : rough);
+  let segment;
   for (const bins of [rough, fine]) {
     bins.time.forEach((at, place) => {
       const [low, high] = [bins.low[place] ?? NaN, bins.high[place] ?? NaN];
       if (bins === rough && at >= (fine.time[0] ?? Infinity)) return;
+      if (unitOf(bins, bins.segment[place]) !== unit) return; // of a board that measured something else then
+      if (segment !== undefined && segment !== bins.segment[place]) points.push([at, NaN]);
+      segment = bins.segment[place];
       points.push([at, low]);
       if (high > low) points.push([at + bins.bin / 2, high]);
     });
@@ -80,19 +95,25 @@ export async function seed(uuid, number) {
 
 /**
  * Bins as `Ring.bins` gives points: three entries for each of `columns`, the least, the greatest, and null where the line
- * ends. It ends where nothing came for longer than `silence`, and where nothing was valid.
+ * ends. It ends where nothing came for longer than `silence`, where nothing was valid, and where a new segment begins
+ * (another calibration or zero). Bins in another SI unit than `unit` are left out, unless none is given.
  */
-export function columnsOf(bins, from, to, columns, silence) {
+export function columnsOf(bins, from, to, columns, silence, unit) {
   const out = new Array(3 * columns).fill(undefined);
   const width = (to - from) / columns;
   const quiet = Math.max(1.5 * bins.bin, silence);
   let before = NaN;
   let last = -1;
+  let segment;
   bins.time.forEach((time, place) => {
+    if (unit !== undefined && unitOf(bins, bins.segment[place]) !== unit) return;
     const column = Math.floor((time + bins.bin / 2 - from) / width);
     if (column < 0 || column >= columns) return;
-    if (time - before > quiet && column > 0 && column !== last) out[3 * column - 1] = null;
+    const ends = time - before > quiet || (segment !== undefined && segment !== bins.segment[place]);
+    if (ends && column > 0 && column !== last) out[3 * column - 1] = null;
     before = time;
+    if (segment !== bins.segment[place] && column === last) out[3 * column] = out[3 * column + 1] = undefined; // two meanings: the newer one
+    segment = bins.segment[place];
     const [low, high, at] = [bins.low[place], bins.high[place], 3 * column];
     if (typeof low !== "number") {
       if (out[at] === undefined) out[at] = out[at + 1] = null;

@@ -206,7 +206,7 @@ export class LivePlot {
       const silence = Math.max(0.5, 3 * (last?.period ?? 0));
       const [end, hour] = [from + columns * width, this.hour(channel)];
       const stretch = this.range ? (this.zoomed.get(`${channel.uuid}/${channel.number}`) ?? hour.bins) : this.window > LIVE ? hour.bins : null;
-      const course = stretch ? columnsOf(stretch, from, end, columns, 3 / (hour.bins.rate || 10)) : ringOf(channel.uuid, channel.number).bins(from, end, columns, silence);
+      const course = stretch ? columnsOf(stretch, from, end, columns, 3 / (hour.bins.rate || 10), hour.unit) : ringOf(channel.uuid, channel.number).bins(from, end, columns, silence);
       const scale = scaleOf(channel.uuid, channel.number);
       return course.map((value) => (typeof value === "number" ? toShown(scale, value) : value)); // null ends a line
     });

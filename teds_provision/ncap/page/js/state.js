@@ -126,6 +126,7 @@ const LISTS = {
       else if (state.nodes.has(uuid)) found.set(uuid, state.nodes.get(uuid));
       else found.delete(uuid);
     }
+    found.forEach(forgetOtherUnits);
     state.nodes = found;
     state.loaded = true;
   },
@@ -135,6 +136,14 @@ const LISTS = {
   profiles: async () => (state.profiles = (await get("profiles")).profiles ?? []),
   names: async () => (state.names = (await get("names")).names ?? []),
 };
+
+/** Forget the course of channels that had another SI unit until now: the curve would be drawn in the new one. */
+function forgetOtherUnits(node) {
+  for (const channel of node.channels ?? []) {
+    const before = state.nodes.get(node.uuid)?.channels?.find((one) => one.number === channel.number);
+    if (before && before.scale.si !== channel.scale.si) state.rings.get(keyOf(node.uuid, channel.number))?.clear();
+  }
+}
 
 const asking = new Map(); // list → whether it is to be asked once more after this answer
 
@@ -180,7 +189,11 @@ async function fetchDue() {
     if ((single.get(uuid) ?? 0) > mine || (answer.status === "rejected" && !gone)) return;
     single.set(uuid, mine);
     if (gone) state.nodes.delete(uuid);
-    else state.nodes.set(uuid, shapes.node(answer.value));
+    else {
+      const node = shapes.node(answer.value);
+      forgetOtherUnits(node);
+      state.nodes.set(uuid, node);
+    }
   });
   return changed("nodes");
 }

@@ -1,0 +1,59 @@
+"""``group delete`` beside measurements that are kept for the group: never dropped without a word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from teds_provision.store import Group, KeptMeasurement, Store
+from tests.terminal import on_terminal
+
+from .shell import call
+
+ONE = bytes.fromhex("8d4d9da65281f7000000")
+
+
+@pytest.fixture
+def measured(home: Path) -> Path:
+    """A group with a measurement that the page began, and another one without."""
+    with Store.open(home) as store:
+        store.put_group(Group("crane", (ONE,)))
+        store.put_group(Group("spare", (ONE,)))
+        store.put_measurement(KeptMeasurement("1a2b3c4d", "crane", owner="page"))
+    return home
+
+
+def kept(home: Path) -> list[str]:
+    with Store.open(home) as store:
+        return [measurement.id for measurement in store.measurements()]
+
+
+def test_a_kept_measurement_is_named_and_goes_only_with_a_word(measured: Path) -> None:
+    refused = call(measured, "--json", "group", "delete", "crane")
+    assert (refused.code, refused.json["error"]["code"]) == (6, "frozen")
+    assert "1a2b3c4d" in refused.json["error"]["message"]
+    assert "group delete crane --yes" in refused.json["error"]["hint"]
+    plan = call(measured, "group", "delete", "crane", "--dry-run")
+    assert (plan.code, "1a2b3c4d" in plan.err) == (0, True)
+    no = on_terminal(measured, "group", "delete", "crane", answers=["n"])
+    assert (no.code, "1a2b3c4d" in no.screen) == (6, True), no.screen
+    assert kept(measured) == ["1a2b3c4d"]
+
+    yes = on_terminal(measured, "group", "delete", "crane", answers=["y"])
+    assert yes.code == 0, yes.screen
+    assert kept(measured) == []
+    entries = call(measured, "--json", "log").json["entries"]
+    assert [entry["detail"] for entry in entries if entry["act"] == "group"] == [
+        {"group": "crane", "measurements": ["1a2b3c4d"]}
+    ]
+    assert [entry["detail"]["id"] for entry in entries if entry["act"] == "measure"] == ["1a2b3c4d"]
+
+
+def test_with_yes_it_is_reported_and_a_group_without_one_needs_none(measured: Path) -> None:
+    done = call(measured, "--json", "group", "delete", "crane", "--yes")
+    assert (done.code, done.json["ended"]) == (0, ["1a2b3c4d"])
+    assert [group["name"] for group in done.json["groups"]] == ["spare"]
+    plain = call(measured, "--json", "group", "delete", "spare")
+    assert plain.json == {"groups": []}
+    assert call(measured, "group", "delete", "spare").code == 0
