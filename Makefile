@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Compiled modules are kept: each of five pytests would else rewrite every assert again, 13 s of CPU each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-arm firmware-coverage firmware-soak test-c room clean
+.PHONY: demo demo-page page-picture test test-system lint types unit compiled quick bench bench-teds bench-handover bench-measure bench-ncap bench-page bench-scale test-rclpy fuzz faults pairs model house words man coverage mutants soak api test-other vectors-c sbom firmware firmware-faults firmware-arm firmware-coverage firmware-soak test-c room clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -221,11 +221,17 @@ $(VENV)/.dev: $(VENV)/.made pyproject.toml locks/dev.txt
 	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz]'
 	@touch $@
 
-# The node in C: the host port, its C tests under the sanitizers, every faulty node (firmware/README.md).
-firmware: vectors-c $(VENV)/.dev
+# The node in C: the host port over BearSSL and over Mbed TLS, and its C tests under the sanitizers (firmware/README.md).
+# Under a minute, without a virtual environment.
+firmware:
+	@sh scripts/install-firmware-host
+	@$(PYTHON) -m tests.vectors.c_arrays build/vectors-c
+	$(MAKE) --no-print-directory -C firmware -j$$(nproc) all psa check
+
+# Every faulty node in C, each found by its rule, and builds of other sizes and options, each with every rule.
+firmware-faults: $(VENV)/.dev
 	@sh scripts/install-test-packages
-	$(MAKE) --no-print-directory -C firmware all check
-	$(BIN)/python -m pytest -q -m 'soak or not soak' tests/firmware/test_faults.py tests/firmware/test_options.py
+	$(BIN)/python -m pytest -q -n $(WORKERS) -m 'soak or not soak' tests/firmware/test_faults.py tests/firmware/test_options.py
 
 # Every test of whole runs whose needs the node in C meets, with it on the desk (tests/firmware/c_node.py).
 OF_C := tests/e2e tests/cli/test_handover.py tests/cli/test_life.py tests/cli/test_messages.py tests/check/test_node_check_cli.py

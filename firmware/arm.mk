@@ -4,13 +4,8 @@
 ARM := arm-none-eabi-
 ARM_FLAGS := -mthumb -Os -ffunction-sections -fdata-sections -fstack-usage -fcallgraph-info=su
 BEARSSL ?= $(BUILD)/bearssl
-BEARSSL_SOURCES := $(addprefix $(BEARSSL)/src/, \
-  aead/ccm.c codec/ccopy.c codec/dec32be.c codec/enc32be.c codec/dec32le.c codec/enc32le.c codec/dec64be.c \
-  codec/enc64be.c hash/sha2small.c hash/dig_size.c mac/hmac.c rand/hmac_drbg.c \
-  symcipher/aes_ct.c symcipher/aes_ct_enc.c symcipher/aes_ct_ctrcbc.c int/i32_div32.c \
-  ec/ec_p256_m15.c ec/ec_p256_m31.c ec/ec_secp256r1.c ec/ec_secp384r1.c ec/ec_secp521r1.c ec/ecdsa_i15_bits.c ec/ecdsa_i15_sign_raw.c \
-  ec/ecdsa_i15_vrfy_raw.c ec/ecdsa_i31_bits.c ec/ecdsa_i31_sign_raw.c ec/ecdsa_i31_vrfy_raw.c) \
-  $(wildcard $(BEARSSL)/src/int/i15_*.c $(BEARSSL)/src/int/i31_*.c)
+BEARSSL_SOURCES := $(addprefix $(BEARSSL)/,$(shell grep -v '^\#' port/bearssl/sources.txt))
+BEARSSL_FLAGS := $(shell grep -v '^\#' port/bearssl/flags.txt)
 
 CPU_m0 := -mcpu=cortex-m0plus -DTEDS_BEARSSL_M15
 CPU_m4 := -mcpu=cortex-m4
@@ -37,10 +32,10 @@ endef
 $(foreach cpu,$(CPUS),$(foreach size,full security nfc ble,$(eval $(call LIBRARY_RULE,$(cpu),$(size)))))
 
 define BEARSSL_RULE
-$(BUILD)/arm/$(1)-bearssl.a: port/bearssl/teds_bearssl.c $(HEADERS) arm.mk
+$(BUILD)/arm/$(1)-bearssl.a: port/bearssl/teds_bearssl.c $(wildcard port/bearssl/*.txt) $(HEADERS) arm.mk
 	@test -f $(BEARSSL)/inc/bearssl.h || { echo "BearSSL's source is missing: run scripts/install-firmware-packages"; exit 1; }
 	@mkdir -p $(BUILD)/arm/$(1)-bearssl
-	cd $(BUILD)/arm/$(1)-bearssl && $(ARM)gcc -std=c99 $(ARM_FLAGS) $(CPU_$(1)) -DBR_USE_UNIX_TIME=0 -DBR_USE_URANDOM=0 \
+	cd $(BUILD)/arm/$(1)-bearssl && $(ARM)gcc -std=c99 $(ARM_FLAGS) $(CPU_$(1)) $(BEARSSL_FLAGS) \
 	  -I$(abspath $(BEARSSL))/inc -I$(abspath $(BEARSSL))/src -I$(CURDIR)/include \
 	  -c $(abspath $(BEARSSL_SOURCES)) $(CURDIR)/port/bearssl/teds_bearssl.c
 	@rm -f $$@

@@ -6,7 +6,6 @@ OTHERS := m32 s390x
 CC_m32 := gcc -m32
 CC_s390x := s390x-linux-gnu-gcc -static
 RUN_s390x := qemu-s390x
-OTHER_BEARSSL := $(BEARSSL_SOURCES) $(addprefix $(BEARSSL)/src/symcipher/,aes_ct64.c aes_ct64_enc.c aes_ct64_ctrcbc.c)
 
 .PHONY: others analyse
 others: $(foreach cpu,$(OTHERS),$(foreach test,isotp vectors corpus,$(BUILD)/other/$(cpu)/$(test)))
@@ -18,8 +17,8 @@ others: $(foreach cpu,$(OTHERS),$(foreach test,isotp vectors corpus,$(BUILD)/oth
 define OTHER_RULE
 $(BUILD)/other/$(1)/bearssl.a: arm.mk other.mk
 	@mkdir -p $(BUILD)/other/$(1)/bearssl
-	cd $(BUILD)/other/$(1)/bearssl && $(CC_$(1)) -O2 -DBR_USE_UNIX_TIME=0 -DBR_USE_URANDOM=0 -DBR_AES_X86NI=0 -DBR_SSE2=0 \
-	  -DBR_RDRAND=0 -DBR_POWER8=0 -I$(abspath $(BEARSSL))/inc -I$(abspath $(BEARSSL))/src -c $(abspath $(OTHER_BEARSSL))
+	cd $(BUILD)/other/$(1)/bearssl && $(CC_$(1)) -O2 $(BEARSSL_FLAGS) \
+	  -I$(abspath $(BEARSSL))/inc -I$(abspath $(BEARSSL))/src -c $(abspath $(BEARSSL_SOURCES))
 	@rm -f $$@
 	$(AR) rcs $$@ $(BUILD)/other/$(1)/bearssl/*.o
 

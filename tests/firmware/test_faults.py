@@ -112,7 +112,7 @@ def test_a_good_node_keeps_every_rule(tmp_path: Path, station: Station, monkeypa
 
 
 def of_the_gate() -> Iterator[Any]:
-    """Each fault; beyond the first of a rule they are left to ``make firmware``."""
+    """Each fault; beyond the first of a rule they are left to ``make firmware-faults``."""
     rules = set()
     for name in CHANGES:
         rule = FAULTS[name].rule

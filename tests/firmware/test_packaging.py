@@ -110,3 +110,103 @@ def test_the_library_has_the_version_of_the_project() -> None:
     assert re.match(r"\d+\.\d+\.\d+", whole)[0] == version()  # type: ignore[index]
     assert f'"{version()}{"-dev" if "dev" in whole else ""}"' in text
     assert version() in (builds.FIRMWARE / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+CONSUMER = """cmake_minimum_required(VERSION 3.20)
+project(board C)
+{library}
+set(folder {template})
+add_executable(board ${{folder}}/main.c ${{folder}}/board.c)
+target_link_libraries(board PRIVATE teds::node)
+add_executable(sizes sizes.c)
+target_link_libraries(sizes PRIVATE teds::node)
+"""
+SIZES = """#include "teds/node.h"
+typedef char staging_is_that_of_the_cache[TEDS_STAGING == 8192 && TEDS_NFC == 1 ? 1 : -1];
+static teds_node node; static teds_config config; static teds_port port;
+int main(void) { return teds_node_init(&node, &config, &port) == TEDS_E_USAGE ? 0 : 1; }
+"""
+"""TEDS_E_USAGE and not TEDS_E_BUILD: board and library were compiled with the same sizes."""
+
+
+def consumer(folder: Path, library: str) -> None:
+    """Write a project that builds the blank port over the library as this CMake code names it."""
+    folder.mkdir()
+    template = builds.FIRMWARE / "port/template"
+    (folder / "CMakeLists.txt").write_text(CONSUMER.format(library=library, template=template))
+    (folder / "sizes.c").write_text(SIZES)
+
+
+def test_a_project_finds_the_installed_library_by_cmake(tmp_path: Path) -> None:
+    builds.need("cmake", "gcc")
+    options = ["-DTEDS_STAGING=8192", "-DTEDS_NFC=1", "-DCMAKE_BUILD_TYPE=Debug"]
+    run("cmake", "-S", str(builds.FIRMWARE), "-B", "library", *options, folder=tmp_path)
+    run("cmake", "--build", "library", "-j2", folder=tmp_path)
+    run("cmake", "--install", "library", "--prefix", str(tmp_path / "installed"), folder=tmp_path)
+    consumer(tmp_path / "board", f"find_package(teds-node {version()} REQUIRED)")
+    run("cmake", "-S", "board", "-B", "built", f"-DCMAKE_PREFIX_PATH={tmp_path / 'installed'}", folder=tmp_path)
+    run("cmake", "--build", "built", folder=tmp_path)
+    run(str(tmp_path / "built/sizes"))
+    run(str(tmp_path / "built/board"), code=1)  # its flash fails: the blank port starts nothing
+
+    wrong = run("cmake", "-S", str(builds.FIRMWARE), "-B", "wrong", "-DTEDS_CRYPTO=ROT13", folder=tmp_path, code=1)
+    assert "TEDS_CRYPTO is BEARSSL, PSA or NONE, not ROT13." in wrong
+
+
+def test_a_project_takes_the_library_into_its_tree_with_psa(tmp_path: Path) -> None:
+    builds.need("cmake", "gcc", headers=("psa/crypto.h",))
+    words = "set(TEDS_CRYPTO PSA)\nset(TEDS_STAGING 8192)\nset(TEDS_NFC 1)\n"
+    consumer(tmp_path / "board", f"{words}add_subdirectory({builds.FIRMWARE} teds)")
+    text = (tmp_path / "board/CMakeLists.txt").read_text().split("set(folder")[0]
+    (tmp_path / "board/CMakeLists.txt").write_text(
+        text + "add_executable(sizes sizes.c)\ntarget_link_libraries(sizes PRIVATE teds::node)\n"
+    )
+    run("cmake", "-S", "board", "-B", "built", folder=tmp_path)
+    run("cmake", "--build", "built", "-j2", folder=tmp_path)
+    run(str(tmp_path / "built/sizes"))
+
+
+def test_bearssls_files_are_listed_once_and_are_there() -> None:
+    """Makefile, CMakeLists.txt and ESP-IDF read one list, and one list of flags."""
+    lists = builds.FIRMWARE / "port/bearssl"
+    names = [line for line in (lists / "sources.txt").read_text().splitlines() if not line.startswith("#")]
+    flags = [line for line in (lists / "flags.txt").read_text().splitlines() if not line.startswith("#")]
+    assert "src/aead/ccm.c" in names
+    assert "-DBR_USE_UNIX_TIME=0" in flags
+    for path in [*builds.FIRMWARE.glob("*.mk"), *builds.FIRMWARE.rglob("CMakeLists.txt"), builds.FIRMWARE / "Makefile"]:
+        text = path.read_text(encoding="utf-8")
+        assert "ccm.c" not in text, path
+        assert "BR_USE_" not in text, path
+    source = builds.FIRMWARE / "build/bearssl"
+    if source.exists():
+        assert [name for name in names if not (source / name).exists()] == []
+
+
+def test_the_blank_port_compiles_and_each_of_its_functions_has_a_comment() -> None:
+    builds.need("gcc")
+    folder = builds.FIRMWARE / "port/template"
+    where = [f"-I{builds.FIRMWARE / name}" for name in ("include", "port/bearssl", "port/template")]
+    warnings = ["-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror", "-fsyntax-only"]
+    run("gcc", "-std=c99", *warnings, *where, str(folder / "main.c"), str(folder / "board.c"))
+    lines = (folder / "board.c").read_text(encoding="utf-8").splitlines()
+    heads = [at for at, line in enumerate(lines) if line == "{"]
+    assert len(heads) > 18
+    bare = [lines[at - 1] for at in heads if not lines[at - 2].endswith("*/")]
+    assert bare == ["static uint64_t now(void *user)"], "a function without a comment on what it must do"
+    port = (builds.FIRMWARE / "include/teds/port.h").read_text(encoding="utf-8")
+    for name in (
+        "erase",
+        "write",
+        "read",
+        "random",
+        "now",
+        "sample",
+        "bears",
+        "set",
+        "set_point",
+        "safe",
+        "arm",
+        "kick",
+    ):
+        assert f"(*{name})(" in port
+        assert f"port->{name} = " in "\n".join(lines), name
