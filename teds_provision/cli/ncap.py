@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -30,7 +30,7 @@ from teds_provision.cli.options import (
     said_here,
     tracing,
 )
-from teds_provision.cli.rendering import shown
+from teds_provision.cli.rendering import count_of, shown
 from teds_provision.errors import UsageError
 from teds_provision.lazy import how_to_install, late
 from teds_provision.store.records import iso
@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 
     from teds_provision.api.bodies import Mode
     from teds_provision.measure import matching
+    from teds_provision.measure.matching import MatchSurvey
     from teds_provision.ncap import service_run, settings
     from teds_provision.ncap.web import tokens
+    from teds_provision.station.station import Station
 else:
     service_run, settings = late("teds_provision.ncap.service_run"), late("teds_provision.ncap.settings")
     tokens = late("teds_provision.ncap.web.tokens")
@@ -49,6 +51,8 @@ else:
 
 
 MOST: Final = 1000  # lines that may wait for somebody to read them
+_MOST_NAMED: Final = 5
+_MOST_REASONS: Final = 5
 LEAVING: Final = 2.0  # seconds for them to leave at the end
 _MOMENTS: Final = frozenset({"time", "since", "started", "until", "tapped"})
 """Members of events and of the status that are moments."""
@@ -151,7 +155,11 @@ def run(
     if wanted.registry:
         plant.apply_pages.require_roster(station)
     if wanted.measure is not None:
-        matching.NodeMatch.parse(wanted.measure).require_groups(station)
+        match = matching.NodeMatch.parse(wanted.measure)
+        match.require_groups(station)
+        unknown = match.unknown_type(station)
+        if unknown:
+            app.warn(f"Nothing is measured until a node of that type comes: {unknown}.")
     station.unlock()  # nobody is asked for a passphrase later
     lines = DaemonLog(app)
     with tracing(trace) as opened:
@@ -337,12 +345,42 @@ def measure(app: App, expression: str, rate: float | None, frozen: bool, files: 
     match: type:PROFILE, name:GLOB, group:NAME and bounds such as 'angle >= 360 deg'. The measurement is kept, across
     restarts too, until it is deleted on the page or through the API.
     """
-    with client.connect(home=app.home) as station:
-        made = station.measure(match=expression, rate=rate, frozen=frozen, sinks=files)
-    unknown = measure_room.matching.NodeMatch.parse(expression).unknown_type(app.station())
+    with client.connect(home=app.home) as running:
+        made = running.measure(match=expression, rate=rate, frozen=frozen, sinks=files)
+        present = {node["uuid"] for node in running.nodes() if node["present"]}
+    station, match = app.station(), measure_room.matching.NodeMatch.parse(expression)
+    found = measure_room.matching.survey(station, match)
+    unknown = match.unknown_type(station)
     if unknown:
-        app.warn(f"The measurement waits: {unknown}. To list the profiles: teds-provision profile list")
-    app.emit({**made}, f"Measuring {expression} (measurement {made['id']}).")
+        near = [name for kind in match.types for name in measure_room.matching.nearest_types(kind, station)]
+        meant = f" Did you mean type:{near[0]}?" if near else ""
+        app.warn(f"The measurement waits: {unknown}.{meant} To list the profiles: teds-provision profile list")
+    others = [{"uuid": uuid, "why": why} for uuid, why in found.others.items()]
+    app.emit(
+        {**made, "matching": list(found.matching), "others": others},
+        "\n".join((f"Measuring {expression} (measurement {made['id']}).", *_match_lines(station, found, present))),
+    )
+
+
+def _match_lines(station: Station, found: MatchSurvey, present: Set[str]) -> list[str]:
+    """Return how many known nodes match now, and why the others do not."""
+    names = {record.uuid.hex(): record.name or record.uuid.hex() for record in station.nodes.all()}
+
+    def named(uuids: Sequence[str]) -> str:
+        more = f" and {len(uuids) - _MOST_NAMED} more" if len(uuids) > _MOST_NAMED else ""
+        return ", ".join(shown(names[uuid]) for uuid in uuids[:_MOST_NAMED]) + more
+
+    matching = found.matching
+    there = sum(uuid in present for uuid in matching)
+    verb = "matches" if len(matching) == 1 else "match"
+    lines = [f"{count_of(len(matching))} {verb} now{f', {there} present: {named(matching)}' if matching else ''}."]
+    reasons: dict[str, list[str]] = {}
+    for uuid, why in found.others.items():
+        reasons.setdefault(why, []).append(uuid)
+    lines += [f"Not {named(uuids)}: {why}." for why, uuids in list(reasons.items())[:_MOST_REASONS]]
+    if len(reasons) > _MOST_REASONS:
+        lines.append(f"{len(reasons) - _MOST_REASONS} more reasons are in the output of --json.")
+    return lines
 
 
 @command("teds-provision ncap detection transparent", name="detection")

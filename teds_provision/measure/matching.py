@@ -8,25 +8,39 @@ measured at all is no matter of the expression: a node must have a key here, and
 from __future__ import annotations
 
 import re
-from collections.abc import Set
+import time
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
+from functools import lru_cache
+from pathlib import Path
 
 from teds_provision.errors import BadDataError, NotFoundError, PolicyError, UsageError
 from teds_provision.measure.planning import BusTime, plan_node, sensors_of
 from teds_provision.measure.request import MeasurementRequest
 from teds_provision.measure.sinks.base import ROWS
+from teds_provision.measure.standing import why_not_measured
 from teds_provision.station.groups import ALL
 from teds_provision.station.station import Station
+from teds_provision.steps.board_type import misfit
 from teds_provision.steps.readings import verdict_of
 from teds_provision.store import Search
 from teds_provision.teds.fits import Requirement, judge, met, parse_fits
-from teds_provision.teds.profile.load import default_folders, find_profile, is_profile_name
+from teds_provision.teds.profile.load import (
+    default_folders,
+    find_profile,
+    is_profile_name,
+    list_profiles,
+    load_profile,
+)
+from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.sheet import Sheet
 
 _BOUND = re.compile(r"[<>]")
 _KINDS = ("type", "name", "group")
+_LONGEST = 64  # characters of a name that is looked for
 
 
 @dataclass(frozen=True)
@@ -88,8 +102,11 @@ class NodeMatch:
         record = station.nodes.get(uuid)
         profile, name = (record.profile or "", record.name or "") if record is not None else ("", "")
         for kind in self.types:
-            if profile != kind:
-                return f"its type is {profile or 'unknown'}, not {kind}"
+            if profile and profile != kind:
+                return f"its type is {profile}, not {kind}"
+            unlike = "" if profile else _unlike(station, uuid, kind)
+            if unlike:
+                return f"its type is unknown, and its datasheet does not fit {kind}: {unlike}"
         for pattern in self.names:
             if not fnmatchcase(name, pattern):
                 return f"its name {name!r} is not {pattern}"
@@ -104,6 +121,32 @@ class NodeMatch:
         if met(self.fits, judged):
             return ""
         return next((fit.why.rstrip(".") for fit in judged), "its datasheet is unknown")
+
+
+@dataclass(frozen=True)
+class MatchSurvey:
+    """Which known nodes an expression means now (UUIDs in hex), and why the others are not measured by it."""
+
+    matching: tuple[str, ...]
+    others: Mapping[str, str]
+
+
+def survey(station: Station, match: NodeMatch) -> MatchSurvey:
+    """Hold every node that the station knows against an expression."""
+    matching, others = [], {}
+    for record in station.nodes.all():
+        why = why_not_measured(station, record.uuid) or match.why_not(station, record.uuid)
+        if why:
+            others[record.uuid.hex()] = why
+        else:
+            matching.append(record.uuid.hex())
+    return MatchSurvey(tuple(matching), others)
+
+
+def nearest_types(kind: str, station: Station) -> list[str]:
+    """Return profiles with a name much like this one, the nearest first."""
+    names = [entry.name for entry in list_profiles(default_folders(station.home))]
+    return get_close_matches(kind[:_LONGEST], names, n=2, cutoff=0.6)
 
 
 @dataclass(frozen=True)
@@ -175,6 +218,33 @@ def _is_profile(kind: str, station: Station) -> bool:
         return is_profile_name(kind) and find_profile(kind, default_folders(station.home)).is_file()
     except NotFoundError:
         return False
+
+
+def _unlike(station: Station, uuid: bytes, kind: str) -> str:
+    """Return why a node whose profile is not known is none of this type; "" if its datasheet fits the type.
+
+    Such a node was adopted, or came from a station that did not name its profile.
+    """
+    image = station.nodes.datasheet(uuid)
+    if image is None or not Sheet.from_image(image).channels:
+        return "none is known"
+    profile = _profile(kind, station.home)
+    why = misfit(image, profile).rstrip(".") if profile is not None else f"There is no profile {kind}"
+    return why[:1].lower() + why[1:]
+
+
+def _profile(kind: str, home: Path) -> Profile | None:
+    folders = default_folders(home)
+    try:
+        path = find_profile(kind, folders) if is_profile_name(kind) else None
+        return None if path is None else _read_profile(path, folders, path.stat().st_mtime_ns, int(time.monotonic()))
+    except (BadDataError, NotFoundError, OSError):
+        return None
+
+
+@lru_cache(maxsize=16)  # asked for each node after each change of the store
+def _read_profile(path: Path, folders: tuple[Path, ...], _changed: int, _second: int) -> Profile:
+    return load_profile(path, folders)
 
 
 def _wrong(part: str, text: str) -> UsageError:

@@ -25,7 +25,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import guard
 from teds_provision.steps.commands import NodeVisit, at_node
-from teds_provision.steps.sign import sign
+from teds_provision.steps.sign import require_not_measured, sign
 from teds_provision.steps.verify_node import NodeVerification, verify_in_session, verify_node
 from teds_provision.steps.write import Low, wait_for_charge, write
 from teds_provision.talk.conversation import SessionLostError
@@ -172,6 +172,7 @@ class _ZeroRun:
         if self.dry_run:
             return replace(found, steps=tuple(self.steps.done))
         if not node.tapped:  # a tap ends the claims of others by itself
+            require_not_measured(station, node, released=self.visit.released)
             _require_nobody_else(trusted)
         return self._bring(wanted_image, found)
 

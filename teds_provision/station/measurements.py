@@ -248,6 +248,10 @@ class Measurements:
         """Whether a measurement of this station holds the node, in this process or another one."""
         return self._mark(uuid).is_taken
 
+    def holder(self, uuid: bytes) -> str | None:
+        """Return which process measures the node, in words; None if no process of this station does."""
+        return self._mark(uuid).holder
+
     def _mark(self, uuid: bytes, what: str = "") -> UsageLock:
         return UsageLock(self._home / FOLDER / f"{uuid.hex()}.lock", command=what, shared=True)
 

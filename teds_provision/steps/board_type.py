@@ -116,6 +116,30 @@ def differences(
     return tuple(text for number in sorted(meant) for text in _between(number, own.get(number), meant[number]))
 
 
+def misfit(image: Image, profile: Profile) -> str:
+    """Return why a datasheet is none of this type, a sentence; "" if it is one.
+
+    Stricter than :func:`differences`, because a datasheet of which the profile is not known is recognised by it: it has
+    exactly these channels, and states exactly these units.
+    """
+    own = {channel.number: channel for channel in Sheet.from_image(image).channels if channel.described}
+    wanted = {channel.number: channel for channel in profile.channels}
+    if own.keys() != wanted.keys() or not own:
+        return f"Its channels are {_listed(own)}, not {_listed(wanted)}."
+    told = differences(image.blocks, profile)
+    if told:
+        return told[0]
+    for number, channel in sorted(own.items()):
+        mine, meant = replace(channel.units, extension=0), replace(wanted[number].units, extension=0)
+        if not channel.units_stated or mine != meant:
+            return f"Channel {number} is in {name_of_units(mine)}, not in {name_of_units(meant)}."
+    return ""
+
+
+def _listed(numbers: Collection[int]) -> str:
+    return ", ".join(map(str, sorted(numbers))) or "none"
+
+
 def _describes(has: Mapping[BlockId, bytes]) -> bool:
     """Whether these TEDS describe any channel; a new board, of which most are asked, has none."""
     return any(code == AccessCode.CHANNEL for _, code in has)

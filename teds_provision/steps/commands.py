@@ -37,7 +37,7 @@ from teds_provision.steps.build import guard, own_name, require_free_name
 from teds_provision.steps.identify import IdentifiedNode, describe, identify
 from teds_provision.steps.provision import add_to_whitelist
 from teds_provision.steps.readings import keep
-from teds_provision.steps.sign import SignResult, known_image, known_node_keys, sign
+from teds_provision.steps.sign import SignResult, known_image, known_node_keys, require_not_measured, sign
 from teds_provision.steps.teds_read import read_identity, read_image, take_snapshot
 from teds_provision.steps.verify import (
     Verification,
@@ -68,6 +68,7 @@ class NodeVisit:
     station: Station
     node: Conversation
     who: IdentifiedNode
+    released: bool = False  # the running `ncap` measured the node and let it go
 
     def session(self) -> None:
         """Open a session under the key that is held; raises PolicyError where there is none."""
@@ -99,9 +100,9 @@ def at_node(
     with (
         meet(station, links, uuid, reporter, before=before) as node,
         station.node_lock(uuid),
-        station.released(uuid, writes) if writes else nullcontext(),
+        station.released(uuid, writes) if writes else nullcontext() as released,
     ):
-        yield NodeVisit(station, node, identify(station, node))
+        yield NodeVisit(station, node, identify(station, node), bool(released))
 
 
 def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
@@ -740,6 +741,7 @@ def restore_datasheet(
             on_node=present.image.security if not changes else None,
             keep_draft=True,
             profile=record.profile,
+            before=lambda: require_not_measured(station, visit.node, released=visit.released),
         )
         facts = {"profile": record.profile} if record.profile is not None else {}
         written = write(station, visit.node, signed.image, present=present, progress=reporter.written, facts=facts)

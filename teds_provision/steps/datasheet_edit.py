@@ -15,7 +15,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.board_type import differences, require_board_type
 from teds_provision.steps.build import guard, own_name, require_fit, teds_calibrations
-from teds_provision.steps.sign import known_node_keys, sign
+from teds_provision.steps.sign import known_node_keys, require_not_measured, sign
 from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.steps.verify import Verification, require_authentic
 from teds_provision.steps.verify_node import verify_node
@@ -134,6 +134,7 @@ def write_sheet(
             node_sequence=present.identity.sequence,
             on_node=on_node,
             keep_draft=True,
+            before=lambda: require_not_measured(station, node),
         )
         step.result = NOTHING if signed.reused else DONE
         step.detail = f"sequence {signed.sequence}"

@@ -41,7 +41,7 @@ from teds_provision.steps.build import (
     propose,
 )
 from teds_provision.steps.identify import IdentifiedNode, identify
-from teds_provision.steps.sign import SignResult, sign
+from teds_provision.steps.sign import SignResult, require_not_measured, sign
 from teds_provision.steps.teds_read import NodeSnapshot, take_snapshot
 from teds_provision.steps.verify import Verification
 from teds_provision.steps.verify_node import verify_at_node, verify_node
@@ -202,7 +202,8 @@ def provision(
     """
     run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype, line, adopt)
     try:
-        with station.node_lock(node.uuid), station.released(node.uuid, "provision"), station.run():
+        with station.node_lock(node.uuid), station.released(node.uuid, "provision") as released, station.run():
+            run.released = bool(released)
             return run.proven()
     except TedsProvisionError as error:
         with suppress(StoreError):  # a full disk must not hide what happened
@@ -232,6 +233,7 @@ class _Run:
         self.retype, self._retyped, self.adopt = retype or require_board_type, False, adopt
         self.line = line
         self.unit: Unit | None = None
+        self.released = False  # the running `ncap` measured the node and let it go
 
     def proven(self) -> ProvisionResult:
         """The run; what ends a board that has a unit leaves proof too, while the board may still be there."""
@@ -370,6 +372,7 @@ class _Run:
                 keep_draft=True,
                 profile=proposal.profile,
                 write_follows=True,
+                before=lambda: require_not_measured(self.station, self.node, released=self.released),
             )
             step.result = NOTHING if signed.reused else DONE
             step.detail = f"sequence {signed.sequence}"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from teds_provision.errors import BadDataError, NotFoundError, PolicyError, TedsProvisionError
+from teds_provision.errors import BadDataError, FrozenError, NotFoundError, PolicyError, TedsProvisionError
 from teds_provision.protocol.datasheet import (
     SignedNodeKey,
     can_be_stored,
@@ -20,6 +20,7 @@ from teds_provision.protocol.datasheet import (
 from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.station.station import Station
 from teds_provision.store import Draft
+from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
 
@@ -102,6 +103,7 @@ def sign(
     profile: str | None = None,
     unit: tuple[str, int] | None = None,
     write_follows: bool = False,
+    before: Callable[[], object] = lambda: None,
 ) -> SignResult:
     """Sign ``image`` for key epoch ``epoch``.
 
@@ -112,6 +114,7 @@ def sign(
     given to anyone: one that was lost with its process was never seen, and its number may be used again. ``unit``: the
     job and the unit that an office signs for, which its pages say too. ``write_follows``: in a run nobody is given it
     but the node, by :func:`~teds_provision.steps.write.write`, which waits for the disk before the signature leaves.
+    ``before`` is called before a new signature is made; what it raises leaves the sequence as it is.
     """
     for block, teds in image.unsigned_blocks().items():
         if not can_be_stored(block) or not passes_own_check(block, teds):
@@ -123,6 +126,7 @@ def sign(
             number = _sequence_if_the_same(station, keys, image, octets, epoch)
             if number is not None and (octets == on_node or number > node_sequence):
                 return SignResult(image.with_block(SECURITY, octets), number, reused=True)
+    before()
     station.plant.require_role(
         "sign", "cannot sign datasheets", "Have a station sign it that has this role: sign --by OFFICE"
     )
@@ -154,6 +158,19 @@ def sign(
     if write_follows:
         station.run_in_background(station.flush)
     return SignResult(made, number, reused=False)
+
+
+def require_not_measured(station: Station, node: Conversation, *, released: bool = False) -> None:
+    """Raise FrozenError if a command of this station measures the node: it would refuse what is about to be signed.
+
+    ``released``: the running `ncap` measured the node and let it go. A write at the reader ends the claims of sensors.
+    """
+    holder = None if released or node.tapped else station.measurements.holder(node.uuid)
+    if holder is not None:
+        raise FrozenError(
+            f"Node {node.uuid.hex()} is being measured by {holder}. Nothing was signed or written.",
+            hint="End that measurement first.",
+        )
 
 
 def _sequence_if_the_same(station: Station, keys: SignedNodeKey, image: Image, octets: bytes, epoch: int) -> int | None:

@@ -179,7 +179,12 @@ class UsageLock(_HeldFile):
     @property
     def is_taken(self) -> bool:
         """Whether somebody holds it now, alone or shared."""
-        return _held_by(self._path) is not None
+        return self.holder is not None
+
+    @property
+    def holder(self) -> str | None:
+        """Who holds it now, in words; None if it is free."""
+        return _held_by(self._path)
 
     @property
     def is_taken_alone(self) -> bool:

@@ -340,6 +340,9 @@ def test_a_type_that_nobody_knows_is_told_while_its_measurement_waits(lab: Lab) 
     said = lab.service.station.run("ncap", "measure", "type:load-cel")
     assert said.code == 0, "a node of that type may come from another station"
     assert "no profile and no known node is called 'load-cel'" in said.err
+    assert "Did you mean type:load-cell?" in said.err
+    assert "0 nodes match now." in said.out
+    assert "its type is magnetic-angular-position-sensor, not load-cel." in said.out, said.out
     with lab.service.client() as asked:
         [one] = until(lambda: [measurement for measurement in asked.measurements() if measurement["why"]])
         assert (one["state"], one["why"]) == ("waiting", "no profile and no known node is called 'load-cel'")

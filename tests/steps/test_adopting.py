@@ -9,6 +9,7 @@ import pytest
 
 from teds_provision import teds
 from teds_provision.errors import BadDataError, PolicyError, TedsProvisionError, UsageError
+from teds_provision.measure.matching import NodeMatch, survey
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.hardware.board import Board as Hardware
 from teds_provision.node.virtual import VirtualNode
@@ -85,6 +86,21 @@ def test_without_a_yes_it_stays_as_it_was(station: Station, tmp_path: Path) -> N
     assert node.tim.flash.sequence == 0
     done, _ = adopted(station, node)
     assert done.verified.verdict == "authentic"
+
+
+def test_an_adopted_node_is_recognised_as_the_type_that_its_datasheet_fits(station: Station, tmp_path: Path) -> None:
+    node = board(tmp_path / "n", factory())
+    adopted(station, node)
+    found = survey(station, NodeMatch.parse(f"type:{ANGLE}"))
+    assert (found.matching, found.others) == ((UUID.hex(),), {})
+    other = survey(station, NodeMatch.parse("type:gripper"))
+    assert other.matching == ()
+    assert other.others[UUID.hex()] == (
+        "its type is unknown, and its datasheet does not fit gripper: its channels are 1, not 1, 2, 3"
+    )
+    cell = survey(station, NodeMatch.parse("type:load-cell")).others[UUID.hex()]
+    assert "channel 1 is in rad, not in N" in cell, cell
+    assert survey(station, NodeMatch.parse("type:no-such")).others[UUID.hex()].endswith("there is no profile no-such")
 
 
 def test_another_name_goes_before_its_own(station: Station, tmp_path: Path) -> None:
