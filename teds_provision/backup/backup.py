@@ -22,7 +22,7 @@ from teds_provision.vault.passphrase import PRODUCT, Costs
 
 @dataclass(frozen=True)
 class BackupResult:
-    """What was written: size and digest of the file, how much stands in it, and what to know of it."""
+    """Result of a backup: size and digest of the file, the numbers of rows in it, and warnings."""
 
     octets: int
     sha256: str
@@ -43,11 +43,11 @@ def backup(
 ) -> BackupResult:
     """Write a sealed copy of the station to ``path`` (mode 0600, whole or not at all; an old file is replaced).
 
-    ``recovery`` is the point of a recovery key, else ``ask`` gives a new passphrase. The store may be in use meanwhile;
-    ``notice`` is told whom the entry in the audit log waits for. The file gets its name only after it was read back as
-    ``restore`` would, and after that entry: where another process keeps it from being made, the command fails
-    (StoreLockedError). On a disk that takes no entry at all the backup is made, with a warning.
-    Raises StoreError, VaultError and its leaves.
+    ``recovery`` is the public point of a recovery key; without it ``ask`` returns a new passphrase. The store may be in
+    use meanwhile. If the entry in the audit log has to wait for another process, ``notice`` receives a message with its
+    name. The file gets its name only after it was read back as ``restore`` would read it, and after that entry: if
+    another process blocks the entry, the command fails (StoreLockedError). If the disk is full and takes no entry, the
+    backup is made, with a warning. Raises StoreError, VaultError and its leaves.
     """
     vault = station.vault
     sealer = Sealer(
@@ -74,9 +74,9 @@ def backup(
 
 
 def _write(station: Station, vault: Vault, file: BinaryIO, sealer: Sealer) -> bytes:
-    """Write the vault's secrets and the rows of one moment: keys are of no use without the master key that wraps them.
+    """Write the vault's secrets and the rows of one moment: keys are useless without the master key that wraps them.
 
-    A command that changes the vault in between (there are few) makes this begin anew. Returns the content key.
+    Starts over if another command changes the vault in between, which is rare. Returns the content key.
     """
     while True:
         vault.refresh()

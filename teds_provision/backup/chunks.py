@@ -26,7 +26,7 @@ _FULL: Final = CHUNK_OCTETS + TAG_OCTETS
 
 
 class OctetSource(Protocol):
-    """What gives octets in order."""
+    """A source of octets in order."""
 
     def read(self, size: int, /) -> bytes:
         """Return up to ``size`` octets; fewer only at the end."""

@@ -1,4 +1,4 @@
-"""What a backup holds once it is open."""
+"""The content of an opened backup."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "ma
 
 
 def digest_of(document: dict[str, Any]) -> str:
-    """What stands as ``sha256`` in the clear part of a file: over all the rest of it."""
+    """Return the ``sha256`` member of a file's clear part: a digest over all other members."""
     return hashlib.sha256(dump(document)).hexdigest()
 
 
 def check_digest(document: dict[str, Any]) -> None:
-    """Raise NotAuthenticError if a file's ``sha256`` is not over the rest of it: so damage is told from a wrong key."""
+    """Raise NotAuthenticError if a file's ``sha256`` does not match, to distinguish damage from a wrong key."""
     rest = {name: value for name, value in document.items() if name != "sha256"}
     if document.get("sha256") != digest_of(rest):
         raise NotAuthenticError(
@@ -35,7 +35,7 @@ def check_digest(document: dict[str, Any]) -> None:
 
 
 def context_of(clear: dict[str, Any], form: str) -> bytes:
-    """What the sealed part of a file is bound to: the format, and what stands in the clear."""
+    """Return the context to which the sealed part of a file is bound: the format and the clear part."""
     return form.encode() + b"\0" + dump(clear)
 
 
@@ -60,17 +60,17 @@ class BackupHead:
 
     @property
     def in_token(self) -> bool:
-        """Whether the station's key lies in a token."""
+        """True if the station's key is in a token."""
         return self.keystore.startswith("pkcs11")
 
     def line(self, form: str) -> bytes:
-        """The head as a line of JSON, for a file of that format (``teds-backup/2``)."""
+        """Return the head as a line of JSON, for a file of that format (``teds-backup/2``)."""
         texts = {name: getattr(self, name) for name in _TEXTS}
         return dump({"format": form, **texts, "point": self.point.hex(), "version": __version__}) + b"\n"
 
     @staticmethod
     def read(line: bytes, form: str) -> BackupHead:
-        """The head that a line says; raises BadDataError: another format, a text that is missing, no point of P-256."""
+        """Parse the head from a line; raises BadDataError: another format, a missing text, no point of P-256."""
         members = load_object(line, "The head of the backup")
         if members.get("format") != form or not all(isinstance(members.get(name), str) for name in _TEXTS):
             raise BadDataError("The header of the backup is from another version.")
@@ -84,7 +84,7 @@ class BackupHead:
         return BackupHead(members["store"], point, *values)
 
     def age_days(self, now: datetime | None = None) -> int:
-        """How many whole days ago it was made; negative for a time in the future, 0 where the time cannot be read."""
+        """Return the backup's age in whole days; negative for a time in the future, 0 if the time cannot be parsed."""
         try:
             made = datetime.fromisoformat(self.created)
         except ValueError:
@@ -100,7 +100,7 @@ class Content(BackupHead):
     copy: Store = field(repr=False, kw_only=True)
 
     def unopened(self, vault: Vault) -> Iterator[KeyRecord]:
-        """The keys that a vault does not open."""
+        """Yield the keys that ``vault`` cannot open."""
         for record in self.copy.all_keys():
             context = node_key_context(self.copy.id, record.uuid, record.epoch, record.slot)
             try:

@@ -1,4 +1,4 @@
-"""What a backup brings back into a living store, and what stays as it is although the backup says otherwise."""
+"""What a backup restores in an existing store, and what stays although the backup differs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from teds_provision.store.snapshot import Relation, extend_audit
 
 
 class Merge:
-    """One merge: ``back`` counts what came, ``kept`` what stayed as it is although the backup says otherwise."""
+    """Result of one merge: ``back`` counts restored rows, ``kept`` those that stayed although the backup differs."""
 
     def __init__(self, live: Store, copy: Store, how: Relation) -> None:
         self.live, self.copy = live, copy
@@ -48,7 +48,7 @@ class Merge:
         self._groups()
 
     def kept_sentences(self) -> list[str]:
-        """What stayed, in sentences."""
+        """Return sentences about what stayed."""
         return [f"{what}: {count}" for what, count in self.kept.items() if count]
 
     def _handovers(self) -> None:

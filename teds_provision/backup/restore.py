@@ -34,9 +34,10 @@ from teds_provision.vault.passphrase import PRODUCT, Costs
 
 @dataclass(frozen=True)
 class RestoreResult:
-    """What was done (or would be): ``rebuilt``, ``merged`` or ``nothing``; how much came back, and what stayed.
+    """What was done (or would be): ``rebuilt``, ``merged`` or ``nothing``; how many rows came back, and what stayed.
 
-    ``rotations_due`` counts the nodes whose key must be rotated by tap, or by a person's word, before anything else.
+    ``rotations_due`` counts the nodes whose key must be rotated by tap, or by an operator's confirmation, before
+    anything else.
     """
 
     action: str
@@ -53,9 +54,9 @@ class _DryRunRollbackError(Exception):
 
 
 def open_present(home: Path, content: Content) -> Store | None:
-    """Open the store of ``home`` if there is one that can be used, None if there is none or it is damaged.
+    """Open the store of ``home`` if it is usable; return None if it is absent or damaged.
 
-    Raises PolicyError where it is the store of another station, StoreError where it cannot be used otherwise.
+    Raises PolicyError if it belongs to another station, StoreError if it cannot be used for another reason.
     """
     if not has_store(home):
         return None
@@ -85,10 +86,10 @@ def rebuild(
 ) -> RestoreResult:
     """Make the station of a backup in a home without a usable store; a damaged one is kept under another name.
 
-    ``keystore`` as for init; None takes the kind that the station had, or a passphrase file where the keyring does not
-    work. The vault comes first, the store last and in one piece: killed in between, the same command carries on.
-    Every node that a key is held for is due for rotation afterwards, by tap or a person's word: nobody here knows what
-    became of it since the backup. Raises NotAuthenticError, VaultError and its leaves, StoreError.
+    ``keystore`` as for init; None selects the kind that the station had, or a passphrase file if the keyring does not
+    work. The vault is written first, the store last and in one piece: after a kill in between, the same command carries
+    on. Every node with a held key is due for rotation afterwards, by tap or by an operator's confirmation, as its state
+    may have changed since the backup. Raises NotAuthenticError, VaultError and its leaves, StoreError.
     """
     copy = content.copy
     _check_inside(copy, content)
@@ -140,10 +141,10 @@ def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
 
 
 def keystore_for(content: Content, asked: str | None) -> str | None:
-    """Which keystore a restored station gets: None means the keyring, or a passphrase file where it does not work.
+    """Return the keystore for a restored station; None means the keyring, or a passphrase file if it does not work.
 
-    No path of a module ever comes from a backup: for keys in a token the URI has to be given (UsageError). Raises
-    PolicyError where the keys cannot be put there.
+    The path of a module never comes from a backup: for keys in a token the URI has to be given (UsageError). Raises
+    PolicyError if the keys cannot be stored there.
     """
     # The backup's own keystore where any machine can have it; None for what this machine has.
     kept = None if content.in_token or content.keystore in ("keyring", "pkcs11") else content.keystore
@@ -193,9 +194,9 @@ def open_vault_of(store: Store, ask: Ask) -> None:
 
 
 def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | None = None) -> Vault:
-    """Open the vault of a living station; make it again where it is lost, and join master keys that it lacks.
+    """Open the vault of an existing station; recreate it if it is lost, and add missing master keys from the backup.
 
-    A CA key that was taken out of the vault since the backup stays out. Raises VaultError and its leaves.
+    A CA key that was removed from the vault since the backup stays removed. Raises VaultError and its leaves.
     """
     facts = store.facts()
     wanted = facts.keystore if facts is not None else keystore_for(content, keystore)

@@ -1,14 +1,13 @@
-"""The sealed file of ``backup`` (version 2): what stands in it, and what opening it checks.
+"""The sealed file of ``backup`` (version 2): its content, and the checks when it is opened.
 
 One line of JSON in the clear: ``format`` ``teds-backup/2``, ``store``, ``station``, ``created``, ``key`` and ``sha256``
-over all of it, so that a damaged head is told from a wrong passphrase. ``key`` is the file's own random key, sealed
-under a passphrase (Argon2id, AES-256-GCM) or as a JWE to a recovery key, which any JOSE implementation opens.
-Then chunks (:mod:`.chunks`), each bound to the SHA-256 of that line. Inside: a line of JSON
-(:class:`.content.BackupHead`), the store as rows (:mod:`teds_provision.store.dump`), and the station's signature,
-64 octets: SIG(station, "TEDS1 backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of all that stands before the
-signature).
+over all of it, which distinguishes a damaged head from a wrong passphrase. ``key`` is the file's random key, sealed
+under a passphrase (Argon2id, AES-256-GCM) or as a JWE to a recovery key, which any JOSE implementation opens. Then
+chunks (:mod:`.chunks`), each bound to the SHA-256 of that line. Inside: a line of JSON (:class:`.content.BackupHead`),
+the store as rows (:mod:`teds_provision.store.dump`), and the station's signature, 64 octets: SIG(station, "TEDS1
+backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of everything before the signature).
 
-Files of version 1, of the time before KeyAgreement 2, are refused by name.
+Files of version 1, which are older than KeyAgreement 2, are refused by name.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _CLEAR: Final = ("format", "store", "station", "created")
 
 
 class Sealer:
-    """What a backup is sealed with: a passphrase, or the 65-octet point of a recovery key."""
+    """Key source of a sealed backup: a passphrase, or the 65-octet point of a recovery key."""
 
     def __init__(
         self, *, passphrase: str | None = None, recovery: bytes | None = None, costs: sealing.Costs = sealing.PRODUCT
@@ -75,7 +74,7 @@ def write(out: BinaryIO, head: BackupHead, rows: Iterable[bytes], signer: Privat
 
 
 class SealedFile:
-    """A backup that lies in a file, still sealed. Opening it reads its first line.
+    """A backup in a file, still sealed. Opening it reads its first line.
 
     Raises NotFoundError, BadDataError.
     """
@@ -134,7 +133,7 @@ class SealedFile:
             raise NotFoundError(f"{self.path} cannot be read: {error.strerror}.") from error
 
     def _checked_head(self) -> dict[str, Any]:
-        """The members in the clear, held against their digest."""
+        """Return the members in the clear after checking their digest."""
         check_digest(self._head)
         return {name: self._head.get(name) for name in _CLEAR}
 

@@ -1,9 +1,9 @@
-"""The deny list: whose word bans a node here, and how a ban is taken back.
+"""The deny list: whose statement bans a node here, and how a ban is withdrawn.
 
-A statement counts when its signer has authority over the node: this station itself; a station that holds a key of it,
-or that it was given to; one that is certified by the CA that the node keeps; or the sender of the very bundle that
-brings the node. And only for the key that it names, or for the one that the UUID is pinned to here: whoever could ban
-any UUID could take other people's nodes out of service.
+A statement counts if its signer has authority over the node: this station itself; a station that holds a key of it, or
+that it was given to; one that is certified by the CA that the node keeps; or the sender of the very bundle that brings
+the node. And only for the key that it names, or for the one that the UUID is pinned to here: a signer who could ban any
+UUID could take other owners' nodes out of service.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from teds_provision.store import RevocationRecord
 
 
 def why_not(station: Station, statement: Statement, bundle: Bundle) -> str:
-    """Why a statement that came in ``bundle`` bans nothing here; "" where it counts."""
+    """Return why a statement that came in ``bundle`` bans nothing here; "" if it counts."""
     if station.policy.was_lifted(statement.statement):
         return "it was lifted here"
     brought = next((node for node in bundle.nodes if node.uuid == statement.uuid), None)
@@ -33,7 +33,7 @@ def why_not(station: Station, statement: Statement, bundle: Bundle) -> str:
 
 
 def deny(station: Station, statement: Statement, *, key: str | None) -> None:
-    """Put a signed statement on the deny list, bound to ``key`` where it names none; one that is there stays."""
+    """Add a signed statement to the deny list, bound to ``key`` if it names none; an existing one stays."""
     if station.policy.revocation(statement.uuid) is None:
         created = time_text(statement.created)
         named = statement.fingerprint or key
@@ -61,7 +61,7 @@ def lift(station: Station, uuid: bytes) -> bool:
 
 
 def _key_of(station: Station, uuid: bytes, bundle: Bundle) -> str | None:
-    """The key that a UUID is pinned to here, else the one that the bundle brings with it."""
+    """Return the key that a UUID is pinned to here, else the one that the bundle brings with it."""
     pinned = station.pins.pinned(uuid)
     brought = next((fingerprint(node.node_key) for node in bundle.nodes if node.uuid == uuid), None)
     return pinned or brought

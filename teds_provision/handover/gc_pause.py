@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def pause_gc() -> Iterator[None]:
-    """Search for no cycles of objects in the block: rows make none, and each search would look at all of them."""
+    """Pause the cyclic GC in the block: rows form no cycles, and each collection would visit all of them."""
     was = gc.isenabled()
     gc.disable()
     try:

@@ -42,9 +42,9 @@ Decision = Literal["new", "newer", "same", "refused"]
 
 @dataclass(frozen=True, slots=True)
 class PlannedNode:
-    """What becomes of one node of the bundle, and why where it is refused.
+    """Outcome of one node of the bundle, with the reason if it is refused.
 
-    ``name`` is the one that it gets here, ``notes`` say what a person should know of a node that is taken.
+    ``name`` is its name here, ``notes`` are hints for the operator about an accepted node.
     """
 
     node: BundledNode
@@ -118,7 +118,7 @@ class ImportedRows:
         )
 
     def _entry(self, planned: PlannedNode) -> WhitelistEntry | None:
-        """The whitelist entry, pinned to the node's key; None where it is pinned already."""
+        """Return the whitelist entry, pinned to the node's key; None if the node is pinned already."""
         node = planned.node
         pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
         if pin is None:
@@ -126,7 +126,7 @@ class ImportedRows:
         return None if is_whole(pin.fingerprint) else replace(pin, fingerprint=digits, assurance="import")
 
     def _node(self, planned: PlannedNode) -> NodeRecord:
-        """What is known of the node from now on; not its epoch and sequence, which a session has to tell."""
+        """Return the node's new record, without epoch and sequence, which only a session can report."""
         node = planned.node
         state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
         known = self.known.get(node.uuid)
@@ -173,7 +173,7 @@ _LIKE_UUID = re.compile("(0x)?[0-9a-f]{4,}", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class ImportPlan:
-    """What an import would do; ``ca_is_known`` False: that CA would be trusted for these nodes from now on."""
+    """Preview of an import; ``ca_is_known`` False: that CA would be trusted for these nodes from now on."""
 
     opened: OpenedBundle
     content: str
@@ -211,7 +211,7 @@ class ImportResult:
 
 
 class NothingImportedError(PolicyError):
-    """Every node of a bundle is refused; ``nodes`` say why."""
+    """Every node of a bundle is refused; ``nodes`` have the reasons."""
 
     def __init__(self, bundle: Bundle, nodes: tuple[PlannedNode, ...]) -> None:
         super().__init__(
@@ -223,13 +223,13 @@ class NothingImportedError(PolicyError):
 
 @gc_pause.pause_gc()
 def plan_import(station: Station, source: Source, now: datetime | None = None) -> ImportPlan | ImportResult:
-    """Open and check a bundle (octets, or a file), and say what would become of each node; changes nothing.
+    """Open and check a bundle (octets, or a file) and return the outcome for each node; changes nothing.
 
-    A bundle that was taken in before is returned as such, even when it has expired since. What it says of sequences
-    and epochs is hearsay: none of it is kept but the epoch of a pending key, which the first session corrects. A node
-    that was moved away comes back only from the station that it went to. Raises what
-    :func:`open_bundle` raises, and PolicyError: an id seen with other content, no signature of the bundle's CA over
-    this station, or every node refused (NothingImportedError).
+    A bundle that was imported before returns its result, even if it has expired since. Its sequences and epochs are
+    unverified: only the epoch of a pending key is kept, which the first session corrects. A node that was moved away
+    comes back only from the station that it went to. Raises what :func:`open_bundle` raises, and PolicyError: an id
+    seen with other content, no signature of the bundle's CA over this station, or every node refused
+    (NothingImportedError).
     """
     opened = open_bundle(source, station.vault.identity(), station.policy.station_points().get, None)
     bundle, content = opened.bundle, digest_of(opened.bundle)
@@ -249,7 +249,7 @@ _PassedOver = tuple[tuple[Statement, str], ...]
 
 
 def _new_revocations(station: Station, opened: OpenedBundle) -> tuple[tuple[Statement, ...], _PassedOver]:
-    """The revocations of the bundle that are new here: those that count, and those that do not, with why."""
+    """Return the revocations of the bundle that are new here: those that count, and the others with the reason."""
     news = [revocation for revocation in opened.revocations if station.policy.revocation(revocation.uuid) is None]
     judged = [(revocation, why_not(station, revocation, opened.bundle)) for revocation in news]
     denied = tuple(revocation for revocation, why in judged if not why)
@@ -257,7 +257,7 @@ def _new_revocations(station: Station, opened: OpenedBundle) -> tuple[tuple[Stat
 
 
 def _is_known_ca(station: Station, ca: bytes) -> bool:
-    """Whether the CA stands here without this bundle: it certified this station before, or a person trusts it."""
+    """True if the CA is known without this bundle: it certified this station before, or an operator trusts it."""
     certified = station.identity.certificate(ca, station.point) is not None
     return station.policy.counts(ca) and (certified or ca in station.policy.trusted_cas())
 
@@ -315,7 +315,7 @@ def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = Non
 
 
 def _before(row: Handover, content: str) -> ImportResult:
-    """A bundle of an id that came before: the same import again, or PolicyError where its content differs."""
+    """Return the result of a bundle id that came before; PolicyError if its content differs."""
     notes = BundleNotes.from_json(row.nodes)
     if notes.content != content:
         raise PolicyError(
@@ -327,7 +327,7 @@ def _before(row: Handover, content: str) -> ImportResult:
 
 
 def _check_certified(station: Station, opened: OpenedBundle) -> None:
-    """The receiver must be able to write and rotate: it needs the CA's signature over its key."""
+    """Check that the receiver is able to write and rotate: it needs the CA's signature over its key."""
     ca = opened.bundle.ca
     if opened.station_signature is None and station.identity.certificate(ca, station.point) is None:
         raise PolicyError(
@@ -411,7 +411,7 @@ class _Judge:
         return PlannedNode(node, self._decision(node), name=name, notes=tuple(notes))
 
     def _free_name(self, uuid: bytes, name: str) -> str:
-        """A name that no other node has and that cannot be taken for the first digits of a UUID."""
+        """Return a name that no other node has and that cannot be mistaken for the first digits of a UUID."""
         tried, digits = name, 4
         while self._bearer(tried, uuid) != uuid or _LIKE_UUID.fullmatch(tried):
             tried = f"{name}-{uuid.hex()[-digits:]}"
@@ -420,7 +420,7 @@ class _Judge:
         return tried
 
     def _bearer(self, name: str, uuid: bytes) -> bytes:
-        """Who has this name, among the nodes that come or here; ``uuid`` where nobody has it."""
+        """Return the node with this name, among those in the bundle and here; ``uuid`` if there is none."""
         return self.given.get(name) or self.bearers.get(name, uuid)
 
     def _decision(self, node: BundledNode) -> Decision:

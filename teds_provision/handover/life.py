@@ -29,7 +29,7 @@ UNCONFIRMED = ", unconfirmed"
 
 @dataclass(frozen=True)
 class RevokeResult:
-    """A node on the deny list; ``fresh`` False where there was nothing left to do."""
+    """A node on the deny list; ``fresh`` False if there was nothing left to do."""
 
     entry: RevocationRecord
     fresh: bool
@@ -63,12 +63,12 @@ def revoke(station: Station, uuid: bytes, why: str) -> RevokeResult:
 
 
 def is_retired(record: NodeRecord | None) -> bool:
-    """Whether a node was taken out of service."""
+    """True if a node was taken out of service."""
     return record is not None and (record.retired or "").startswith((DECOMMISSIONED, REPLACED))
 
 
 def is_finished(station: Station, uuid: bytes) -> bool:
-    """Whether a node was taken out of service and signed that it is in factory state."""
+    """True if a node was taken out of service and has signed that it is in factory state."""
     record = station.nodes.get(uuid)
     return record is not None and is_retired(record) and not (record.retired or "").endswith(UNCONFIRMED)
 
@@ -101,7 +101,7 @@ class TakeoverPlan:
 
     @property
     def done(self) -> bool:
-        """Whether the spare is in its place already."""
+        """True if the spare is in its place already."""
         return (self.old.retired or "").startswith(f"{REPLACED} {self.new.uuid.hex()}")
 
 
@@ -122,7 +122,7 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
 
 
 def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
-    """The Calibration TEDS that a node was last read to have.
+    """Return the Calibration TEDS of a node's last reading.
 
     Raises NotFoundError, BadDataError (they cannot be built in).
     """

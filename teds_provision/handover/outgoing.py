@@ -48,7 +48,7 @@ _CURE = "See teds-provision nodes UUID; any session settles it, or: teds-provisi
 
 @dataclass(frozen=True)
 class ExportOrder:
-    """What to hand over: to whom (as typed), which nodes (None: all that can be), how, and for how many days."""
+    """A request for a handover: the receiver (as typed), the nodes (None: all that can go), the mode, and the days."""
 
     to: tuple[str, ...]
     nodes: tuple[bytes, ...] | None
@@ -97,7 +97,7 @@ class Selection:
         return [*resting.values(), *(free[start : start + most] for start in range(0, len(free), most))]
 
     def choose(self) -> tuple[Chosen, list[tuple[bytes, str]]]:
-        """The nodes with their keys, and those that ``--all`` leaves out."""
+        """Return the nodes with their keys, and those that ``--all`` leaves out."""
         why = self._every() if self.order.nodes is None else self._named(self.order.nodes)
         chosen = [self.keys[uuid] for uuid, obstacle in why.items() if not obstacle]
         if not chosen:
@@ -109,7 +109,7 @@ class Selection:
         return [self.keys[uuid] for uuid in sorted(set(self.order.nodes or ())) if not self._obstacle(uuid)]
 
     def _named(self, nodes: tuple[bytes, ...]) -> dict[bytes, str]:
-        """The nodes that were named; raises PolicyError where one cannot go."""
+        """Return the nodes that were named; raises PolicyError if one cannot go."""
         why = {uuid: self._obstacle(uuid) for uuid in sorted(set(nodes))}
         for uuid, obstacle in why.items():
             if obstacle:
@@ -117,14 +117,14 @@ class Selection:
         return why
 
     def _every(self) -> dict[bytes, str]:
-        """Every node of which a key is held, with what keeps it here; where all stay, those of a move that was cut."""
+        """Return every node with a held key and what keeps it here; if all stay, those of an interrupted move."""
         why = {uuid: self._obstacle(uuid) for uuid in sorted(self.keys.keys() | self.pending)}
         if all(why.values()):
             return self._cut_again() or why
         return why
 
     def _cut_again(self) -> dict[bytes, str]:
-        """The nodes of a move that was cut; PolicyError where one of them has been revoked or forgotten since."""
+        """Return the nodes of an interrupted move; PolicyError if one of them has been revoked or forgotten since."""
         resting = self._cut_move()
         for uuid in resting:
             if uuid in self.revoked or uuid not in self.keys:
@@ -154,7 +154,7 @@ class Selection:
         return ""
 
     def _is_cut(self, uuid: bytes) -> bool:
-        """Whether this node rests because of a move to the same receiver that is still open."""
+        """True if this node rests because of a move to the same receiver that is still open."""
         tombstone = self.tombstones[uuid]
         return (
             self.order.mode == "move"
@@ -163,9 +163,9 @@ class Selection:
         )
 
     def _cut_move(self) -> list[bytes]:
-        """The nodes of the newest open move to this receiver, and of the bundles that one command made with it.
+        """Return the nodes of the newest open move to this receiver, and of the bundles made by the same command.
 
-        ``--all`` again after a cut means these.
+        ``--all`` again after an interruption means these.
         """
         if self.order.mode != "move":
             return []
@@ -208,7 +208,7 @@ def _why_node_stays(node: NodeRecord | ExportEligibility, pin: str) -> str:
 
 
 def _of_the_last_run(notes: list[BundleNotes]) -> list[BundleNotes]:
-    """The newest bundle, with all that one command made together with it."""
+    """Return the newest bundle, with all that the same command made."""
     return [note for note in notes if note.run and note.run == notes[-1].run] or notes[-1:]
 
 
@@ -218,7 +218,7 @@ NODES_IN_A_BUNDLE = 50_000
 
 @dataclass(frozen=True)
 class ExportPlan:
-    """What would be handed over. ``skipped`` are nodes that ``--all`` leaves out, and why.
+    """Preview of a handover. ``skipped`` are nodes that ``--all`` leaves out, with the reason.
 
     ``earlier`` is the open handover that this one carries on: the same keys to the same stations. ``also_held_by`` are
     other stations (fingerprints) that hold a copy of any of these keys.
@@ -236,12 +236,12 @@ class ExportPlan:
     earlier: Handover | None
     also_held_by: tuple[str, ...] = ()
     run: str = ""
-    """Id of the first bundle where one command made several."""
+    """Id of the first bundle if one command made several."""
 
 
 @dataclass(frozen=True)
 class ExportResult:
-    """A bundle that lies in a file; ``fresh`` False where it lay there already."""
+    """A bundle in a file; ``fresh`` False if the file existed already."""
 
     plan: ExportPlan
     sha256: str
@@ -288,7 +288,7 @@ def plan_exports(
 
 @dataclass(frozen=True)
 class _SharedFields:
-    """What the bundles of one command share."""
+    """Fields that the bundles of one command share."""
 
     order: ExportOrder
     receivers: tuple[TrustRecord, ...]
@@ -299,7 +299,7 @@ class _SharedFields:
     rows: Sequence[Handover]
 
     def plan(self, nodes: Chosen, also_held_by: tuple[str, ...]) -> ExportPlan:
-        """The plan of one bundle; an open one of the same content is carried on."""
+        """Return the plan of one bundle; an open one of the same content is carried on."""
         mode, to = self.order.mode, [record.fingerprint for record in self.receivers]
         listed = ((node.uuid, node.key_id, node.epoch) for node in sorted(nodes, key=attrgetter("uuid")))
         content = content_digest(self.sender, to, mode, self.ca, listed)
@@ -325,11 +325,11 @@ class _SharedFields:
 
 @gc_pause.pause_gc()
 def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> ExportResult:
-    """Seal the bundle into a new file of mode 0600; a move's keys rest from before anybody could open that file.
+    """Seal the bundle into a new file of mode 0600; a move's keys rest before the file can be opened.
 
-    What is written before the store has it is a draft without signature and tag, under a name of its own.
-    The same command over its own file finds nothing to do. Raises UsageError (another file lies there),
-    StoreError, VaultError.
+    What is written before the store has it is a draft without signature and tag, under a temporary name. The same
+    command over its own file finds nothing to do. Raises UsageError (the path holds another file), StoreError,
+    VaultError.
     """
     before = _already(plan, output)
     if before is not None:
@@ -348,7 +348,7 @@ def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetim
 
 @dataclass(frozen=True)
 class SealedBundle:
-    """A bundle that lies in no file; :func:`record_export` has to be durable before anybody gets it."""
+    """A bundle without a file; :func:`record_export` has to be durable before it leaves this process."""
 
     plan: ExportPlan
     octets: bytes
@@ -372,9 +372,9 @@ def record_export(station: Station, sealed: SealedBundle) -> None:
 def plan_copies(
     station: Station, receiver: TrustRecord, uuids: Sequence[bytes], now: datetime, *, most: int = NODES_IN_A_BUNDLE
 ) -> list[ExportPlan]:
-    """Plans of copies for one station: those of the nodes that may go and keep the owner's CA.
+    """Return plans of copies for one station: those of the nodes that may go and keep the owner's CA.
 
-    What an export leaves out is left out without a word. Raises PolicyError where the receiver is not certified.
+    Nodes that an export leaves out are left out without a notice. Raises PolicyError if the receiver is not certified.
     """
     order = ExportOrder((receiver.fingerprint,), tuple(uuids), "copy", ca=fingerprint(station.ca))
     selection = Selection(station, order, {receiver.fingerprint})
@@ -420,7 +420,7 @@ def _receivers(station: Station, order: ExportOrder) -> list[TrustRecord]:
 
 
 def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
-    """The CA that the nodes keep: one bundle has one."""
+    """Return the CA that the nodes keep: one bundle has one."""
     found = {fingerprint(ca): ca for ca in {ca for _, ca in _with_ca(station, nodes)}}
     if order.ca is not None:
         found = {digits: ca for digits, ca in found.items() if digits.startswith(order.ca.lower())}
@@ -443,7 +443,7 @@ def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[LeavingNode, byt
 
 
 def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
-    """SIG104 over the receiver: known, in the plant's roster, or made now where the CA key is here."""
+    """Return SIG104 over the receiver: known, in the plant's roster, or made now if the CA key is here."""
     known = station.identity.certificate(ca, receiver.point)
     if known is None and ca == station.ca and (roster := station.plant.roster) is not None:
         member = roster.member(receiver.fingerprint)
@@ -477,7 +477,7 @@ def _is_same(row: Handover, content: str, now: datetime) -> bool:
 
 
 def _already(plan: ExportPlan, output: Path) -> str | None:
-    """Digest of the file where it is one that this very handover gave before."""
+    """Return the digest of the file if this very handover wrote it before."""
     if plan.earlier is None or not output.is_file():
         return None
     with output.open("rb") as file:
@@ -528,9 +528,9 @@ def _bundled(station: Station, nodes: Iterable[LeavingNode]) -> Iterator[Bundled
 
 
 def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Handover:
-    """What must be durable before the file: who holds what, the bundle's row, and for a move the tombstones.
+    """Write what must be durable before the file: the holders, the bundle's row, and for a move the tombstones.
 
-    ``digests`` are those of the file and of what was signed in it; none where a bundle of several is announced.
+    ``digests`` are those of the file and of what was signed in it; empty if a bundle of several is announced.
     """
     files = _files_before(plan)
     uuids_hex = tuple(node.uuid.hex() for node in plan.nodes)

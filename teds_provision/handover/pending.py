@@ -1,7 +1,7 @@
-"""Handovers under way: what the store remembers of a bundle, the receipt that closes it, and undoing a move.
+"""Pending handovers: the stored record of a bundle, the receipt that closes it, and undoing a move.
 
 A bundle that left is ``open`` until its receipt comes (``closed``) or it is taken back (``undone``); one that came is
-``imported``. What belongs to it beyond the columns of the table is in :class:`BundleNotes`.
+``imported``. :class:`BundleNotes` holds what the columns of the table do not.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
 
 @dataclass(frozen=True)
 class BundleNotes:
-    """What is kept with a bundle: its nodes (UUIDs in hex), what it says in one digest, and its files.
+    """Notes kept with a bundle: its nodes (UUIDs in hex), one digest of its content, and its files.
 
     ``files`` are the SHA-256 of every file that was sealed with this content, and of what was signed in each: sealing
     again gives other octets. ``keys`` are the ids of the keys that left, one for each node (empty in rows of version
-    1); ``run`` is the id of the first bundle of those that one command made.
+    1); ``run`` is the id of the first bundle made by the same command.
     """
 
     uuids: tuple[str, ...]
@@ -66,10 +66,10 @@ class BundleNotes:
 def content_digest(
     sender: str, to: Iterable[str], mode: str, ca: bytes, nodes: Iterable[tuple[bytes, str, int]]
 ) -> str:
-    """Return what tells one handover from another: who gives which keys (UUID, keyId, epoch) of which CA to whom.
+    """Return a digest that identifies a handover: who gives which keys (UUID, keyId, epoch) of which CA to whom.
 
     No time and no id: the same command gives the same digest again. Key ids are public, keys are not in it. ``nodes``
-    ascend by UUID. The digest is over JSON, which is never there as a whole.
+    ascend by UUID. The digest is over JSON, which is streamed and never built as a whole.
     """
     digest = hashlib.sha256(
         json.dumps([sender, sorted(to), mode, ca.hex()], separators=(",", ":")).encode()[:-1] + b",["
@@ -156,11 +156,12 @@ class CloseResult:
 def close(station: Station, octets: bytes) -> CloseResult:
     """Take in the receipt of a bundle that left here; a move is then over: its keys are deleted.
 
-    Only the keys that were in the bundle are deleted, and only while this very move stands: a receipt that comes after
+    Only the keys that were in the bundle are deleted, and only while this very move is open: a receipt that comes after
     the node's return deletes nothing. A copy for several stations is closed when each has sent its receipt.
 
-    What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthenticError
-    (signature, sender, another file), PolicyError (not ours, undone), NotFoundError (unknown id), BadDataError.
+    Nodes that the receiver refused come back to this station, to be rotated at the next contact. Raises
+    NotAuthenticError (signature, sender, another file), PolicyError (not ours, undone), NotFoundError (unknown id),
+    BadDataError.
     """
     receipt = open_receipt(octets, station.policy.station_points().get)
     row = station.handovers.get(receipt.id, "out")
@@ -192,7 +193,7 @@ def close(station: Station, octets: bytes) -> CloseResult:
 
 
 def _settle(station: Station, row: Handover, receipt: Receipt) -> None:
-    """Who holds which key now that the receiver said what it took in and what not."""
+    """Update the holders of each key from what the receiver accepted and refused."""
     if row.mode == "move":
         _delete_what_left(station, row, receipt.imported)
     for refused in receipt.refused:
@@ -220,7 +221,7 @@ def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -
 
 
 def signer_of(text: str) -> str:
-    """Who signed a receipt or revocation that was verified when it came, "" where that cannot be read."""
+    """Return the signer of a receipt or revocation that was verified on arrival, "" if it cannot be parsed."""
     try:
         return str(load_object(decode_base64url(text.split(".")[1], "The receipt"), "The receipt").get("from", ""))
     except (BadDataError, IndexError):
@@ -262,7 +263,10 @@ class ListedHandover:
 
 
 def list_handovers(station: Station, now: datetime) -> list[ListedHandover]:
-    """Every bundle that left or came, oldest first; ``expired`` says that an open one can be imported no more."""
+    """Return every bundle that left or came, oldest first.
+
+    ``expired`` marks open ones that can no longer be imported.
+    """
     names = {record.fingerprint: record.name for record in station.policy.trusted("station")}
     listed = []
     for row in station.handovers.all():

@@ -102,7 +102,7 @@ def read_certificate(octets: bytes) -> Certificate:
 
 
 def sign_request(station: Station, request: CertificateRequest) -> Certificate:
-    """Certify a station under this owner's CA, and remember that; raises NotFoundError where the CA key is not here."""
+    """Certify a station under this owner's CA, and record that; raises NotFoundError if the CA key is not here."""
     if request.station == station.ca:
         raise PolicyError("The request names the CA's own key as a station.")
     known = station.identity.certificate(station.ca, request.station)
@@ -193,7 +193,7 @@ def _name(value: object) -> str:
 
 
 def require_ca(station: Station) -> PrivateKey:
-    """Return the CA key; raises PolicyError where this station's CA is kept elsewhere."""
+    """Return the CA key; raises PolicyError if this station's CA is kept elsewhere."""
     ca = station.vault.ca()
     if ca is None or ca.point != station.ca:
         raise PolicyError(
@@ -234,7 +234,7 @@ _CA_SUFFIXES = (".ca.pem", ".ca.pub")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A key that someone wants trusted, where it came from, and the CA's signature over it if the file brings one."""
+    """A key that someone wants trusted, its origin, and the CA's signature over it if the file has one."""
 
     record: TrustRecord
     path: Path
@@ -243,15 +243,15 @@ class Candidate:
 
 
 def spoken(digits: str) -> str:
-    """A fingerprint as people read it to each other: in fours, sixteen fours in all."""
+    """Return a fingerprint as people read it aloud: sixteen groups of four digits."""
     return " ".join(digits[start : start + 4] for start in range(0, len(digits), 4))
 
 
 def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candidate:
     """Read one public key (PEM) or a station's certificate.
 
-    Raises NotFoundError, BadDataError (private key, RSA, P-384, nothing of the kind), PolicyError (its own key, a name
-    that stands for another key).
+    Raises NotFoundError, BadDataError (private key, RSA, P-384, neither key nor certificate), PolicyError (the
+    station's own key, a name of another key).
     """
     point, certificate = _read(path)
     if certificate is not None and role == "ca":
@@ -278,7 +278,7 @@ def _refuse_in_roster(station: Station, fingerprint: str) -> None:
 
 
 def _is_listed(station: Station, wanted: TrustRecord) -> bool:
-    """Whether this very key stands under this very name already; raises PolicyError where another one does."""
+    """True if this key is listed under this name already; raises PolicyError if another key has the name."""
     named = [record for record in station.policy.listed() if record.name == wanted.name]
     for old in named:
         if (old.role, old.point) != (wanted.role, wanted.point):
@@ -314,7 +314,7 @@ def candidates_of(station: Station, folder: Path, role: TrustRole) -> list[Candi
 
 
 def refuse_private_keys(folder: Path) -> None:
-    """Raise PolicyError where any file below ``folder`` holds a private key; such a folder is shared and kept."""
+    """Raise PolicyError if any file below ``folder`` holds a private key; such a folder is shared and kept."""
     for path, why in private_keys(folder):
         raise PolicyError(
             f"{path} holds {why}; this folder is for public keys.",
@@ -333,7 +333,7 @@ def private_keys(folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _secret_in(octets: bytes, suffix: str) -> str:
-    """What a file holds that must not be shared, "" for nothing."""
+    """Return the kind of secret in a file that must not be shared, "" if there is none."""
     if b"PRIVATE KEY" in octets:
         return "a private key"
     if suffix in _DER_SUFFIXES and octets[:1] == b"\x30":
@@ -425,7 +425,7 @@ class Removal:
 
 
 def plan_removal(station: Station, record: TrustRecord) -> Removal:
-    """Find what hangs on the trust in a key; changes nothing. Raises PolicyError for one that the roster names."""
+    """Find what depends on the trust in a key; changes nothing. Raises PolicyError for one that the roster names."""
     if record.role == "station":
         _refuse_in_roster(station, record.fingerprint)
     cas = _cas_of(station, record)
@@ -456,7 +456,7 @@ def remove(station: Station, record: TrustRecord) -> Removal:
 
 
 def _cas_of(station: Station, record: TrustRecord) -> tuple[bytes, ...]:
-    """The CAs whose standing here ends with this key: itself, or those that no other trusted station brought."""
+    """Return the CAs whose trust ends with this key: itself, or those that no other trusted station brought."""
     trusted = {trusted.point for trusted in station.policy.trusted("ca")} | {station.ca}
     if record.role == "ca":
         return () if record.point == station.ca else (record.point,)

@@ -1,4 +1,4 @@
-"""What a station remembers: whitelist, nodes, wrapped keys, trust and the audit log, in one SQLite file."""
+"""The station's memory in one SQLite file: whitelist, nodes, wrapped keys, trust and the audit log."""
 
 from typing import TYPE_CHECKING
 

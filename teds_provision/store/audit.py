@@ -1,11 +1,11 @@
 """The audit log: append-only, hash-chained, one entry per act.
 
-Each entry's hash is SHA-256(hash of the entry before ‖ canonical JSON of this one); the first follows
-SHA-256("TEDS1 audit" ‖ 00 ‖ store id). Canonical JSON: sorted keys, no spaces, ASCII. The number of entries and the
-last hash are remembered beside the table, so a tail that was cut off is noticed. Triggers refuse to change or delete.
+Each entry's hash is SHA-256(hash of the entry before ‖ canonical JSON of this one); the first follows SHA-256("TEDS1
+audit" ‖ 00 ‖ store id). Canonical JSON: sorted keys, no spaces, ASCII. The number of entries and the last hash are kept
+beside the table, so that a removed tail is noticed. Triggers refuse to change or delete.
 
-What it does not prove: whoever may write the file can recompute the whole chain. Compare ``AuditVerdict.head`` with
-one noted elsewhere where that matters.
+It does not prove everything: a process that may write the file can recompute the whole chain. If that matters, compare
+``AuditVerdict.head`` with one that is noted elsewhere.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from teds_provision.store.database import Database
 from teds_provision.store.records import utc_now
 
 ACTOR: ContextVar[str | None] = ContextVar("ACTOR", default=None)
-"""On whose word acts are done here, where that is not the user who runs this process: ``page``, ``token NAME``."""
+"""The actor of acts done here, if it is not the user who runs this process: ``page``, ``token NAME``."""
 _quoted = json.encoder.encode_basestring_ascii
 _encode = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
 _NOTED = "(SELECT value FROM meta WHERE name = 'audit-head')"
@@ -36,7 +36,7 @@ _TOKEN = "token "
 
 
 def by_token(name: str) -> str:
-    """What :data:`ACTOR` says of a token of the API."""
+    """Return the value of :data:`ACTOR` for a token of the API."""
     return f"{_TOKEN}{name}"
 
 
@@ -67,7 +67,7 @@ class AuditFilter:
     act: str | None = None
     failed: bool = False
     text: str | None = None
-    """Stands in act, outcome, details, actor or UUID, in either case."""
+    """Matches act, outcome, details, actor or UUID, in either case."""
     before: int | None = None
     """Only entries with a smaller number."""
     since: str | None = None
@@ -85,13 +85,13 @@ FAILED = (
 
 
 def is_failure(outcome: str) -> bool:
-    """Whether an act did not do what it should."""
+    """True if an act did not succeed."""
     return outcome.startswith(FAILED)
 
 
 @dataclass(frozen=True)
 class AuditVerdict:
-    """Whether the chain holds; ``first_bad`` numbers the first entry that does not, ``why`` says what is wrong."""
+    """Verdict on the chain; ``first_bad`` is the number of the first wrong entry, ``why`` the reason."""
 
     intact: bool
     first_bad: int | None
@@ -146,7 +146,7 @@ class AuditLog:
     def before(self, choice: AuditFilter, *, last: int | None = None) -> int:
         """Return the number of the entry before the first one to show: of the ``last`` chosen, or made ``since``.
 
-        With ``last`` the search starts at the end. A time says nothing about the position, as clocks are set back, so
+        With ``last`` the search starts at the end. A time does not determine the position, as clocks are set back, so
         ``since`` without ``last`` reads entries from the beginning (0.1 s for a million).
         """
         if last is not None:
@@ -165,7 +165,7 @@ class AuditLog:
     def check(self, after: int = 0) -> AuditVerdict:
         """Recompute the chain from entry ``after`` on (0: the whole of it); raises StoreError for an unreadable file.
 
-        From the middle on it says that what stands there was not changed since the entry before was as it is.
+        From the middle on it proves only that the rest is unchanged relative to the entry before.
         """
         expected, previous = after, self._root
         if after:
@@ -189,7 +189,7 @@ class AuditLog:
         return AuditVerdict(True, None, expected, previous.hex())
 
     def _remembered(self) -> tuple[int, bytes] | None:
-        """Return the number of entries and the last hash, None where that note itself is damaged."""
+        """Return the number of entries and the last hash, None if that note is damaged."""
         return self._read(self._noted())
 
     def _noted(self) -> object:
@@ -226,7 +226,7 @@ def _entry(
 
 
 def _linked(*row: Any) -> tuple[int, Callable[[bytes], bytes], bytes]:
-    """Return number, the hash as a function of the one before, and the hash that stands there."""
+    """Return number, the hash as a function of the one before, and the stored hash."""
     texts, uuid, digest = (row[1], row[2], row[3], row[5], row[6]), row[4], row[7]
     if (
         not all(isinstance(text, str) for text in texts)
@@ -238,7 +238,7 @@ def _linked(*row: Any) -> tuple[int, Callable[[bytes], bytes], bytes]:
 
 
 def _chained(previous: bytes, row: tuple[Any, ...]) -> bytes:
-    """The hash of an entry. Its canonical JSON is put together by hand: a log has a million entries."""
+    """Return the hash of an entry. Its canonical JSON is put together by hand: a log has a million entries."""
     seq, at, who, act, uuid, outcome, detail = row
     node = "null" if uuid is None else f'"{uuid.hex()}"'
     text = (
@@ -249,7 +249,7 @@ def _chained(previous: bytes, row: tuple[Any, ...]) -> bytes:
 
 
 def _terms(choice: AuditFilter) -> str:
-    """SQL of a choice. Its values were written by this program, or are UUID digits, or are quoted here."""
+    """Return the SQL of a choice. Its values were written by this program, or are UUID digits, or are quoted here."""
     terms = ""
     if choice.uuid is not None:
         terms += f" AND uuid = x'{choice.uuid.hex()}'"
@@ -269,7 +269,7 @@ def _terms(choice: AuditFilter) -> str:
 
 
 def _like(text: str) -> str:
-    """A text as a pattern of SQL, quoted. Details are kept as canonical JSON, in ASCII."""
+    """Return a text as a quoted pattern of SQL. Details are kept as canonical JSON, in ASCII."""
     plain = _quoted(text)[1:-1]
     for sign in "!%_":
         plain = plain.replace(sign, f"!{sign}")
@@ -278,7 +278,7 @@ def _like(text: str) -> str:
 
 @cache
 def _who() -> str:
-    """Who runs this process, and where; neither changes while it runs."""
+    """Return the user and the host of this process; neither changes while it runs."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # no entry in the user database, as in a container

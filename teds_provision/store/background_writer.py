@@ -16,7 +16,7 @@ Step = Callable[[], object]
 
 
 class BackgroundWriter:
-    """The steps of the run of one thread, one at a time; ``waiting`` says, by thread, whose next statement waits."""
+    """Steps of the run of one thread, one at a time; ``waiting`` maps a thread to its waiting statement."""
 
     def __init__(self, waiting: MutableMapping[int, BackgroundWriter]) -> None:
         self._waiting, self._owner = waiting, threading.get_ident()
@@ -46,7 +46,7 @@ class BackgroundWriter:
                 raise error
 
     def close(self) -> None:
-        """End the thread; raises what a step raised that nobody has waited for."""
+        """End the thread; raises an error of a step that was not waited for."""
         try:
             self.wait()
         finally:

@@ -1,7 +1,7 @@
 """Statements and transactions on one connection to SQLite: waited for, undone whole, errors translated.
 
-``synchronous=FULL``: a commit that returned has reached the disk, unless it was said that it may come later, and a
-process killed at any instant leaves the last commit.
+``synchronous=FULL``: a commit that returned has reached the disk, unless it was allowed to come later, and a process
+killed at any instant leaves the last commit.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _OS_CAUSES: dict[int, tuple[str, str]] = {
 
 
 def as_store_failure(error: sqlite3.Error | OSError, path: Path) -> StoreError:
-    """Say in the words of the tool why SQLite or the system refused; cause and cure, no octet of the contents."""
+    """Translate an error of SQLite or the system: cause and remedy, no octet of the contents."""
     if isinstance(error, OSError):
         cause, cure = _OS_CAUSES.get(error.errno or 0, (error.strerror or type(error).__name__, "Check that path."))
         return StoreError(f"The store {path} cannot be used: {cause}.", hint=cure)
@@ -77,13 +77,13 @@ def as_store_failure(error: sqlite3.Error | OSError, path: Path) -> StoreError:
 
 
 def damaged(path: Path) -> StoreError:
-    """The error for a file that holds what this tool never wrote."""
+    """Return the error for a file with content that this tool never wrote."""
     cause, cure = _CAUSES[_SQLITE_CORRUPT]
     return StoreError(f"The store {path} cannot be used: {cause}.", hint=cure)
 
 
 def is_no_place_to_write(failure: StoreError) -> bool:
-    """Whether a store could not be opened because nothing can be written where it lies."""
+    """True if a store could not be opened because its place cannot be written to."""
     cause = failure.__cause__
     if isinstance(cause, OSError):
         return cause.errno in _OS_CAUSES
@@ -92,7 +92,7 @@ def is_no_place_to_write(failure: StoreError) -> bool:
 
 
 def too_old(what: str, version: int) -> StoreError:
-    """The error for a store, or the store in a backup (``what``), of a schema before KeyAgreement 2."""
+    """Return the error for a store, or the store in a backup (``what``), of a schema before KeyAgreement 2."""
     return StoreError(
         f"{what} is of schema {version}, from before KeyAgreement 2, which nodes no longer support.",
         hint="That version was never released. Choose another --home, run init there, and provision the nodes again.",
@@ -100,7 +100,7 @@ def too_old(what: str, version: int) -> StoreError:
 
 
 QUIET_SECONDS: Final = 0.3
-"""For so long SQLite waits by itself for another process; then it is said, and tried again."""
+"""Seconds that SQLite waits silently for another process; then there is a notice, and another try."""
 WAITING: Final = "synchronous=FULL"
 _Given = TypeVar("_Given")
 
@@ -124,7 +124,7 @@ class Connection:
         self.background: dict[int, BackgroundWriter] = {}
         """By thread: the run that has a step taken behind its back, for which its next statement waits."""
         self.notice: Callable[[str], object] | None = None
-        """Told, in a sentence, what a change of the store waits for."""
+        """Receives a sentence about what a change of the store waits for."""
         self._frozen: StoreError | None = None
         """Why nothing can be written; what is read then comes from a private copy."""
 
@@ -172,7 +172,7 @@ class Connection:
             return self._wait_for(run)
 
     def _wait_for(self, run: Callable[[], _Given]) -> _Given:
-        """Try once more, again and again; say what is waited for and until when."""
+        """Try again until it works; report what it waits for and until when."""
         until = time.monotonic() + BUSY_SECONDS
         if self.notice is not None:
             self.notice(f"Waiting up to {BUSY_SECONDS:.0f} s for another process that is writing to the store.")
@@ -184,7 +184,7 @@ class Connection:
                     raise self._failure(error) from error
 
     def _is_to_wait(self, error: Exception) -> bool:
-        """Whether another process holds the file: inside a transaction nobody else does."""
+        """True if another process holds the file; inside a transaction that is impossible."""
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         return not self._depth and code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 
@@ -209,10 +209,10 @@ class Connection:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """What was read before and not changed by this process counts as it was when the block began, in this thread.
+        """Keep rows that were read before, and not changed by this process, valid for the block, in this thread.
 
-        For many questions at one moment, with no waiting in between: whether another process has changed something is
-        asked once. Changes inside it are made, and seen, as ever.
+        For many reads at one moment, with no waiting in between: changes by another process are checked for once.
+        Changes inside the block are made, and seen, as usual.
         """
         self.drain()
         with self._lock:
@@ -234,10 +234,10 @@ class Connection:
         return Transaction(self, later=later)
 
     def together(self) -> AbstractContextManager[None]:
-        """All or nothing, as :meth:`transaction`; inside another one a part of it, without a savepoint of its own.
+        """Run all or nothing, as :meth:`transaction`; inside another one, join it without a savepoint.
 
-        What fails in it after a change takes the whole with it: where that error is caught and the rest goes on, the
-        end undoes everything and raises StoreError.
+        A failure after a write rolls back the outer transaction: if that error is caught and the rest goes on, the end
+        undoes everything and raises StoreError.
         """
         return Transaction(self, apart=False)
 
@@ -295,7 +295,7 @@ class Connection:
         self._steady, self._added = None, False
 
     def leave(self, block: Transaction, *, failed: bool) -> None:
-        """End a block; for :class:`Transaction` alone. Raises StoreError where it cannot be kept."""
+        """End a block; for :class:`Transaction` alone. Raises StoreError if it cannot be kept."""
         try:
             if failed:
                 self._undo(block)
@@ -348,7 +348,7 @@ class Connection:
             raise self._failure(error) from error
 
     def _failure(self, error: Exception) -> TedsProvisionError:
-        """What is raised in place of an error of SQLite, of the system, or of a text."""
+        """Return the error to raise in place of one of SQLite, of the system, or of a text."""
         if isinstance(error, UnicodeDecodeError):  # SQLite quotes what it found in a damaged file
             return self._damaged()
         if isinstance(error, sqlite3.Error | OSError):

@@ -1,7 +1,7 @@
 """The SQLite file under the store: opened safely, written durably, and never a foreign exception.
 
-Write-ahead log with ``synchronous=FULL``: a commit that returned has reached the disk, unless it was said that it may
-come later, and a process killed at any instant leaves the last commit. ``secure_delete`` overwrites what is deleted.
+Write-ahead log with ``synchronous=FULL``: a commit that returned has reached the disk, unless it was allowed to come
+later, and a process killed at any instant leaves the last commit. ``secure_delete`` overwrites what is deleted.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FILE_NAME: Final = "store.sqlite3"
 
 
 def has_store(home: Path) -> bool:
-    """Whether a store lies here, usable or not."""
+    """True if there is a store here, usable or not."""
     return (home / FILE_NAME).exists()
 
 
@@ -82,7 +82,7 @@ def prepare_file(path: Path, *, create: bool) -> None:
 
 
 def _require_own(file: Path) -> None:
-    """Refuse a link, or another user's file, in the place of the store: somebody put it there."""
+    """Refuse a link, or another user's file, in the place of the store, as it may have been planted."""
     try:
         status = file.lstat()
     except FileNotFoundError:
@@ -99,7 +99,7 @@ _Record = TypeVar("_Record")
 
 
 def places(values: Sized) -> str:
-    """A ``?`` for each value, as a statement has them."""
+    """Return a ``?`` for each value, as a statement has them."""
     return ", ".join("?" * len(values))
 
 
@@ -163,7 +163,7 @@ class Database(Connection):
 
     @property
     def frozen(self) -> StoreError | None:
-        """Why nothing can be written (the disk is full or read-only), None where it can."""
+        """Why nothing can be written (the disk is full or read-only), None if it can."""
         return self._frozen
 
     def close(self) -> None:
@@ -177,7 +177,7 @@ class Database(Connection):
         return rows[0] if rows else None
 
     def read(self, make: Callable[..., _Record], statement: str, values: Sequence[Any] = ()) -> list[_Record]:
-        """Make a record of every row; raises StoreError, also where a damaged row makes no record."""
+        """Make a record of every row; raises StoreError, also if a damaged row makes no record."""
         rows = self.execute(statement, values)
         try:
             return [make(*row) for row in rows]
@@ -190,9 +190,9 @@ class Database(Connection):
         return records[0] if records else None
 
     def recall(self, make: Callable[..., _Record], statement: str, values: Sequence[Any] = ()) -> tuple[_Record, ...]:
-        """Make a record of every row; what was read a moment ago, and nobody has changed since, is given once more.
+        """Make a record of every row, from the cache if no process has changed the table since.
 
-        For what every step asks again of the node at hand. Raises what :meth:`read` raises.
+        For what every step reads again of the node at hand. Raises what :meth:`read` raises.
         """
         if self.background:
             self.drain()

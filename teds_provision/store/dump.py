@@ -39,7 +39,7 @@ _NAME: Final = re.compile("[a-z][a-z0-9_]*")
 
 
 class RowSource(Protocol):
-    """Where a dump is read from."""
+    """Source of a dump."""
 
     def read(self, size: int) -> bytes:
         """Return exactly ``size`` octets."""

@@ -1,9 +1,9 @@
-"""One command at a time changes a store, and one at a time works on a node: advisory locks.
+"""Advisory locks: one command at a time changes a store, and one at a time works on a node.
 
 The store's (flock) names its holder; a node's is one octet of a file, taken by number.
 
-The kernel releases it when the holder ends, however it ends; what the file says of its holder counts only while the
-lock is held.
+The kernel releases it when the holder ends, however it ends; the holder's name in the file counts only while the lock
+is held.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _quoted = json.encoder.encode_basestring_ascii
 
 @lru_cache(maxsize=4)
 def _beside(home: Path, name: str) -> Path:
-    """The file of a home, made once: a run of steps takes the store six times."""
+    """Return the file of a home, made once: a run of steps takes the store six times."""
     return home / name
 
 
@@ -80,14 +80,14 @@ class _HeldFile(ABC):
         """Lock the open file, or raise."""
 
     def _release(self, descriptor: int) -> None:  # noqa: B027  a node's turn leaves nothing behind
-        """What is to be done before the file is closed, which unlocks it."""
+        """Do what is needed before the file is closed, which unlocks it."""
 
 
 class StoreLock(_HeldFile):
     """``with StoreLock(home, command="provision"):`` holds the store of ``home`` for one command.
 
-    Waits up to ``wait`` seconds; ``notice`` is told once, in one sentence, whom it waits for. Raises StoreLockedError
-    after that, StoreError where the file cannot be made. Not re-entrant: take it once, at the outside.
+    Waits up to ``wait`` seconds; ``notice`` receives one sentence with the holder's name. Raises StoreLockedError after
+    that, StoreError if the file cannot be made. Not re-entrant: take it once, at the outside.
     """
 
     def __init__(
@@ -135,11 +135,11 @@ class StoreLock(_HeldFile):
 
 
 class UsageLock(_HeldFile):
-    """``with Mark(path, command="measure hand") as mark:`` something is taken, for as long as this process lives.
+    """``with UsageLock(path, command="measure hand") as lock:`` uses something for as long as this process lives.
 
-    Does not wait: raises :class:`UsageLockTakenError`, which names the holder. Several may hold it together where each
-    takes it as ``shared``. ``left_behind`` says that the one before had no time to put its mark away (it was killed, or
-    the power failed).
+    Does not wait: raises :class:`UsageLockTakenError`, which names the holder. Several processes may hold it together
+    if each takes it as ``shared``. ``left_behind`` is true if the previous holder could not remove its mark (it was
+    killed, or the power failed).
     """
 
     def __init__(self, path: Path, *, command: str, shared: bool = False) -> None:
@@ -188,12 +188,12 @@ class UsageLock(_HeldFile):
 
     @property
     def is_taken_alone(self) -> bool:
-        """Whether somebody holds it now who shares it with nobody."""
+        """True if one process holds it now and does not share it."""
         return _held_by(self._path, shared=True) is not None
 
 
 class UsageLockTakenError(StoreLockedError):
-    """Somebody else holds a :class:`UsageLock`; ``holder`` names the process."""
+    """Another process holds a :class:`UsageLock`; ``holder`` names the process."""
 
     def __init__(self, message: str, holder: str) -> None:
         super().__init__(message, hint="Wait for it to finish, or stop it.")
@@ -205,7 +205,7 @@ def _signature(command: str) -> bytes:
 
 
 def holder_of(home: Path) -> str | None:
-    """Who holds the store of ``home`` now, in words; None where nobody does."""
+    """Describe the process that holds the store of ``home`` now; None if there is none."""
     return _held_by(home / FILE_NAME)
 
 
@@ -275,8 +275,8 @@ class _LockedOctet(_HeldFile):
 class NodeLock(_LockedOctet):
     """``with NodeLock(home, uuid):`` one command works on this node of the store, the next one waits for it.
 
-    Two nodes may share an octet: then they take turns, no more. Waits up to a minute; raises NodeBusyError after that,
-    StoreError where the file cannot be made.
+    Two nodes may share an octet; then they only take turns. Waits up to a minute; raises NodeBusyError after that,
+    StoreError if the file cannot be made.
     """
 
     def __init__(self, home: Path, uuid: bytes, *, notice: Callable[[str], object] | None = None) -> None:

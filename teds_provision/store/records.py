@@ -1,4 +1,4 @@
-"""What the store keeps, as frozen values: one class per table (store.md; profile.md).
+"""Rows of the store as frozen values: one class per table (store.md; profile.md).
 
 UUIDs are 10 octets, fingerprints 64 hex digits, points 65 octets (SEC 1 uncompressed), times ISO 8601 in UTC.
 """
@@ -61,10 +61,9 @@ class NodeRecord:
 
     ``state`` is that of Identify (0 factory, 1 keyed, 2 provisioned); ``can_address`` 1 to 239, 0 for none;
     ``teds_sha256`` is the digest (hex) of the Security TEDS last committed; ``channels`` counts TransducerChannels;
-    ``retired`` is a person's word that it is out of service;
-    ``due`` is the day (ISO 8601) on which the first calibration of its datasheet ends; ``charging`` what it last said
-    of its charge, JSON with the time ``at``, which nobody authenticated. ``profile`` is a name or the whole path of a
-    file, ``profile_digest`` (hex) what it said when the node's datasheet was made.
+    ``retired``: an operator took it out of service; ``due`` is the day (ISO 8601) on which the first calibration of its
+    datasheet ends; ``charging`` its last charge report, JSON with the time ``at``, unauthenticated. ``profile`` is a
+    name or the whole path of a file, ``profile_digest`` (hex) that of its content when the node's datasheet was made.
     """
 
     uuid: bytes
@@ -87,13 +86,13 @@ class NodeRecord:
 
 @dataclass(frozen=True, slots=True)
 class NodeReading:
-    """The one row that a node's verdict is judged from: what was read of it last, and what those octets say.
+    """Last reading of each node, from which its verdict is derived.
 
     ``at`` is when its TEDS were read, ``by`` the command that did; ``c`` (8 octets) that of the newest session with the
     node, None for a reading in no session. ``whole``: every TEDS that it lists was read, in a session since its last
     start; else the Security TEDS alone was, and the rest of ``digests`` is as it was read before. ``digests`` are
     channel u16 ‖ access code u8 ‖ SHA-256 of every TEDS, ascending. Then fields 101 to 104 of the Security TEDS (None
-    where it cannot be read, or nobody signed it), and ``checks``: those that no later change of trust can alter, JSON.
+    if it cannot be parsed, or is unsigned), and ``checks``: those that no later change of trust can alter, JSON.
     """
 
     uuid: bytes
@@ -110,12 +109,12 @@ class NodeReading:
 
     @property
     def in_session(self) -> bool:
-        """Whether the node is known to have said it: it was read in a session."""
+        """True if the node is known to have sent it: it was read in a session."""
         return self.c is not None
 
     @property
     def is_datasheet(self) -> bool:
-        """Whether a datasheet was read at all: the Security TEDS alone, which a plain contact shows, is none."""
+        """True if a datasheet was read; the Security TEDS alone, which a plain contact shows, is none."""
         return self.whole or self.c is not None
 
     @property
@@ -124,14 +123,14 @@ class NodeReading:
         return frozenset(name for name, result, *_ in json.loads(self.checks) if result == "failed")
 
     def is_of_this_start(self, c: bytes) -> bool:
-        """Whether a session with this c is of the same power-up of the node (profile.md, "Sessions")."""
+        """True if a session with this c is of the same power-up of the node (profile.md, "Sessions")."""
         if self.c is None:
             return False
         return (int.from_bytes(c, "big") - int.from_bytes(self.c, "big")) % (1 << 64) < 1 << 32
 
 
 class ExportEligibility(NamedTuple):
-    """Of one node, what says whether it may leave: its identity key with its seal, and whether it was retired."""
+    """What decides whether one node may leave: its identity key with its seal, and whether it was retired."""
 
     uuid: bytes
     point: bytes | None
@@ -140,7 +139,7 @@ class ExportEligibility(NamedTuple):
 
 
 class ExportedNode(NamedTuple):
-    """Of one node, what a bundle says beside its link key; as in :class:`NodeRecord`, with the groups that it is in."""
+    """What a bundle contains about a node beside its link key; as in :class:`NodeRecord`, with the node's groups."""
 
     uuid: bytes
     point: bytes | None
@@ -155,7 +154,8 @@ class ExportedNode(NamedTuple):
 class KeyRecord:
     """One link key of one node, wrapped by the vault; ``key_id`` is 16 hex digits (profile.md, "Key agreement").
 
-    ``slot`` tells apart keys of one node and epoch (see ``Store.next_slot``); ``seq`` is given by the store and grows.
+    ``slot`` distinguishes keys of one node and epoch (see ``Store.next_slot``); ``seq`` is given by the store and
+    grows.
     """
 
     uuid: bytes
@@ -184,8 +184,8 @@ class Draft:
 class DatasheetRecord:
     """A datasheet that a node had, as it was read or written.
 
-    ``sequence``, ``epoch`` and ``signed`` (ISO 8601, None for an unsigned one) are what its Security TEDS says;
-    ``digest`` is that of the image (64 hex digits), ``seen`` when it was read first.
+    ``sequence``, ``epoch`` and ``signed`` (ISO 8601, None for an unsigned one) come from its Security TEDS; ``digest``
+    is that of the image (64 hex digits), ``seen`` when it was read first.
     """
 
     uuid: bytes
@@ -202,9 +202,9 @@ class DatasheetRecord:
 class StationRecord:
     """What a station knows of itself: name, keystore, and the points (65 octets) and signature (64) of its key.
 
-    ``requested`` is the point for which a certificate was asked; ``point``, ``ca`` and ``signature`` come together when
-    init is complete. ``master`` is the number of the master key that wraps link keys, ``rewrapping`` the one that they
-    are being wrapped under anew. ``seal_key`` (wrapped by the vault) makes the MACs of rows.
+    ``requested`` is the point for which a certificate was requested; ``point``, ``ca`` and ``signature`` come together
+    when init is complete. ``master`` is the number of the master key that wraps link keys, ``rewrapping`` the number of
+    the next one during a change. ``seal_key`` (wrapped by the vault) makes the MACs of rows.
     """
 
     name: str
@@ -224,9 +224,9 @@ class StationRecord:
 class KeyFlags:
     """What holds for the keys of one node until something ends it.
 
-    ``ca``: P(CA) that it keeps, where that is not the owner's; ``next_ca`` the one that it keeps if the pending key
+    ``ca``: P(CA) that it keeps, if that is not the owner's; ``next_ca`` the one that it keeps if the pending key
     ``next_key_id`` turns out to be good; ``rotation``: why a rotation is due; ``former``: fingerprint of the board that
-    its link keys were agreed with, once its pin was let go.
+    its link keys were agreed with, after its pin was removed.
     """
 
     ca: bytes | None = None
@@ -254,15 +254,14 @@ COMMAND: Final = "command"
 class KeptMeasurement:
     """What the station measures after every start (operation.md section 7): a group, or nodes by UUID.
 
-    ``channels`` empty: every sensor. ``rate`` in Hz, None for what the datasheets say; ``kind`` None: as each channel
-    is. ``sinks`` are the strings that name files and topics; ``actuators`` says whether set points may come by them,
-    with a ``dead_man`` in ms. ``scalar_rate`` in Hz is that of topics of one value.
-    ``owner`` is ``ncap``, ``page``, ``api:TOKEN`` or :data:`COMMAND`; of a command ``pid`` is the process ID and
-    ``started`` the start of that process (unix seconds). ``ends`` is when (unix seconds), None for never.
-    ``test_pattern`` and ``unsigned`` as the options of ``measure``; ``require`` is the text of its ``--require`` file,
-    "" for none.
-    ``match`` is the expression of which nodes are taken in as they come (measure/matching.py), None for none;
-    ``frozen``: the nodes that are meant at its beginning stay, nobody joins and none is let go.
+    ``channels`` empty: every sensor. ``rate`` in Hz, None for that of the datasheets; ``kind`` None: as each channel
+    is. ``sinks`` are the strings that name files and topics; ``actuators``: set points may come by them, with a
+    ``dead_man`` in ms. ``scalar_rate`` in Hz is that of topics of one value. ``owner`` is ``ncap``, ``page``,
+    ``api:TOKEN`` or :data:`COMMAND`; of a command ``pid`` is the process ID and ``started`` the start of that process
+    (unix seconds). ``ends`` is when (unix seconds), None for never. ``test_pattern`` and ``unsigned`` as the options of
+    ``measure``; ``require`` is the text of its ``--require`` file, "" for none. ``match`` is the expression that
+    selects nodes as they come (measure/matching.py), None for none; ``frozen``: membership is fixed at the start; no
+    node joins or leaves.
     """
 
     id: str
@@ -322,7 +321,7 @@ class Handover:
 
 @dataclass(frozen=True)
 class Tombstone:
-    """A node given away: its key is used no more, and this says where it went."""
+    """A node given away: its key is no longer used; records the receiver."""
 
     uuid: bytes
     to_fingerprint: str
@@ -342,7 +341,7 @@ class Holder:
 
 @dataclass(frozen=True)
 class RevocationRecord:
-    """A node (by UUID, and by key where known) that is trusted no more; ``statement`` is the signed text."""
+    """A node (by UUID, and by key if known) that is no longer trusted; ``statement`` is the signed text."""
 
     uuid: bytes
     fingerprint: str | None

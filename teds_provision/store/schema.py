@@ -294,6 +294,9 @@ _STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
 
 
 def statements(before: int, to: int = SCHEMA_VERSION) -> list[str]:
-    """What brings a store of schema ``before`` (0: an empty file, else at least OLDEST_SCHEMA) to schema ``to``."""
+    """Return the statements that bring a store of schema ``before`` to schema ``to``.
+
+    ``before`` is 0 for an empty file, else at least OLDEST_SCHEMA.
+    """
     made = [] if before else list(_TABLES)
     return made + [statement for step in range(max(before, OLDEST_SCHEMA) + 1, to + 1) for statement in _STEPS_TO[step]]

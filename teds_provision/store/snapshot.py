@@ -26,7 +26,7 @@ _DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 class Relation(Enum):
-    """How a copy stands to the store it is held against, by their audit logs."""
+    """Relation of a copy to the store that it is compared with, by their audit logs."""
 
     SAME = "the same state"
     OLDER = "an older state"
@@ -73,13 +73,13 @@ def set_aside(home: Path) -> Path:
 
 
 def is_damage(failure: StoreError) -> bool:
-    """Say whether a store could not be used because its file is damaged (and not locked, newer or unreadable)."""
+    """True if a store could not be used because its file is damaged (and not locked, newer or unreadable)."""
     cause = failure.__cause__
     return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGE
 
 
 def relation(copy: Store, live: Store) -> Relation:
-    """Compare the audit logs of a copy and of a store: the one that goes on where the other ended is the newer."""
+    """Compare the audit logs of a copy and of a store: the one that goes on after the end of the other is the newer."""
     ours, theirs = live.audit.check(), copy.audit.check()
     if (ours.count, ours.head) == (theirs.count, theirs.head):
         return Relation.SAME

@@ -45,8 +45,8 @@ class Store(
 ):
     """Whitelist, nodes, wrapped keys, datasheets, drafts, trust, handovers, groups and the audit log of one station.
 
-    Every method is durable when it returns, and all of them raise StoreError (or StoreLockedError) where the file
-    cannot give or take what they ask. Several processes may have it open; a command that changes it holds a StoreLock.
+    Every method is durable when it returns, and all of them raise StoreError (or StoreLockedError) if the file fails.
+    Several processes may have it open; a command that changes it holds a StoreLock.
     """
 
     id: str
@@ -58,7 +58,7 @@ class Store(
 
     @classmethod
     def open(cls, home: Path, *, create: bool = False) -> Store:
-        """Open the store of ``home``; ``create`` makes it (and the directory) where it is missing.
+        """Open the store of ``home``; ``create`` makes it (and the directory) if it is missing.
 
         Raises StoreError: missing, damaged, of a newer version, not ours, no permission, no space.
         """
@@ -71,9 +71,9 @@ class Store(
 
     @classmethod
     def of_backup(cls, connection: sqlite3.Connection) -> Store:
-        """The store in a private database that a backup was unpacked to; an older schema is brought forward.
+        """Return the store in a private database that a backup was unpacked to; an older schema is migrated.
 
-        Raises BadDataError where it is damaged, StoreError. The connection stays open then.
+        Raises BadDataError if it is damaged, StoreError. The connection stays open then.
         """
         database = Database(Path("backup", FILE_NAME), connection)
         database.set_up(create=False)
@@ -91,12 +91,12 @@ class Store(
 
     @property
     def home(self) -> Path:
-        """The directory that the store lies in."""
+        """The directory of the store."""
         return self._home
 
     @property
     def frozen(self) -> StoreError | None:
-        """Why nothing can be written (the disk is full or read-only), None where it can."""
+        """Why nothing can be written (the disk is full or read-only), None if it can."""
         return self._database.frozen
 
     def close(self) -> None:
@@ -112,7 +112,7 @@ class Store(
         self.close()
 
     def transaction(self, *, later: bool = False) -> AbstractContextManager[None]:
-        """All of the block or nothing of it; may stand inside another one.
+        """Run all of the block or nothing of it; may be nested.
 
         ``later``: it is on the disk with the next one that is not, or after :meth:`flush`.
         """
@@ -144,7 +144,7 @@ class Store(
         return self._database.later
 
     def when_waiting(self, notice: Callable[[str], object]) -> None:
-        """Have ``notice`` told, in a sentence, when a change has to wait for another process."""
+        """Have ``notice`` receive a sentence when a change has to wait for another process."""
         self._database.notice = notice
 
     def version(self) -> int:

@@ -31,9 +31,9 @@ _REOPENINGS = 2
 _REPEATS = 5
 """How often a command that does no harm is sent again on a link that loses frames."""
 _TORN_REPEATS = 40
-"""Of one whose reply is torn: where 3 % are lost a long one loses a frame more often than not, and costs 20 ms."""
+"""Tries of a command whose reply is torn: with 3 % loss a long reply usually loses a frame; a try costs 20 ms."""
 _REPEATING_SECONDS = 60.0
-"""How long that goes on: a node that is there and answers nothing but Identify holds nobody up for ever."""
+"""Limit of that in seconds: a node that answers only Identify must not block the run."""
 _OPENING = "to open a session"
 
 _MEANING = {
@@ -77,11 +77,11 @@ _CURE = {
 
 
 HEARD = "Not verified: "
-"""What a refusal outside a session begins with: anyone on the link may have sent it."""
+"""First words about a refusal outside a session: any device on the link may have sent it."""
 
 
 def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefusedError:
-    """The error for a refusal of ``doing`` something; outside a session (not ``sealed``) it is a hint, and says so."""
+    """Return the error for a refusal of ``doing``; outside a session (not ``sealed``) it is marked as a hint."""
     heard = "The node refused" if sealed else f"{HEARD}the node refuses"
     try:
         known = Reason(reason if reason is not None else 0)
@@ -93,7 +93,7 @@ def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefu
 
 
 def is_busy(error: TedsProvisionError) -> bool:
-    """Whether a node refused because it is busy (17): time cures that, nothing else does."""
+    """True if a node refused because it is busy (17), which only time resolves."""
     return isinstance(error, NodeRefusedError) and error.reason == Reason.BUSY
 
 
@@ -102,7 +102,7 @@ _DISTURBED = (Reason.UNKNOWN_KEY, Reason.BAD_FORM, Reason.BAD_POINT)
 
 
 class SessionLostError(Exception):
-    """The session is gone at the node; ``cause`` is what to tell when opening a new one does not help."""
+    """The session is gone at the node; ``cause`` is the error to raise if re-opening fails."""
 
     def __init__(self, cause: TedsProvisionError) -> None:
         super().__init__(cause.message)
@@ -117,15 +117,15 @@ class Conversation:
         self.identity = contact.identity
         self.uuid = contact.identity.uuid
         self.proven: Identity | None = None
-        """What Identify said in the session that is open, None where it was not asked yet."""
+        """The Identify reply of the open session, None if it was not requested yet."""
         self.charging = contact.charging
-        """What its initial NFC message said of its charge, also where the conversation went on over another link."""
+        """The charge that its initial NFC message reported, also after the conversation moved to another link."""
         self._notice, self._busy_seconds = notice, busy_seconds
         self._key: bytes | None = None
         self._session: StationSession | None = None
         self._statics: tuple[bytes, ...] = ()
         self.open_counter: bytes | None = None
-        """c of the Open of this session, 8 octets: it tells whether the node has started anew since another one."""
+        """c of the Open of this session, 8 octets; a change shows that the node has restarted."""
         self._release: Callable[[], object] = _nothing
 
     def __enter__(self) -> Conversation:
@@ -141,17 +141,17 @@ class Conversation:
 
     @property
     def tapped(self) -> bool:
-        """Whether commands of this conversation arrive over NFC."""
+        """True if commands of this conversation arrive over NFC."""
         return self.contact.link.capabilities.tapped
 
     @property
     def wired(self) -> bool:
-        """Whether the node hangs on a wired bus."""
+        """True if the node is on a wired bus."""
         return self.contact.link.capabilities.wired
 
     @property
     def sealed(self) -> bool:
-        """Whether a session is open."""
+        """True if a session is open."""
         return self._session is not None
 
     @property
@@ -167,7 +167,7 @@ class Conversation:
 
         Raises NodeRefusedError (16: unknown key) or NotAuthenticError (wrong node tag).
 
-        ``statics``: P(station) and P(node), where they are at hand; the node's one-time key is neither.
+        ``statics``: P(station) and P(node), if they are at hand; the node's one-time key is neither.
         """
         self._statics = statics or self._statics
         session, reply = self._open(key)
@@ -180,7 +180,7 @@ class Conversation:
         self._session, self._key, self.open_counter = session, key, session.open_counter
 
     def _open(self, key: bytes) -> tuple[StationSession, Reply]:
-        """Ask for c and send one Open; each has a one-time key of its own."""
+        """Request c and send one Open; each has a one-time key."""
         session = StationSession(key, self.uuid, statics=self._statics)
         return session, self._exchange(session.open(self.request_plain(session.request_counter(), _OPENING)))
 
@@ -204,7 +204,7 @@ class Conversation:
         self.open(key)
 
     def forget(self) -> None:
-        """The node ended the session (Confirm, Reset): go on plain."""
+        """Drop the session, which the node has ended (Confirm, Reset), and go on in plain."""
         self._session = self._key = self.proven = None
 
     def leave(self) -> None:
@@ -228,9 +228,9 @@ class Conversation:
         return reply.payload
 
     def request(self, command: Command, doing: str, *, within: float | None = None) -> bytes:
-        """Send sealed where a session is open, else plain. Raises SessionLostError where the session is gone.
+        """Send sealed if a session is open, else plain. Raises SessionLostError if the session is gone.
 
-        ``within``: seconds after which what it orders is of no use; it is given up then (NodeSilentError).
+        ``within``: seconds after which the order is of no use; then it is abandoned (NodeSilentError).
         """
         session = self._session
         if session is None:
@@ -263,9 +263,9 @@ class Conversation:
         return self.request(command, doing)
 
     def request_idempotent(self, command: Command, doing: str) -> bytes:
-        """Send a command that may be repeated without harm, over a new session where the old one was lost.
+        """Send an idempotent command, over a new session if the old one was lost.
 
-        One that the node was too busy for is given up: a new session would meet the same node.
+        A command is abandoned if the node was too busy for it: a new session would meet the same node.
         """
         reopenings = repeats = torn = 0
         until = time.monotonic() + _REPEATING_SECONDS
@@ -289,13 +289,13 @@ class Conversation:
 
     @property
     def _is_noisy(self) -> bool:
-        """Whether commands and replies go through nothing but the checksums of single frames: a bus."""
+        """True if only the checksums of single frames protect commands and replies: a bus."""
         return self.contact.link.capabilities.many
 
     def lives(self) -> bool:
-        """Whether a node that a message did not reach still answers: on a bus single frames are lost, nodes are not.
+        """True if a node that a message did not reach still answers: on a bus single frames are lost, nodes are not.
 
-        Never True at a reader: what is not answered there has left the field.
+        Never True at a reader: a node that does not answer there has left the field.
         """
         if not self._is_noisy:
             return False

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _SHOWN = 5
 _TRY_SECONDS = 1.5
-"""So long a node is looked for where it was met last before a tap is waited for: an answer of everyone, and a spare."""
+"""Seconds to search the last known bus before waiting for a tap (one broadcast round plus margin)."""
 
 
 @contextmanager
@@ -47,13 +47,12 @@ def meet(
     *,
     before: Callable[[], object] = lambda: None,
 ) -> Iterator[Conversation]:
-    """Wait for node ``uuid`` (None: any node) on the chosen link and give a conversation with it.
+    """Wait for node ``uuid`` (None: any node) on the chosen link and yield a conversation with it.
 
-    Of several nodes on a bus that is the one which is not finished yet. ``before`` is called when the link is open and
-    nothing is waited for yet: the time to ask for a passphrase. Where nobody said which link, ``uuid`` is looked for on
-    the buses that are named beside, else on the one where it was met last, and then waited for at the reader. Raises
-    NoReaderError, NoNodeError after ``links.timeout`` seconds, AddressConflictError, UsageError where several could be
-    meant.
+    Of several nodes on a bus it selects the only one that is not finished yet. ``before`` is called when the link is
+    open and the wait has not begun: the time to ask for a passphrase. If no link was chosen, ``uuid`` is searched on
+    the buses that are named, else on the one where it was met last, and then at the reader. Raises NoReaderError,
+    NoNodeError after ``links.timeout`` seconds, AddressConflictError, UsageError if several nodes qualify.
     """
     if uuid is None:
         port = open_port(links)
@@ -109,9 +108,9 @@ def _met_somewhere(
     reporter: Reporter,
     before: Callable[[], object],
 ) -> Conversation:
-    """Meet a node where it may be: a short look at each of the places that are known, then a tap.
+    """Meet a node where it may be: a short search at each known place, then a tap.
 
-    Without a reader nobody can tap, and the first of the places has all the time that is left.
+    Without a reader there is no tap, and the first place gets all the remaining time.
     """
     asked = False
 
@@ -146,9 +145,9 @@ def _met_somewhere(
 
 
 def likely_places(station: Station, links: LinkSettings, uuids: Sequence[bytes]) -> tuple[str, ...]:
-    """Where nodes may be if nobody said which link is meant: the buses that are named beside, else where each was last.
+    """Return where nodes may be if no link was chosen: the named buses, else the place of each node's last contact.
 
-    Places are ``LINK:WHERE``; none where somebody said, or where nothing is known.
+    Places are ``LINK:PORT``; empty if a link was chosen, or if none is known.
     """
     if not links.is_open:
         return ()
@@ -156,7 +155,7 @@ def likely_places(station: Station, links: LinkSettings, uuids: Sequence[bytes])
 
 
 def _no_link(station: Station, uuid: bytes, error: NoReaderError) -> NoReaderError:
-    """The error where no link is named, so that a reader is looked for, and there is none."""
+    """Return the error for a missing reader if no link was named, which selects the reader."""
     known = station.nodes.get(uuid)
     met = known is not None and known.can_address
     last = f" It was last met on a CAN bus, at address 0x{known.can_address:02X}." if known and met else ""
@@ -167,16 +166,16 @@ def _no_link(station: Station, uuid: bytes, error: NoReaderError) -> NoReaderErr
 
 
 def likely_address(station: Station, uuid: bytes) -> int:
-    """The CAN address to look for a node first: where it was last met, else its own default address. A hint."""
+    """Return the CAN address to try first: that of the last contact, else the node's default. A hint only."""
     known = station.nodes.get(uuid)
     return known.can_address if known is not None and known.can_address else default_can_address(uuid)
 
 
 def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
-    """Keep off the source address from which a process of this station measures the node.
+    """Avoid the source address from which a process of this station measures the node.
 
-    A session belongs to a pair of addresses: another one from here would end that one's. Where none was named the next
-    free one is taken; raises StoreLockedError where one was, or none is free.
+    A session belongs to a pair of addresses: another one from here would end it. Without a named address the next free
+    one is used; raises StoreLockedError if the named one is in use, or none is free.
     """
     if port.via != "can" or not hasattr(port, "spec") or not station.measurements.is_running(uuid):
         return
@@ -208,9 +207,9 @@ def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conv
 
 
 def drop_duplicate_uuids(contacts: list[Contact], notice: NoticeSink) -> list[Contact]:
-    """Those whose UUID answers at one address alone; anybody can copy a UUID, so it costs that node and no other.
+    """Return the contacts whose UUID answers at one address only; a copied UUID must cost no other node.
 
-    ``notice`` is told of the rest; raises AddressConflictError where nothing is left.
+    ``notice`` receives the dropped ones; raises AddressConflictError if none is left.
     """
     same: dict[bytes, list[Contact]] = {}
     for contact in contacts:
@@ -226,7 +225,7 @@ def drop_duplicate_uuids(contacts: list[Contact], notice: NoticeSink) -> list[Co
 
 
 def refuse_duplicate_uuids(contacts: list[Contact]) -> list[Contact]:
-    """The contacts as they are; raises AddressConflictError where one UUID answers at two addresses."""
+    """Return the contacts unchanged; raises AddressConflictError if one UUID answers at two addresses."""
     seen: dict[bytes, Contact] = {}
     for contact in contacts:
         twin = seen.setdefault(contact.identity.uuid, contact)
@@ -241,7 +240,7 @@ def refuse_duplicate_uuids(contacts: list[Contact]) -> list[Contact]:
 
 
 def pick_single_node(station: Station, contacts: list[Contact]) -> Contact:
-    """The only node, or the only one that is not provisioned and verified yet."""
+    """Return the only contact, or the only one that is not provisioned and verified yet."""
     refuse_duplicate_uuids(contacts)
     unfinished = [contact for contact in contacts if not _finished(station, contact.identity)]
     for choice in (contacts, unfinished):
@@ -266,9 +265,9 @@ def _finished(station: Station, identity: Identity) -> bool:
 
 
 def continue_over_ble(links: LinkSettings, notice: NoticeSink) -> Callable[[Conversation], None] | None:
-    """How to go on once a key is agreed on: where both ``--nfc`` and ``--ble`` are named, over BLE; None where not.
+    """Return how to continue over BLE after the agreement if ``--nfc`` and ``--ble`` are both named, else None.
 
-    What is returned raises NoReaderError, NoNodeError (it does not advertise, or is out of reach), LinkError.
+    The returned function raises NoReaderError, NoNodeError (it does not advertise, or is out of reach), LinkError.
     """
     place = links.onward
     if place is None:
@@ -302,7 +301,7 @@ _END_SECONDS = 5.0
 
 @dataclass(frozen=True)
 class Arrival(Generic[Result]):
-    """One node that came: the result of the work, or the error that ended it; where it came, seconds it took."""
+    """One arrived node: the result of the work or the error that ended it, its place, and the seconds it took."""
 
     uuid: bytes
     place: str
@@ -322,7 +321,10 @@ class IdleStop(threading.Event):
         self.renew()
 
     def request_stop(self) -> None:
-        """Say stop from a signal handler: takes no lock, which the interrupted thread may hold; seen within 0.2 s."""
+        """Request the stop from a signal handler; seen within 0.2 s.
+
+        Takes no lock, since the interrupted thread may hold it.
+        """
         self._asked = True
 
     def renew(self) -> None:
@@ -348,14 +350,14 @@ class IdleStop(threading.Event):
 
     @property
     def ran_out(self) -> bool:
-        """Whether the time is over, and not somebody said stop."""
+        """True if the time is over, rather than a stop requested."""
         return self._is_over() and not self._asked and not super().is_set()
 
     def _is_over(self) -> bool:
         return not self._busy and self._until is not None and time.monotonic() >= self._until
 
     def is_set(self) -> bool:
-        """Whether somebody said stop, or the time is over."""
+        """True if a stop was requested, or the time is over."""
         return self._asked or super().is_set() or self._is_over()
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -372,11 +374,10 @@ class IdleStop(threading.Event):
 def watch_nodes(
     links: LinkSettings, work: Callable[[Conversation], Result], reporter: Reporter, stop: threading.Event
 ) -> Iterator[Arrival[Result]]:
-    """Do ``work`` with every node that comes on the chosen links; yields how each of them ended.
+    """Do ``work`` with every node that comes on the chosen links; yield how each of them ended.
 
-    Debounced (one visit, one result); goes on when a reader is unplugged and plugged in again. Several readers serve
-    several taps at once, each in a thread of its own. Raises NoReaderError only where one cannot be opened at the
-    start.
+    Debounced (one visit, one result); continues when a reader is unplugged and plugged in again. Several readers serve
+    several taps at once, each in a thread. Raises NoReaderError only if a reader cannot be opened at the start.
     """
     ports = open_ports(links)
     try:

@@ -1,4 +1,4 @@
-"""What a workflow tells while it runs: steps with their time, and what is waited for."""
+"""Progress of a running workflow: steps with their time, and what it waits for."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SKIPPED = "skipped"
 class StepResult:
     """One step: ``result`` is "done", "nothing to do" or "skipped"; ``detail`` one short sentence for people.
 
-    ``of`` names the node where several are worked on at once.
+    ``of`` names the node if several are worked on at once.
     """
 
     name: str
@@ -30,13 +30,13 @@ class StepResult:
 
 
 class Reporter(Protocol):
-    """Where progress goes."""
+    """Receiver of progress."""
 
     def started(self, step: str) -> None:
-        """A step begins."""
+        """Report the start of a step."""
 
     def finished(self, step: StepResult) -> None:
-        """A step ended well."""
+        """Report a step that ended well."""
 
     def notice(self, notice: Notice) -> None:
         """Something is waited for, or came by."""
@@ -46,33 +46,33 @@ class Reporter(Protocol):
 
 
 class SilentReporter:
-    """A reporter that tells nothing."""
+    """A reporter without output."""
 
     def started(self, step: str) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def finished(self, step: StepResult) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def notice(self, notice: Notice) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def written(self, octets: int, total: int) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
 
 class NodeReporter:
-    """A reporter for one of several nodes that are worked on at once: what it tells names that node."""
+    """A reporter for one of several nodes that are worked on at once: its messages name that node."""
 
     def __init__(self, inner: Reporter, label: str) -> None:
         self._inner, self._label = inner, label
 
     def started(self, step: str) -> None:
-        """A step begins."""
+        """Report the start of a step."""
         self._inner.started(step)
 
     def finished(self, step: StepResult) -> None:
-        """A step of this node ended well."""
+        """Report a step of this node that ended well."""
         self._inner.finished(replace(step, of=self._label))
 
     def notice(self, notice: Notice) -> None:
@@ -86,7 +86,7 @@ class NodeReporter:
 
 @dataclass
 class Steps:
-    """The steps of one run, told as they happen."""
+    """The steps of one run, reported as they happen."""
 
     reporter: Reporter
     done: list[StepResult] = field(default_factory=list)

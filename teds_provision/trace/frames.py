@@ -14,7 +14,7 @@ _FLOWS = ("go on", "wait", "overflow")
 
 
 def can_words(identifier: int, data: bytes) -> str:
-    """What a frame of the profile is; "not of the profile" for any other. Never raises."""
+    """Describe a frame of the profile; "not of the profile" for any other. Never raises."""
     ends = addresses(identifier)
     if ends is not None:
         return f"{ends[1]:02x} to {ends[0]:02x}: {_transport(data)}"
@@ -33,7 +33,7 @@ def can_words(identifier: int, data: bytes) -> str:
 
 
 def _transport(data: bytes) -> str:
-    """The ISO 15765-2 part of a frame; transactions are the first octet of the profile's messages."""
+    """Describe the ISO 15765-2 part of a frame; transactions are the first octet of the profile's messages."""
     if not data:
         return "empty"
     kind, low = data[0] >> 4, data[0] & 0xF
@@ -58,7 +58,7 @@ _ANSWER_OCTETS: Final = 16
 
 
 def nfc_words(octets: bytes, direction: Direction) -> str:
-    """What a frame is, as far as one frame says it (a Type 2 page and a block may begin alike). Never raises."""
+    """Describe a frame by its own octets (a Type 2 page and a block may begin alike). Never raises."""
     if not octets:
         return "empty"
     return (_asked(octets) if direction == "out" else _answered(octets)) or _of_iso_dep(octets, direction)

@@ -2,8 +2,7 @@
 
 Three interfaces, by link type: CAN frames (227, SocketCAN: identifier and flags u32 big-endian, length, FD flags, two
 octets reserved, data), NFC frames (264, ISO 14443: version 0, event, length u16 big-endian, data without its CRC), and
-messages and all else (147, user 0: the octets as they went). What is opened and what it is stand
-as comments of the packet.
+messages and all else (147, user 0: the octets as sent). The opened form and its description are comments of the packet.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _LINK: Final = "link: "
 
 
 def head() -> bytes:
-    """The section header and the three interfaces."""
+    """Return the section header and the three interfaces."""
     section = struct.pack("<IHHq", _ORDER, 1, 0, -1) + _option(_APPLICATION, f"teds-provision {__version__}".encode())
     octets = _block(_SECTION, section + _option(_END))
     for link_type, name in _INTERFACES:
@@ -59,7 +58,7 @@ def block(record: Record) -> bytes:
 
 
 def is_pcapng(octets: bytes) -> bool:
-    """Whether a file begins as pcapng does."""
+    """True if a file begins as pcapng does."""
     return octets[:4] == _SECTION.to_bytes(4, "big") and len(octets) >= 12
 
 
@@ -97,7 +96,7 @@ def _blocks(octets: bytes) -> Iterator[tuple[int, str, int, bytes]]:
 
 
 def _framed(record: Record) -> tuple[int, bytes]:
-    """Number of the interface, and the packet with the head of its link type."""
+    """Return the number of the interface, and the packet with the head of its link type."""
     data = record.octets
     if record.layer == "message" or (record.identifier is None and record.link != "nfc"):
         return 2, data

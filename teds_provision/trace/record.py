@@ -20,9 +20,9 @@ Layer = Literal["frame", "message"]
 class Record:
     """A frame or a message.
 
-    ``time`` in unix seconds; ``octets`` as they went (sealed messages sealed); ``opened`` the plain command or reply of
-    a sealed one, None where it was not opened; ``identifier`` and ``fd`` of a CAN frame; ``uuid`` of the node, where it
-    is known; ``command`` what it is, in words.
+    ``time`` in unix seconds; ``octets`` as sent (sealed messages sealed); ``opened`` the plain command or reply of a
+    sealed one, None if it was not opened; ``identifier`` and ``fd`` of a CAN frame; ``uuid`` of the node, if it is
+    known; ``command`` a description.
     """
 
     time: float
@@ -38,7 +38,7 @@ class Record:
     uuid: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in a file of lines and in ``trace show --json``; what does not apply is left out."""
+        """Return the record as in a file of lines and in ``trace show --json``, without members that do not apply."""
         told: dict[str, Any] = {
             "time": datetime.fromtimestamp(self.time, UTC).isoformat(timespec="microseconds").replace("+00:00", "Z"),
             "direction": self.direction,
@@ -63,7 +63,7 @@ FORMAT: Final = "teds-trace/1"
 
 
 def head() -> bytes:
-    """The first line."""
+    """Return the first line."""
     return json.dumps({"format": FORMAT, "made_by": f"teds-provision {__version__}"}).encode() + b"\n"
 
 
@@ -73,7 +73,7 @@ def line(record: Record) -> bytes:
 
 
 def is_lines(octets: bytes) -> bool:
-    """Whether a file begins as a trace of lines does."""
+    """True if a file begins as a trace of lines does."""
     return octets[:64].lstrip().startswith(b'{"format": "' + FORMAT.encode())
 
 

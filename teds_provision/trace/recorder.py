@@ -23,9 +23,9 @@ PCAPNG = ".pcapng"
 
 
 def open_trace(path: Path, tell: Callable[[str], None]) -> Recorder:
-    """Make the file of a trace, mode 0600, never over another one; ``tell`` hears of a disk that takes no more.
+    """Make the file of a trace, mode 0600, never over another one; ``tell`` receives the notice about a full disk.
 
-    Raises UsageError where something lies at ``path``, NotFoundError where its folder is missing, else StoreError.
+    Raises UsageError if ``path`` exists, NotFoundError if its folder is missing, else StoreError.
     """
     require_new(path)
     try:
@@ -40,7 +40,10 @@ def open_trace(path: Path, tell: Callable[[str], None]) -> Recorder:
 
 
 class Recorder:
-    """An open trace; see ``links.ports.Trace``. Thread-safe. ``failure`` is why it is not whole, "" where it is."""
+    """An open trace; see ``links.ports.Trace``. Thread-safe.
+
+    ``failure`` is why it is incomplete, "" if it is complete.
+    """
 
     def __init__(self, path: Path, descriptor: int, tell: Callable[[str], None]) -> None:
         self.path, self.failure = path, ""
@@ -62,7 +65,10 @@ class Recorder:
         fd: bool = False,
         at: float | None = None,
     ) -> None:
-        """A frame as the link carried it; ``at`` is its arrival in seconds of ``time.monotonic()``, None for now."""
+        """Record a frame as the link carried it.
+
+        ``at`` is its arrival in seconds of ``time.monotonic()``, None for now.
+        """
         moment = time.time() - (0.0 if at is None else time.monotonic() - at)
         words = can_words(identifier, octets) if identifier is not None else ""
         words = nfc_words(octets, direction) if link in ("nfc", "pcsc") else words
@@ -79,14 +85,14 @@ class Recorder:
         sealed: bool = False,
         opened: bytes | None = None,
     ) -> None:
-        """A whole command or reply, with what it says in words, and its plain form where it was sealed."""
+        """Record a whole command or reply with its description, and its plain form if it was sealed."""
         told = f"{words}, not opened" if sealed and opened is None else words
         self._put(
             Record(time.time(), direction, link, "message", octets, told, opened=opened, sealed=sealed, uuid=uuid.hex())
         )
 
     def close(self, *, keep_empty: bool = True) -> None:
-        """End the trace; never raises. Without ``keep_empty`` a file in which no frame stands is taken away."""
+        """End the trace; never raises. Without ``keep_empty`` a file without a frame is removed."""
         with self._lock:
             if self._descriptor >= 0:
                 if self.is_empty and not keep_empty:
@@ -122,9 +128,9 @@ _HEAD_OCTETS: Final = 64
 
 
 def read_trace(path: Path) -> Iterator[Record]:
-    """Every record of a file.
+    """Yield every record of a file.
 
-    Raises NotFoundError, and BadDataError if it is no trace (told before the first record).
+    Raises NotFoundError, and BadDataError if it is no trace (before the first record).
     """
     with open_to_read(path) as file:
         octets = file.read(_HEAD_OCTETS)

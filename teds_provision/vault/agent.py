@@ -39,28 +39,28 @@ _ANSWER_SECONDS: Final = 3.0
 
 
 def held(home: Path, kind: str) -> bytes | None:
-    """What opens the vault of this kind, None where nobody holds it open."""
+    """Return the secret that opens the vault of this kind, None if no agent holds it."""
     answer = _ask(home, SECRET)
     return answer[1:] if answer[:1] == KINDS[kind] and len(answer) > 1 else None
 
 
 def seconds_left(home: Path) -> int | None:
-    """How long the vault is still held open, None where it is not."""
+    """Return for how many more seconds the vault stays open, None if it is not open."""
     answer = _ask(home, TIME)
     return struct.unpack(">I", answer)[0] if len(answer) == 4 else None
 
 
 def lock(home: Path) -> bool:
-    """Have the secret wiped and the process end; False where there was none."""
+    """Wipe the agent's secret and end its process; False if there was none."""
     there = seconds_left(home) is not None
     _ask(home, END)
     return there
 
 
 def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
-    """Hold ``secret`` for so many seconds, in a process of its own; one that is there ends first.
+    """Hold ``secret`` for the given number of seconds in a separate process; a running agent ends first.
 
-    Raises VaultError where this system has no such sockets, or the process does not come up.
+    Raises VaultError if this system has no such sockets, or the process does not start.
     """
     if not hasattr(socket, "SO_PEERCRED"):
         raise VaultError("unlock requires Linux: this system does not identify the peer of a socket.")
@@ -92,7 +92,7 @@ def start(home: Path, kind: str, secret: bytes, seconds: int) -> None:
 
 
 def _ask(home: Path, request: bytes) -> bytes:
-    """The whole answer; empty where nobody of this user's own listens."""
+    """Return the whole answer; empty if no process of this user listens."""
     path = home / SOCKET
     if not path.is_socket() or not hasattr(socket, "SO_PEERCRED"):
         return b""
@@ -109,7 +109,7 @@ def _ask(home: Path, request: bytes) -> bytes:
 
 
 def user_at(line: socket.socket) -> int:
-    """The uid of the process at the other end, as the kernel noted it (socket(7), SO_PEERCRED)."""
+    """Return the uid of the process at the other end, as the kernel recorded it (socket(7), SO_PEERCRED)."""
     _, uid, _ = struct.unpack("3i", line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))
     return int(uid)
 
@@ -161,7 +161,7 @@ class LockedPage:
         self._length = 0
         address = ctypes.addressof(ctypes.c_char.from_buffer(self._memory))
         self.locked = ctypes.CDLL(None).mlock(ctypes.c_void_p(address), ctypes.c_size_t(mmap.PAGESIZE)) == 0
-        """Whether it stays out of the swap: a limit of the system may forbid that (ulimit -l)."""
+        """True if the page stays out of swap; a system limit may forbid that (ulimit -l)."""
         for advice in ("MADV_DONTDUMP", "MADV_DONTFORK"):
             with suppress(OSError, AttributeError):
                 self._memory.madvise(getattr(mmap, advice))
@@ -175,7 +175,7 @@ class LockedPage:
                 raise ValueError("longer than any secret")
 
     def view(self) -> memoryview:
-        """The secret, where it lies."""
+        """Return the secret in place, without copying it."""
         return memoryview(self._memory)[: self._length]
 
     def wipe(self) -> None:
@@ -185,7 +185,7 @@ class LockedPage:
 
 
 def serve(listener: socket.socket, page: LockedPage, until: float) -> None:
-    """Answer this user's commands until the time is over, or one says to end; the page is wiped then."""
+    """Answer this user's commands until the time is over or one asks to end; then wipe the page."""
     try:
         while (left := until - _now()) > 0:
             if select.select([listener], [], [], min(left, _LOOK_SECONDS))[0]:
@@ -198,7 +198,7 @@ def serve(listener: socket.socket, page: LockedPage, until: float) -> None:
 
 
 def _answer(line: socket.socket, page: LockedPage, until: float) -> bool:
-    """Serve one command; False where the secret is to go."""
+    """Serve one command; return False if the secret has to be wiped."""
     line.settimeout(_CLIENT_SECONDS)
     if user_at(line) != os.geteuid():
         return True

@@ -1,4 +1,4 @@
-"""What every vault can do: give the station's keys, and wrap node keys under its one master key."""
+"""The interface of every vault: give the station's keys, and wrap node keys under its master key."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from teds_provision.vault.master import MasterKeys
 
 Ask = Callable[[str, bool], str]
-"""``ask(prompt, confirm)`` returns a passphrase or PIN; raises where nobody can be asked."""
+"""``ask(prompt, confirm)`` returns a passphrase or PIN; raises if there is no terminal to ask at."""
 
 SERVICE = "teds-provision"
 LAST_ATTEMPT = "last attempt before it locks"
@@ -20,11 +20,11 @@ LAST_ATTEMPT = "last attempt before it locks"
 
 
 class Vault(Protocol):
-    """Where the secrets of one station lie. All methods raise VaultError or a leaf below it.
+    """Store of one station's secrets. All methods raise VaultError or a leaf below it.
 
-    What changes the vault reads first what lies there now, and makes what it writes from that: the caller holds the
-    store's lock, and a copy from before the lock decides nothing. It raises VaultChangedError where the passphrase (or
-    PIN) that opened this one is not the vault's any more.
+    A change of the vault first rereads its current content and starts from that: the caller holds the store's lock, and
+    a copy from before the lock decides nothing. It raises VaultChangedError if the passphrase (or PIN) that opened this
+    one is no longer the vault's.
     """
 
     @property
@@ -33,7 +33,7 @@ class Vault(Protocol):
 
     @property
     def description(self) -> str:
-        """What it is, for people: for example the keyring's name or the path of the file."""
+        """A description for people: for example the keyring's name or the path of the file."""
 
     def identity(self) -> PrivateKey:
         """Return the station's identity key."""
@@ -54,17 +54,17 @@ class Vault(Protocol):
         """Add a master key durably; it wraps from now on. First step of a change."""
 
     def retire_masters(self) -> None:
-        """Forget all master keys but the newest, durably. Last step of a change, once every key is wrapped anew."""
+        """Delete all master keys but the newest, durably. Last step of a change, after every key was wrapped again."""
 
     def new_passphrase(self, ask: Ask) -> Callable[[], None]:
-        """Ask for another passphrase (or PIN), with no lock held; what is returned sets it durably, under the lock.
+        """Ask for another passphrase (or PIN), with no lock held, and return a function that sets it.
 
-        The keys stay. ``ask`` is called for the new one, and before it for the old one where the vault has to give it
-        on. Raises VaultError where another program does that.
+        That function writes durably, under the lock. The keys stay. ``ask`` is called for the new one, and before it
+        for the old one if the vault needs it. Raises VaultError if another program manages the passphrase.
         """
 
     def refresh(self) -> bool:
-        """Take in what another process has written since; False where nothing was. Nobody is asked."""
+        """Take in changes of other processes without asking; False if there were none."""
 
     def reread(self) -> None:
         """Read the master keys again with what this process has opened already, for a process that runs for long.
@@ -80,9 +80,10 @@ class Vault(Protocol):
         """Use these master keys from now on, in this process alone: nothing is written."""
 
     def opener(self) -> bytes:
-        """What opens this vault without asking, for an agent (``unlock``): the key of a passphrase file.
+        """Return the secret that opens this vault without asking, for an agent (``unlock``).
 
-        Empty where only the passphrase or PIN itself would do, or where nothing is asked for.
+        It is the key of a passphrase file. Empty if only the passphrase or PIN itself would do, or if the vault asks
+        for nothing.
         """
 
     def export_ca(self, path: Path, passphrase: str) -> None:
@@ -92,7 +93,7 @@ class Vault(Protocol):
         """
 
     def drop_ca(self) -> bool:
-        """Take the CA key out of the vault for good; False if there is none."""
+        """Delete the CA key from the vault; False if there is none."""
 
     def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
         """Take in the CA key that :meth:`export_ca` wrote, and return it.
@@ -102,7 +103,7 @@ class Vault(Protocol):
         """
 
     def secret_material(self) -> str:
-        """Return what a sealed backup has to hold so that this vault can be made again. Whoever calls it seals it."""
+        """Return what a sealed backup needs to recreate this vault. The caller seals it."""
 
 
 def node_key_context(store_id: str, uuid: bytes, epoch: int, slot: int) -> bytes:
@@ -112,6 +113,6 @@ def node_key_context(store_id: str, uuid: bytes, epoch: int, slot: int) -> bytes
 
 @lru_cache(maxsize=4)
 def _of_store(store_id: str) -> bytes:
-    """What is the same for all keys of a store, of which there may be ten thousand."""
+    """Return the part of the context that all keys of a store share; there may be ten thousand."""
     identifier = store_id.encode()
     return b"TEDS1 wrapped key\0" + len(identifier).to_bytes(2, "big") + identifier

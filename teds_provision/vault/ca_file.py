@@ -18,7 +18,7 @@ from teds_provision.vault.passphrase import check_new
 
 ROUNDS: Final = 600_000
 MAX_ROUNDS: Final = 10_000_000
-"""Some seconds: the number stands in a file that nobody has vouched for yet."""
+"""Some seconds of work: the number comes from a file that is not verified yet."""
 _MAX_OCTETS: Final = 16 * 1024
 _LABEL: Final = "ENCRYPTED PRIVATE KEY"
 # DER of the object identifiers, tag and length included (RFC 8018 appendix C, RFC 3565).
@@ -90,7 +90,7 @@ def _check_costs(path: Path, pem: bytes) -> None:
 
 
 def _rounds(parameters: bytes) -> int:
-    """The iteration count of PBKDF2-params (RFC 8018 appendix A.2); 0 where it is none."""
+    """Return the iteration count of PBKDF2-params (RFC 8018 appendix A.2); 0 if it is malformed."""
     try:
         salt = 2 if parameters[1] < 0x80 else 2 + (parameters[1] & 0x7F)
         if parameters[0] != _SEQUENCE or parameters[salt] != _OCTETS or parameters[salt + 1] >= 0x80:

@@ -31,7 +31,7 @@ class FileVault(SoftwareVault):
         self._store_id = store_id
         self._key = key
         self._content = content
-        """The file as this process read or wrote it, still sealed: tells whether it is another one by now."""
+        """The file as this process last read or wrote it, still sealed; detects a change by another process."""
 
     @classmethod
     def create(
@@ -79,7 +79,7 @@ class FileVault(SoftwareVault):
         return cls(path, store_id, _material(plaintext), key, content)
 
     def opener(self) -> bytes:
-        """What opens this file without its passphrase, as long as that stays: for an agent that the user started."""
+        """Return the secret that opens this file while its passphrase stays: for an agent that the user started."""
         return self._key.salt + self._key.key
 
     def new_passphrase(self, ask: Ask, *, costs: Costs = PRODUCT) -> Callable[[], None]:

@@ -2,7 +2,7 @@
 
 A wrapped key is version u8 (1) ‖ number of the master key u32 ‖ nonce (12) ‖ ciphertext and tag (16), AES-256-GCM with
 the first five octets and the context as associated data. Numbers let a new master key come in before the old one goes:
-add it, wrap every key anew in one transaction of the store, retire the old.
+add it, wrap every key with it in one transaction of the store, retire the old one.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class MasterKeys:
             ) from None
 
     def _cipher(self, number: int) -> AESGCM:
-        """The cipher of one master key, made once: a handover opens ten thousand keys."""
+        """Return the cipher of one master key, cached because a handover opens ten thousand keys."""
         if number not in self._ciphers:
             self._ciphers[number] = AESGCM(self.keys[number])
         return self._ciphers[number]
@@ -141,7 +141,7 @@ def _octets(text: str) -> bytes:
 
 
 def another_life() -> VaultError:
-    """The error where two backups of one station gave one number to different master keys."""
+    """Return the error for two backups of one station that give one number to different master keys."""
     return VaultError(
         "The vault and the backup are of one station, but each has another master key of the same number: "
         "the vault was restored from an older backup, and vault rewrap was run there since.",

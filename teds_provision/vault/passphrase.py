@@ -1,7 +1,7 @@
 """Sealing under a passphrase: Argon2id (RFC 9106) and AES-256-GCM.
 
-The product's costs are 64 MiB, 3 passes, 4 lanes (RFC 9106 section 4, second recommended option). They stand in the
-sealed object, so they can grow; what is read is bounded, so that a forged object cannot exhaust the machine.
+The product's costs are 64 MiB, 3 passes, 4 lanes (RFC 9106 section 4, second recommended option). The sealed object
+contains them, so they can grow; when reading they are bounded, so that a forged object cannot exhaust the machine.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _MAX_LANES: Final = 16
 
 @dataclass(frozen=True)
 class Costs:
-    """What one guess costs: memory in KiB, passes over it, lanes."""
+    """Cost of one guess: memory in KiB, passes over it, lanes."""
 
     memory_kib: int
     iterations: int
     lanes: int
 
     def bounded(self) -> bool:
-        """Say whether these costs may be tried at all: they come from a file that nobody has vouched for yet."""
+        """True if these costs may be tried; they come from a file that is not verified yet."""
         return (
             1 <= self.lanes <= _MAX_LANES
             and 8 * self.lanes <= self.memory_kib <= _MAX_MEMORY_KIB
@@ -59,7 +59,7 @@ class SealingKey:
 
     @classmethod
     def derive(cls, passphrase: str, *, costs: Costs, salt: bytes | None = None) -> SealingKey:
-        """Run Argon2id over the passphrase (NFKC, UTF-8). Raises VaultError where the platform cannot."""
+        """Run Argon2id over the passphrase (NFKC, UTF-8). Raises VaultError if the platform cannot."""
         from cryptography.exceptions import UnsupportedAlgorithm
 
         salt = os.urandom(_SALT_OCTETS) if salt is None else salt
@@ -105,10 +105,10 @@ def seal(passphrase: str, plaintext: bytes, *, context: bytes, costs: Costs = PR
 
 
 def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tuple[bytes, SealingKey]:
-    """Open a sealed object; returns the plaintext and the key, to seal again without asking.
+    """Open a sealed object; return the plaintext and the key, to seal again without asking.
 
-    Raises WrongPassphraseError if the tag does not hold (wrong passphrase, or the object was changed: these cannot be
-    told apart), VaultError if it is not a sealed object at all.
+    Raises WrongPassphraseError if the tag is wrong (a wrong passphrase and a changed object cannot be distinguished),
+    VaultError if it is not a sealed object.
     """
     costs, salt, _, _ = _parts(sealed)
     key = SealingKey.derive(passphrase, costs=costs, salt=salt)
@@ -122,7 +122,7 @@ def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tup
 
 
 def unseal_with(held: bytes, sealed: Mapping[str, Any], *, context: bytes) -> tuple[bytes, SealingKey] | None:
-    """As :func:`unseal`, by salt ‖ key (32 octets) instead of the passphrase; None where they are of another one."""
+    """Open as :func:`unseal`, by salt ‖ key (32 octets) instead of the passphrase; return None if the salt differs."""
     costs, salt, _, _ = _parts(sealed)
     key = SealingKey(costs, held[:-_KEY_OCTETS], held[-_KEY_OCTETS:])
     opened = _decrypted(key, sealed, context) if key.salt == salt else None
@@ -130,7 +130,7 @@ def unseal_with(held: bytes, sealed: Mapping[str, Any], *, context: bytes) -> tu
 
 
 def _parts(sealed: Mapping[str, Any]) -> tuple[Costs, bytes, bytes, bytes]:
-    """Costs, salt, nonce and ciphertext of a sealed object; raises VaultError where it is none."""
+    """Return costs, salt, nonce and ciphertext of a sealed object; raises VaultError if it is malformed."""
     try:
         known = (sealed["kdf"], sealed["cipher"]) == ("argon2id", "aes-256-gcm")
         costs = Costs(int(sealed["memory_kib"]), int(sealed["iterations"]), int(sealed["lanes"]))

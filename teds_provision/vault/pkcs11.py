@@ -120,7 +120,7 @@ class Pkcs11Vault:
         )
 
     def drop_ca(self) -> bool:
-        """Destroy the CA key in the token for good; False if there is none. It cannot be exported before."""
+        """Destroy the CA key in the token; False if there is none. A token's key cannot be exported first."""
         self.refresh()
         key = self._content.ca
         if key is None:
@@ -138,9 +138,9 @@ class Pkcs11Vault:
         return b""
 
     def new_passphrase(self, ask: Ask) -> Callable[[], None]:
-        """Ask for the token's PIN and a new one; what is returned has the token set it, the store being held.
+        """Ask for the token's PIN and a new one; return a function that sets it in the token, with the store locked.
 
-        That raises WrongPassphraseError, VaultError, and VaultChangedError, before the token counts a try, where
+        That function raises WrongPassphraseError, VaultError, and, before the token counts a try, VaultChangedError if
         another command has set a new PIN since this vault was opened.
         """
         old, new = ask("PIN of the token, as it is now", False), ask("New PIN of the token", True)
@@ -155,9 +155,9 @@ class Pkcs11Vault:
         return set_pin
 
     def refresh(self) -> bool:
-        """Take in what another process has written since; False where nothing was. Nobody is asked.
+        """Take in changes of other processes without asking; False if there were none.
 
-        Raises VaultChangedError where the token has a new PIN, VaultError.
+        Raises VaultChangedError if the token has a new PIN, VaultError.
         """
         if _read(self._home, self._store_id) == self._members:
             return False
@@ -194,7 +194,7 @@ class Pkcs11Vault:
         self._replace(replace(self._content, masters=self._content.masters.with_new()))
 
     def retire_masters(self) -> None:
-        """Forget all master keys but the newest: the last step of a change, once every key is wrapped anew."""
+        """Delete all master keys but the newest: the last step of a change, after every key was wrapped again."""
         self.refresh()
         if len(self._content.masters.keys) > 1:
             self._replace(replace(self._content, masters=self._content.masters.newest_only()))
@@ -230,7 +230,7 @@ class Pkcs11Vault:
 
 @dataclass(frozen=True)
 class _Content:
-    """What an open vault holds; ``pins``: how often a new PIN was set, so that others know theirs for an old one."""
+    """Content of an open vault; ``pins`` counts PIN changes, so that other processes detect an old PIN."""
 
     station: TokenKey
     ca: TokenKey | None
@@ -259,7 +259,7 @@ def _find_or_make(session: TokenSession, store_id: str, uri: Pkcs11Uri, role: st
 
 
 def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> dict[str, Any]:
-    """Seal the master keys to the station key, sign, write whole or not at all; returns what was written."""
+    """Seal the master keys to the station key, sign, write whole or not at all; return what was written."""
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
     one_time, nonce = SoftwareKey.generate(), os.urandom(_NONCE_OCTETS)
@@ -425,7 +425,7 @@ def _wait(descriptor: int) -> None:
 def _folder() -> Path:
     """Return a folder that only this user can write to: in /run/user, else in the home.
 
-    Not in /tmp: there anybody could make a folder of that name first and keep this user out.
+    Not in /tmp, as another user could create a folder of that name first and lock this user out.
     """
     user = os.getuid()
     session = Path(f"/run/user/{user}")

@@ -42,7 +42,7 @@ class TokenKey:
         return self.sign_digest(hashlib.sha256(message).digest())
 
     def sign_digest(self, digest: bytes) -> bytes:
-        """The same by the SHA-256 of the message."""
+        """Sign the SHA-256 digest of a message."""
         from pkcs11 import Mechanism
 
         return normalise_signature(guarded(lambda: bytes(self._key.sign(digest, mechanism=Mechanism.ECDSA))))
@@ -91,7 +91,7 @@ class TokenSession:
         self.label: str = token.label
 
     def find(self, *, label: str | None, identifier: bytes | None) -> TokenKey | None:
-        """Return the P-256 key with this label and CKA_ID; None where there is none.
+        """Return the P-256 key with this label and CKA_ID; None if there is none.
 
         Raises VaultError: several fit, no public key beside it, another curve, or it may leave the token.
         """
@@ -106,7 +106,7 @@ class TokenSession:
         return key
 
     def destroy(self, key: TokenKey) -> None:
-        """Destroy a key pair for good (CKA_ID and label both fit); a writing session shares the login of this one."""
+        """Destroy a key pair (CKA_ID and label both fit); a writing session shares the login of this one."""
         from pkcs11 import Attribute
 
         def run() -> None:
@@ -248,9 +248,9 @@ def find_token(uri: Pkcs11Uri) -> Token:
 def log_in(token: Token, uri: Pkcs11Uri, pin: str | None, *, write: bool) -> TokenSession:
     """Open a session with ``pin`` (None: the token has its own PIN pad). One try, never a second one.
 
-    A login is the process's, not the session's: where this process holds one already, the module does not look at the
-    PIN. ``open_vault`` asks once per process for that reason.
-    Raises WrongPassphraseError, which says what the token tells of the tries left, or VaultError.
+    A login belongs to the process, not to the session: if this process holds one already, the module does not look at
+    the PIN. Therefore ``open_vault`` asks once per process. Raises WrongPassphraseError with the token's hint about
+    remaining tries, or VaultError.
     """
     from pkcs11 import PROTECTED_AUTH, TokenFlag, exceptions
 
@@ -276,7 +276,7 @@ def log_in(token: Token, uri: Pkcs11Uri, pin: str | None, *, write: bool) -> Tok
 
 
 def ask_pin(token: Token, uri: Pkcs11Uri, ask: Ask) -> str | None:
-    """Ask for the PIN, and say if it is the last try; None where the token has its own PIN pad."""
+    """Ask for the PIN and warn before the last try; return None if the token has its own PIN pad."""
     from pkcs11 import TokenFlag
 
     if token.flags & TokenFlag.PROTECTED_AUTHENTICATION_PATH:

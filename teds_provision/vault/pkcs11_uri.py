@@ -14,7 +14,7 @@ _EXAMPLE = "For example: pkcs11:token=station?module-path=/usr/lib/softhsm/libso
 
 @dataclass(frozen=True)
 class Pkcs11Uri:
-    """The attributes that this tool reads; None where the URI does not name one."""
+    """The attributes of a URI that this tool reads; None for those that it lacks."""
 
     module_path: str
     token: str | None = None
@@ -27,10 +27,10 @@ class Pkcs11Uri:
 
     @classmethod
     def parse(cls, text: str) -> Pkcs11Uri:
-        """Read a URI strictly; raises UsageError.
+        """Parse a URI strictly; raises UsageError.
 
-        An attribute that is not known or stands twice is refused, as it might have told two tokens apart. So are
-        ``pin-value`` and ``pin-source``: no option may hold a secret, and no store may say which file holds it.
+        An unknown or repeated attribute is refused, as it might have distinguished two tokens. So are ``pin-value`` and
+        ``pin-source``: no option may hold a secret, and no store may name the file that holds it.
         """
         scheme, colon, rest = text.partition(":")
         if scheme.lower() != "pkcs11" or not colon:

@@ -24,7 +24,7 @@ _Made = TypeVar("_Made")
 
 
 class _QuestionNeededError(Exception):
-    """Somebody has to be asked first."""
+    """An operator has to be asked first."""
 
     def __init__(self, prompt: str, confirm: bool) -> None:
         super().__init__(prompt)
@@ -32,11 +32,11 @@ class _QuestionNeededError(Exception):
 
 
 def asked_first(ask: Ask, work: Callable[[Ask], _Made]) -> _Made:
-    """Do ``work``, which takes a lock and may need a passphrase in it, without that lock while a person types.
+    """Do ``work``, which takes a lock and may need a passphrase inside it, without that lock while an operator types.
 
-    It is handed an ``ask`` that knows the answers given so far. At a question that is still open it is left, the
-    person is asked, and it begins anew: so it must change nothing before its questions, and read again what it asks
-    for. What another process did meanwhile leads to other questions, not to an old answer.
+    It receives an ``ask`` that knows the answers given so far. At an open question ``work`` is abandoned, the operator
+    is asked, and it starts over: so it must change nothing before its questions, and reread what it asks about. Changes
+    by another process meanwhile lead to other questions, not to an old answer.
     """
     answers: dict[tuple[str, bool], str] = {}
 
@@ -63,10 +63,10 @@ def create_vault(
     with_ca: bool = True,
     tell: Callable[[str], object] = lambda text: None,
 ) -> tuple[Vault, str]:
-    """Make the vault of a station, or open the one that an earlier run made; return it and why it was chosen.
+    """Make the vault of a station, or open the one that an earlier run made; return it and the reason for the choice.
 
-    ``tell`` hears why, where and how long before anybody is asked for a new passphrase. The caller holds the store, and
-    lets nobody type meanwhile (:func:`asked_first`).
+    ``tell`` receives the reason, the place and the duration before a new passphrase is asked for. The caller holds the
+    store, and does not wait for typing meanwhile (:func:`asked_first`).
 
     ``keystore`` is ``keyring``, ``file``, ``pkcs11:…`` (RFC 7512) or None: then the keyring if one works (proven by a
     set, a read back and a delete), else a passphrase file. ``costs`` are those of a new passphrase file, ``restored``
@@ -92,9 +92,9 @@ def create_vault(
 
 
 def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, use_agent: bool = False) -> Vault:
-    """Open the vault of a station; a second call in one process gives the same as it is now, without asking again.
+    """Open the vault of a station; a second call in one process returns the same vault, refreshed.
 
-    With ``use_agent`` nobody is asked while ``unlock`` holds it open. Raises VaultError and its leaves: locked,
+    With ``use_agent`` there is no question while ``unlock`` holds it open. Raises VaultError and its leaves: locked,
     missing, damaged, wrong passphrase.
     """
     harden()

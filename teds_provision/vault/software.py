@@ -1,4 +1,4 @@
-"""What the keyring vault and the passphrase file share: the keys are in memory once unlocked."""
+"""The shared part of keyring vault and passphrase file: the keys are in memory once unlocked."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class SoftwareVault(ABC):
         ca_file.write_ca(path, self._material.ca, passphrase)
 
     def drop_ca(self) -> bool:
-        """Take the CA key out of the vault for good; False if there is none. Export it first."""
+        """Delete the CA key from the vault; False if there is none. Export it first."""
         self.refresh()
         if self._material.ca is None:
             return False
@@ -86,9 +86,9 @@ class SoftwareVault(ABC):
         return tuple(sorted(self._material.masters.keys))
 
     def refresh(self) -> bool:
-        """Take in what another process has written since; False where nothing was. Nobody is asked.
+        """Take in changes of other processes without asking; False if there were none.
 
-        Raises VaultChangedError where it lies under another passphrase now, VaultError where it is gone.
+        Raises VaultChangedError if its passphrase has changed, VaultError if it is gone.
         """
         there = self._load()
         if there == self._material:
@@ -117,14 +117,14 @@ class SoftwareVault(ABC):
         self._replace(Material(material.identity, material.ca, material.masters.with_new()))
 
     def retire_masters(self) -> None:
-        """Forget all master keys but the newest: the last step of a change, once every key is wrapped anew."""
+        """Delete all master keys but the newest: the last step of a change, after every key was wrapped again."""
         self.refresh()
         material = self._material
         if len(material.masters.keys) > 1:
             self._replace(Material(material.identity, material.ca, material.masters.newest_only()))
 
     def secret_material(self) -> str:
-        """Return everything secret as one line of text, for a sealed backup. Whoever calls this must seal it."""
+        """Return all secrets as one line of text, for a sealed backup. The caller must seal it."""
         return self._material.encode()
 
     def _replace(self, material: Material) -> None:
@@ -140,7 +140,10 @@ class SoftwareVault(ABC):
 
     @abstractmethod
     def _load(self) -> Material:
-        """What lies there now; raises VaultChangedError where this vault's passphrase does not open it, VaultError."""
+        """Return the current content.
+
+        Raises VaultChangedError if this vault's passphrase does not open it, VaultError.
+        """
 
     @abstractmethod
     def _save(self, material: Material) -> None:

@@ -29,7 +29,7 @@ _MAX_OCTETS = 64 << 20
 
 
 def datasheet_row(image: Image, profile: str | None, seen: str) -> tuple[Any, ...]:
-    """The row of an image: what its Security TEDS says of sequence, epoch and time, its digest, its octets."""
+    """Return the row of an image: sequence, epoch and time of its Security TEDS, its digest, its octets."""
     sequence = epoch = 0
     signed: str | None = None
     if image.security is not None:
@@ -45,7 +45,7 @@ def datasheet_row(image: Image, profile: str | None, seen: str) -> tuple[Any, ..
 
 
 def packed(image: Image) -> bytes:
-    """The blocks of an image, ascending, deflated: channel u16, access code u8, length u32, octets."""
+    """Return the blocks of an image, ascending, deflated: channel u16, access code u8, length u32, octets."""
     parts = (_BLOCK.pack(channel, code, len(image.blocks[channel, code])) for channel, code in image)
     whole = b"".join(head + image.blocks[block] for head, block in zip(parts, image, strict=True))
     return _deflated(whole)
@@ -53,12 +53,12 @@ def packed(image: Image) -> bytes:
 
 @lru_cache(maxsize=4)
 def _deflated(whole: bytes) -> bytes:
-    """An image is kept as a draft, and as it is written a moment later."""
+    """Return an image deflated; cached, as it is kept as a draft, and a moment later as written."""
     return zlib.compress(whole, 9)
 
 
 def unpacked(uuid: bytes, octets: bytes) -> Image:
-    """What :func:`packed` gave; raises ValueError for anything else."""
+    """Return the image that :func:`packed` gave; raises ValueError for any other octets."""
     inflate = zlib.decompressobj()
     try:
         whole = inflate.decompress(octets, _MAX_OCTETS)
@@ -146,7 +146,7 @@ class DatasheetTables:
     # -- readings --------------------------------------------------------------------------------------------------
 
     def reading_of(self, uuid: bytes) -> NodeReading | None:
-        """Return what was read of this node last, None where nothing was."""
+        """Return the last reading of this node, None if there is none."""
         return self._database.read_one(_reading, f"SELECT {_READING} FROM readings WHERE uuid = ?", (uuid,))
 
     def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeReading]:
@@ -155,7 +155,7 @@ class DatasheetTables:
         return {reading.uuid: reading for reading in self._database.read(_reading, statement, uuids)}
 
     def put_reading(self, reading: NodeReading) -> bool:
-        """Keep a reading in place of the one before; False where that was made in a session and this one was not."""
+        """Keep a reading in place of the one before; False if that was made in a session and this one was not."""
         values = tuple(getattr(reading, name) for name in READING_FIELDS)
         changed = ", ".join(f"{name} = excluded.{name}" for name in READING_FIELDS[1:])
         return (
@@ -168,7 +168,7 @@ class DatasheetTables:
         )
 
     def put_start(self, uuid: bytes, c: bytes) -> None:
-        """The node has started anew, and shows the same Security TEDS: the rest is as it was read before."""
+        """Record a restart of the node with the same Security TEDS: the rest is as it was read before."""
         self._database.execute("UPDATE readings SET c = ?, whole = 0 WHERE uuid = ?", (c, uuid))
 
     def drop_reading(self, uuid: bytes) -> None:

@@ -40,7 +40,7 @@ class FactTables:
     # -- certificates ----------------------------------------------------------------------------------------------
 
     def certificate(self, ca: str, station: str) -> bytes | None:
-        """Return SIG104 of a CA over a station's key, both by fingerprint; None where it is not known."""
+        """Return SIG104 of a CA over a station's key, both by fingerprint; None if it is not known."""
         row = self._database.one("SELECT signature FROM certificates WHERE ca = ? AND station = ?", (ca, station))
         return None if row is None else bytes(row[0])
 

@@ -28,7 +28,7 @@ class HandoverTables:
     def put_trust(self, record: TrustRecord) -> None:
         """Trust a key under a name; the same key and role under another name is renamed.
 
-        Raises PolicyError if the name stands for another key or role: it must be removed first.
+        Raises PolicyError if another key or role has the name: it must be removed first.
         """
         with self._database.together():
             row = self._database.one("SELECT fingerprint, role FROM trust WHERE name = ?", (record.name,))
@@ -100,7 +100,7 @@ class HandoverTables:
         return self._database.read(Tombstone, "SELECT * FROM tombstones ORDER BY uuid")
 
     def tombstone(self, uuid: bytes) -> Tombstone | None:
-        """Return where this node was given, None if it was not."""
+        """Return the tombstone of a node that was given away, None if it was not."""
         return self._database.read_one(Tombstone, "SELECT * FROM tombstones WHERE uuid = ?", (uuid,))
 
     def put_tombstone(self, tombstone: Tombstone) -> None:
@@ -136,7 +136,7 @@ class HandoverTables:
         return self._database.read_one(RevocationRecord, "SELECT * FROM revocations WHERE uuid = ?", (uuid,))
 
     def revocations_of(self, uuids: Sequence[bytes]) -> list[RevocationRecord]:
-        """The entries of these nodes, at most a page of them."""
+        """Return the entries of these nodes, at most a batch of them."""
         return self._database.read(
             RevocationRecord, f"SELECT * FROM revocations WHERE uuid IN ({places(uuids)})", uuids
         )

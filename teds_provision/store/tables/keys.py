@@ -94,9 +94,9 @@ class KeyTables:
         return self._database.stream(_key_name, statement)
 
     def replace_keys(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
-        """Wrap every key anew (a change of the master key), all or none; returns how many.
+        """Wrap every key again (a change of the master key), all or none; return how many.
 
-        ``rewrap`` gets each record and returns the new wrapped octets; whatever it raises leaves all as it was.
+        ``rewrap`` gets each record and returns the new wrapped octets; an error that it raises leaves all as it was.
         """
         count = 0
         with self._database.together():

@@ -1,4 +1,4 @@
-"""What a line keeps: jobs, their units, evidence of every attempt, and what an office was asked (contract/plant.md)."""
+"""Rows of a line: jobs, their units, evidence of every attempt, and requests to an office (contract/plant.md)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class UnitRow:
 
 @dataclass(frozen=True)
 class EvidenceRow:
-    """One document, and what it says of itself; ``sha256`` is that of its octets."""
+    """One document with its own facts; ``sha256`` is that of its octets."""
 
     sha256: str
     uuid: bytes
@@ -154,7 +154,7 @@ class LineTables:
     # -- what an office was asked ----------------------------------------------------------------------------------
 
     def sign_request(self, hash: str, direction: Literal["out", "in"]) -> SignRequestRow | None:
-        """Return a request by its H, None where it was asked in the other direction, or never."""
+        """Return a request by its H, None if it has the other direction or does not exist."""
         return self._database.read_one(
             SignRequestRow, f"SELECT {_REQUEST} FROM sign_requests WHERE hash = ? AND direction = ?", (hash, direction)
         )

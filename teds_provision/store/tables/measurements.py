@@ -110,7 +110,7 @@ class MeasurementTables:
     # -- names of topics, and how nodes are detected -----------------------------------------------------------------
 
     def topic_names(self) -> dict[tuple[bytes, int], str]:
-        """Return every name that somebody chose, by UUID and channel; channel 0 is the node's part of its topics."""
+        """Return every name that an operator chose, by UUID and channel; channel 0 is the node's part of its topics."""
         rows = self._database.execute("SELECT uuid, channel, name FROM topics ORDER BY uuid, channel")
         return {(bytes(uuid), int(channel)): str(name) for uuid, channel, name in rows}
 
@@ -124,7 +124,7 @@ class MeasurementTables:
         return self._database.change("DELETE FROM topics WHERE uuid = ? AND channel = ?", (uuid, channel)) > 0
 
     def frames(self) -> dict[tuple[bytes, int], str]:
-        """Return every coordinate frame that somebody chose, by UUID and channel; channel 0 is the whole node."""
+        """Return every coordinate frame that an operator chose, by UUID and channel; channel 0 is the whole node."""
         rows = self._database.execute("SELECT uuid, channel, frame FROM frames ORDER BY uuid, channel")
         return {(bytes(uuid), int(channel)): str(frame) for uuid, channel, frame in rows}
 
@@ -137,7 +137,7 @@ class MeasurementTables:
         return self._database.change("DELETE FROM frames WHERE uuid = ? AND channel = ?", (uuid, channel)) > 0
 
     def detection(self) -> DetectionMode | None:
-        """Return how nodes are detected, None where nobody has said."""
+        """Return how nodes are detected, None if it was never set."""
         row = self._database.one("SELECT mode FROM detection")
         return None if row is None else cast(DetectionMode, row[0])
 

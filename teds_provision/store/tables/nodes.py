@@ -97,7 +97,7 @@ class NodeTables:
         return {record.uuid: record for record in self._database.read(NodeRecord, statement, uuids)}
 
     def exported_nodes_of(self, uuids: Sequence[bytes]) -> dict[bytes, ExportedNode]:
-        """Return what a bundle says of these nodes (a page of them), by UUID."""
+        """Return a bundle's facts about these nodes (a batch of them), by UUID."""
         statement = f"SELECT {_HANDED_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
         return {handed.uuid: handed for handed in self._database.read(_handed, statement, uuids)}
 
@@ -141,16 +141,16 @@ class NodeTables:
         self._database.execute(REPLACE_NODE, tuple(values.values()))
 
     def last_places(self, uuids: Sequence[bytes]) -> dict[bytes, str]:
-        """Return where each of these nodes (a page of them) was met last, ``LINK:WHERE``; without those never met."""
+        """Return the last place of each of these nodes (a batch of them), ``LINK:PORT``; without those never met."""
         statement = f"SELECT uuid, place FROM last_places WHERE uuid IN ({places(uuids)})"
         return {bytes(uuid): str(place) for uuid, place in self._database.execute(statement, uuids)}
 
     def put_last_place(self, uuid: bytes, place: str) -> None:
-        """Keep where a node was met last."""
+        """Record the place of a node's last contact."""
         self._database.execute("INSERT OR REPLACE INTO last_places VALUES(?, ?)", (uuid, place))
 
     def set_due(self, uuid: bytes, due: str | None) -> None:
-        """Note the day (ISO 8601) on which the first calibration of a node ends, None where none does."""
+        """Record the day (ISO 8601) on which the first calibration of a node ends, None if none does."""
         self._database.execute("UPDATE nodes SET due = ? WHERE uuid = ? AND due IS NOT ?", (due, uuid, due))
 
     def unpin_node(self, uuid: bytes) -> None:
@@ -234,7 +234,7 @@ def _by_prefix(digits: str) -> tuple[str, tuple[bytes, bytes, bytes, bytes]]:
 
 
 def _bounds(digits: str) -> tuple[bytes, bytes]:
-    """The lowest and the highest UUID that begins with these digits."""
+    """Return the lowest and the highest UUID that begins with these digits."""
     return bytes.fromhex(digits.ljust(_UUID_DIGITS, "0")), bytes.fromhex(digits.ljust(_UUID_DIGITS, "f"))
 
 

@@ -37,7 +37,7 @@ class Search:
 
 @dataclass(frozen=True)
 class NodeOverview:
-    """What the tables say of one node; None and empty where they say nothing."""
+    """One node across all tables; None and empty for what they lack."""
 
     uuid: bytes
     node: dict[str, Any] | None
@@ -52,7 +52,7 @@ class NodeOverview:
 
 @dataclass(frozen=True)
 class WaitingNodes:
-    """Nodes that wait for somebody, by UUID."""
+    """Nodes that wait for an operator, by UUID."""
 
     overdue: tuple[bytes, ...]
     twice: tuple[bytes, ...]
@@ -62,7 +62,7 @@ class WaitingNodes:
 
 
 class OverviewTables:
-    """The part of the store that looks at all tables at once; see :class:`teds_provision.store.Store`."""
+    """The part of the store that reads all tables at once; see :class:`teds_provision.store.Store`."""
 
     _database: Database
 
@@ -79,7 +79,7 @@ class OverviewTables:
             yield from self._page(uuids[first : first + PAGE])
 
     def tally(self, today: str) -> WaitingNodes:
-        """Return the nodes that wait for somebody; ``today`` is a day, ISO 8601."""
+        """Return the nodes that wait for an operator; ``today`` is a day, ISO 8601."""
 
         def some(statement: str, *values: Any) -> tuple[bytes, ...]:
             return tuple(bytes(uuid) for (uuid,) in self._database.execute(statement, values))
@@ -102,12 +102,12 @@ class OverviewTables:
         )
 
     def is_known(self, uuid: bytes) -> bool:
-        """Say whether anything at all is known of a node."""
+        """True if anything is known of a node."""
         row = self._database.one(f"SELECT {_IS_KNOWN}", (uuid,))
         return row is not None and bool(row[0])
 
     def named(self, name: str) -> bytes | None:
-        """Return the UUID of the one node of exactly this name, None where none or several have it."""
+        """Return the UUID of the only node of exactly this name, None if none or several have it."""
         statement = "SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM whitelist WHERE name = ? LIMIT 2"
         rows = self._database.execute(statement, (name, name))
         return bytes(rows[0][0]) if len(rows) == 1 else None

@@ -17,7 +17,7 @@ ParcelState = Literal["ready", "sent", "later", "waiting"]
 class ParcelRow:
     """One document for, or from, one station (``peer``, a fingerprint).
 
-    Out: ``ready`` to be sent, ``sent``. In: ``later`` (judged anew at the next sync), ``waiting`` for a person.
+    Out: ``ready`` to be sent, ``sent``. In: ``later`` (judged again at the next sync), ``waiting`` for an operator.
     ``about`` is the id of the bundle that it is about, or H of a line's document; ``detail`` why it waits.
     """
 
@@ -55,7 +55,7 @@ class ParcelTables:
         )
 
     def parcel_document(self, id: str, direction: Direction) -> bytes:
-        """Return the octets of a parcel, none where it is done or not known."""
+        """Return the octets of a parcel, empty if it is done or not known."""
         rows = self._database.execute("SELECT document FROM parcels WHERE id = ? AND direction = ?", (id, direction))
         return bytes(rows[0][0]) if rows else b""
 
@@ -107,7 +107,7 @@ class ParcelTables:
         )
 
     def forget_shared(self, parcel: str) -> None:
-        """Have the copies in a parcel that nobody receipted made anew."""
+        """Queue the copies of a parcel without a receipt for another export."""
         self._database.execute("DELETE FROM shared WHERE parcel = ? AND state = 'sent'", (parcel,))
 
     def shared_in(self, parcel: str) -> list[tuple[bytes, int, str]]:

@@ -1,4 +1,4 @@
-"""What a station keeps of its plant: roster, pages, and what follows from them (contract/plant.md).
+"""A station's rows about its plant: roster, pages, and what follows from them (contract/plant.md).
 
 Stations are named by fingerprint here and by a small number (``chain``) in the rows: there may be a million of them.
 """
@@ -19,11 +19,11 @@ _LEVEL: Final = 3  # zlib: a page of 500 kB in 5 ms, to a fifth of its octets
 
 @dataclass(frozen=True)
 class PlantRecord:
-    """That this station joined a registry (a UUIDv4), when, and how far it came.
+    """Membership of this station in a registry (a UUIDv4): since when, and how far it has read.
 
-    ``left``: since when it takes no part any more. ``url``: where PostgreSQL is, ``file:`` and a folder, or None.
-    ``acknowledged``: the number of its newest page that was seen to lie there. ``restored``: since when the home is one
-    that a backup rebuilt and that has not adopted its own pages yet.
+    ``left``: since when it no longer takes part. ``url``: where PostgreSQL is, ``file:`` and a folder, or None.
+    ``acknowledged``: the number of its newest page that was seen in the registry. ``restored``: since when the home is
+    one that a backup rebuilt and that has not adopted its own pages yet.
     """
 
     registry: str
@@ -63,9 +63,9 @@ class Alarm:
 
 @dataclass(frozen=True)
 class Chain:
-    """What one station says: ``counted`` pages of it count (the newest by number and H), ``folded`` are in the claims.
+    """Pages of one station: ``counted`` of them count (the newest by number and H), ``folded`` are in the claims.
 
-    ``accepted``: the branch that a person took where there are two histories. ``waits``: why it is not read on.
+    ``accepted``: the branch that an operator chose if there are two histories. ``waits``: why it is not read on.
     """
 
     chain: int
@@ -103,7 +103,7 @@ class PlantTables:
     # -- what this station has to do with it -----------------------------------------------------------------------
 
     def plant(self) -> PlantRecord | None:
-        """Return what this station joined, None where it never did."""
+        """Return the plant that this station joined, None if it never did."""
         return self._database.read_one(PlantRecord, f"SELECT {_PLANT} FROM plant WHERE one = 1")
 
     def put_plant(self, record: PlantRecord) -> None:
@@ -155,7 +155,7 @@ class PlantTables:
         return self._database.read(_alarm, f"SELECT {_ALARM} FROM alarms ORDER BY at, code, about, n")
 
     def put_alarm(self, alarm: Alarm) -> bool:
-        """Keep an alarm; False where it is there already (it keeps its time, and stays seen)."""
+        """Keep an alarm; False if it exists already (it keeps its time, and stays seen)."""
         values = (alarm.code, alarm.about, alarm.n, alarm.why, alarm.at, int(alarm.seen))
         return self._database.change(f"INSERT OR IGNORE INTO alarms({_ALARM}) VALUES({places(values)})", values) > 0
 
@@ -204,7 +204,7 @@ class PlantTables:
     # -- what this station says ------------------------------------------------------------------------------------
 
     def add_event(self, id: str, event: str, uuid: bytes | None) -> None:
-        """Keep an event until it stands in a page; its node is judged anew at the next fold."""
+        """Keep an event until a page contains it; its node is judged again at the next fold."""
         with self._database.together():
             self._database.execute("INSERT INTO outbox(id, event) VALUES(?, ?)", (id, event))
             if uuid is not None:
@@ -228,7 +228,7 @@ class PlantTables:
         return waiting + sum(len(json.loads(page.content).get("events", ())) for page in pages)
 
     def drop_events(self, ids: Iterable[str]) -> None:
-        """Take events that stand in a page out of the outbox."""
+        """Remove events that a page contains from the outbox."""
         self._database.execute_many("DELETE FROM outbox WHERE id = ?", [(event_id,) for event_id in ids])
 
     # -- chains and pages ------------------------------------------------------------------------------------------
@@ -266,7 +266,7 @@ class PlantTables:
         )  # fmt: skip
 
     def page_names(self, chain: int) -> list[tuple[int, str, str]]:
-        """Return number, H and ``previous`` of every page of a chain, both histories where there are two."""
+        """Return number, H and ``previous`` of every page of a chain, both histories if there are two."""
         return self._database.execute("SELECT n, hash, previous FROM pages WHERE chain = ? ORDER BY n, hash", (chain,))
 
     def page_times(self, chain: int, most: int) -> list[tuple[int, str, str, str]]:
@@ -276,7 +276,7 @@ class PlantTables:
         )
 
     def page_newest(self) -> list[tuple[str, str]]:
-        """Return, for every station, when its newest page was made as it says: the one of the highest number."""
+        """Return the own time of every station's newest page: the one of the highest number."""
         found = self._database.execute(
             "SELECT station, created, max(n) FROM pages JOIN chains USING(chain) GROUP BY station"
         )
@@ -299,7 +299,7 @@ class PlantTables:
                 yield page
 
     def put_heads(self, chain: int, heads: Mapping[str, tuple[int, str]]) -> None:
-        """Keep what a station says that it verified of others, the greatest of each."""
+        """Keep the heads that a station reports as verified, the greatest of each chain."""
         self._database.execute_many(
             "INSERT INTO heads VALUES(?, ?, ?, ?) ON CONFLICT(chain, about) DO UPDATE SET n = excluded.n,"
             " hash = excluded.hash WHERE excluded.n > heads.n",
@@ -307,7 +307,7 @@ class PlantTables:
         )
 
     def heads(self) -> list[tuple[str, str, int, str]]:
-        """Return what stations say of each other: who, of whom, the newest page that it verified and its H."""
+        """Return what stations report of each other: reporter, chain, the newest page that it verified and its H."""
         return self._database.execute(
             "SELECT station, about, n, hash FROM heads JOIN chains USING(chain) ORDER BY about, n DESC, station"
         )
@@ -315,7 +315,7 @@ class PlantTables:
     # -- claims ----------------------------------------------------------------------------------------------------
 
     def known_ids(self, chain: int, ids: Sequence[int]) -> set[int]:
-        """Return those of these event ids that stood in the chain before."""
+        """Return those of these event ids that the chain contained before."""
         known: set[int] = set()
         for start in range(0, len(ids), PAGE):
             part = ids[start : start + PAGE]
@@ -354,21 +354,21 @@ class PlantTables:
         return found
 
     def claimed_nodes(self, after: bytes, most: int) -> list[bytes]:
-        """Return nodes of which anybody claims anything, by UUID, a page at a time."""
+        """Return nodes with a claim of any station, by UUID, a batch at a time."""
         rows = self._database.execute(
             "SELECT DISTINCT uuid FROM claims WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, most)
         )
         return [row[0] for row in rows]
 
     def put_claims(self, chain: int, claims: Mapping[bytes, str]) -> None:
-        """Keep what a station claims of nodes, and have those judged anew."""
+        """Keep a station's claims about nodes, and queue those to be judged again."""
         self._database.execute_many(
             "INSERT OR REPLACE INTO claims VALUES(?, ?, ?)", ((uuid, chain, claim) for uuid, claim in claims.items())
         )
         self._database.execute_many("INSERT OR IGNORE INTO to_judge VALUES(?)", ((uuid,) for uuid in claims))
 
     def forget_claims(self, chain: int) -> None:
-        """Take away everything that was folded of a chain: it is folded anew."""
+        """Remove everything that was folded of a chain, to fold it again."""
         with self._database.together():
             self._database.execute("INSERT OR IGNORE INTO to_judge SELECT uuid FROM claims WHERE chain = ?", (chain,))
             for table in ("claims", "event_ids", "digests", "statements"):
@@ -400,7 +400,7 @@ class PlantTables:
         )
 
     def put_ban(self, hash: str, chain: int, *, counts: bool, uuid: bytes, statement: str) -> None:
-        """Keep a ban that stands in a page (its signed text, which proves itself), and whether such a page counts."""
+        """Keep a ban from a page (its signed text, which proves itself), and whether such a page counts."""
         self._database.execute(
             "INSERT INTO statements VALUES(?, ?, 0, ?, ?, ?, NULL) ON CONFLICT(hash, chain, lifts) DO UPDATE"
             " SET counts = max(counts, excluded.counts)",
@@ -447,11 +447,11 @@ class PlantTables:
         return self._database.execute(f"SELECT uuid, conflict, detail FROM conflicts {which} ORDER BY uuid", values)
 
     def to_judge(self, most: int) -> list[bytes]:
-        """Return nodes that are to be judged anew."""
+        """Return nodes that are to be judged again."""
         return [row[0] for row in self._database.execute("SELECT uuid FROM to_judge ORDER BY uuid LIMIT ?", (most,))]
 
     def queue_judging_of_all(self) -> None:
-        """Have every node judged anew of which anybody claims anything, or bans it."""
+        """Queue every node with a claim or a ban to be judged again."""
         with self._database.together():
             self._database.execute("INSERT OR IGNORE INTO to_judge SELECT DISTINCT uuid FROM claims")
             self._database.execute(
@@ -459,7 +459,7 @@ class PlantTables:
             )
 
     def note_judged(self, uuids: Iterable[bytes]) -> None:
-        """Take these nodes off those that are to be judged anew."""
+        """Remove these nodes from the queue."""
         self._database.execute_many("DELETE FROM to_judge WHERE uuid = ?", ((uuid,) for uuid in uuids))
 
 
