@@ -1,7 +1,7 @@
-"""Announce on CAN, and how nodes that meet on one address sort themselves out (profile.md, "CAN"). Pure.
+"""Announce on CAN, and how nodes that meet on one address resolve the conflict (profile.md, "CAN"). Pure.
 
-An Announce says "here I am, in this state, and this is the CRC-32 of my UUID". Where two nodes have one address, the
-one with the smaller CRC keeps it, the other takes the next address from which it has heard nothing.
+An Announce carries a node's presence, its state, and the CRC-32 of its UUID. If two nodes have one address, the one
+with the smaller CRC keeps it, the other takes the next address from which it has heard nothing.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def uuid_crc(uuid: bytes) -> int:
 
 
 def default_can_address(uuid: bytes) -> int:
-    """A node's own default address: 1 + CRC-32(UUID) mod 239 (profile.md, "CAN")."""
+    """Return a node's default address: 1 + CRC-32(UUID) mod 239 (profile.md, "CAN")."""
     return 1 + uuid_crc(uuid) % LAST_ADDRESS
 
 
@@ -71,7 +71,7 @@ class Announce:
 
 
 def is_announce(identifier: int) -> bool:
-    """Whether a frame's identifier is that of an Announce."""
+    """True if a frame's identifier is that of an Announce."""
     return identifier & 0x1FFFFF00 == ANNOUNCE
 
 
@@ -79,8 +79,8 @@ def is_announce(identifier: int) -> bool:
 class AddressClaim:
     """One node's part: when to announce, and when to move. Times are monotonic seconds.
 
-    ``crc`` of the node's UUID; ``uniform`` gives a random number between two bounds. :meth:`due` is asked before each
-    wait, :meth:`announced` is told of each Announce that left.
+    ``crc`` of the node's UUID; ``uniform`` gives a random number between two bounds. Call :meth:`due` before each wait,
+    and :meth:`announced` after each Announce that left.
     """
 
     crc: int
@@ -95,15 +95,15 @@ class AddressClaim:
     _sent: deque[float] = field(default_factory=deque)
 
     def start(self, now: float) -> None:
-        """The node started, or came back from bus-off: announce after a random 0 to 500 ms."""
+        """Start after power-up or bus-off: announce after a random 0 to 500 ms."""
         self._due = now + self.uniform(0, START_SPREAD)
 
     def hear(self, source: int) -> None:
-        """A frame of any kind came from this address."""
+        """Record a frame of any kind from this address."""
         self._heard.add(source)
 
     def handle_announce(self, announce: Announce, own: int, now: float, *, pinned: bool = False) -> int:
-        """An Announce came in; return the address that the node has from now on, ``own`` if it stays.
+        """Handle a received Announce; return the address that the node has from now on, ``own`` if it stays.
 
         ``pinned``: an actuator of the node is claimed, so it stays and goes on announcing. An Announce proves nothing,
         and a move ends the sessions: after a few, the next waits until :meth:`move_due`.
@@ -158,7 +158,7 @@ class AddressClaim:
         return self._due
 
     def announced(self, now: float) -> None:
-        """The Announce that was due has left."""
+        """Record that the due Announce has left."""
         self._sent.append(now)
         self._due = None
 

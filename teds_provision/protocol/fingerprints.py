@@ -7,22 +7,22 @@ from typing import Final
 
 DIGITS: Final = 64
 LEAST_DIGITS: Final = 32
-"""128 bits: nobody finds a second key whose fingerprint begins so."""
+"""128 bits: too many to find a second key whose fingerprint begins alike."""
 
 
 def read_fingerprint(text: str) -> str | None:
-    """The digits in lower case, without blanks, colons, dashes and 0x; None unless there are 32 to 64."""
+    """Return the digits in lower case, without blanks, colons, dashes and 0x; None unless there are 32 to 64."""
     digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
     return digits if re.fullmatch(f"[0-9a-f]{{{LEAST_DIGITS},{DIGITS}}}", digits) else None
 
 
 def same_key(one: str, other: str) -> bool:
-    """Whether two fingerprints, each whole or its first digits, are of the same key."""
+    """True if two fingerprints, each whole or its first digits, are of the same key."""
     if len(one) > len(other):
         one, other = other, one
     return len(one) >= LEAST_DIGITS and other.startswith(one)
 
 
 def is_whole(fingerprint: str | None) -> bool:
-    """Whether all 64 digits are known."""
+    """True if all 64 digits are known."""
     return fingerprint is not None and len(fingerprint) == DIGITS

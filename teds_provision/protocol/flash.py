@@ -1,4 +1,4 @@
-"""What a node keeps through power cuts, and the one way to change it: a whole new state in one transaction."""
+"""The state that a node keeps through power cuts, and its one change: a whole new state in one transaction."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from teds_provision.teds.image import SECURITY, BlockId
 
 
 class FlashError(Exception):
-    """Raised by a :class:`Flash` whose commit did not happen; the old state stands (reason 11)."""
+    """The commit of a :class:`Flash` failed; the old state remains (reason 11)."""
 
 
 class ChipError(Exception):
@@ -48,13 +48,13 @@ class Flash:
         return NodeState.PROVISIONED if self.provisioned else NodeState.KEYED
 
     def security_teds(self) -> bytes:
-        """The Security TEDS that the node shows now."""
+        """Return the Security TEDS that the node shows now."""
         if self.provisioned:
             return self.blocks[SECURITY]
         return security.initial(self.node_key, self.node_key_signature, sequence=self.sequence, key_epoch=self.epoch)
 
     def teds(self, block: BlockId) -> bytes | None:
-        """The stored TEDS, None where there is none."""
+        """Return the stored TEDS, None if there is none."""
         return self.security_teds() if block == SECURITY else self.blocks.get(block)
 
     def present(self) -> list[BlockId]:
@@ -69,7 +69,7 @@ def in_factory_state(flash: Flash) -> Flash:
 
 
 class FlashMemory(Protocol):
-    """Where the state lies. ``commit`` either puts the whole new state or leaves the whole old one."""
+    """Storage of the state. ``commit`` either stores the whole new state or leaves the whole old one."""
 
     def load(self) -> Flash:
         """Return the state as it is."""

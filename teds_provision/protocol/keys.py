@@ -28,7 +28,7 @@ _HALF_ORDER = GROUP_ORDER // 2
 
 
 class PrivateKey(Protocol):
-    """A P-256 private key, wherever it lies."""
+    """A P-256 private key, in software or in a token."""
 
     @property
     def point(self) -> bytes:
@@ -38,7 +38,7 @@ class PrivateKey(Protocol):
         """SIG(key, message): ECDSA with SHA-256, r ‖ s, 64 octets, s in the lower half of the group order."""
 
     def sign_digest(self, digest: bytes) -> bytes:
-        """The same signature, of a message whose SHA-256 the caller made piece by piece."""
+        """Return the same signature, of a message whose SHA-256 the caller made piece by piece."""
 
     def ecdh(self, peer: bytes) -> bytes:
         """x-coordinate (32 octets) of the ECC CDH with the 65-octet point ``peer``."""
@@ -65,7 +65,7 @@ class SoftwareKey:
         return cls(value)
 
     def secret(self) -> bytes:
-        """Return the scalar, 32 octets. Whoever calls this must seal what it gives."""
+        """Return the scalar, 32 octets. The caller must seal it."""
         return self._key.private_numbers().private_value.to_bytes(32, "big")
 
     def sign(self, message: bytes) -> bytes:
@@ -110,7 +110,7 @@ def public_key(point: bytes) -> ec.EllipticCurvePublicKey:
 
 
 def is_point(point: bytes) -> bool:
-    """Say whether 65 octets are a valid uncompressed P-256 point."""
+    """True if 65 octets are a valid uncompressed P-256 point."""
     try:
         public_key(point)
     except BadDataError:
@@ -121,11 +121,11 @@ def is_point(point: bytes) -> bool:
 _OF_DIGEST = ec.ECDSA(Prehashed(hashes.SHA256()))
 
 Verify = Callable[[bytes, bytes, bytes], bool]
-"""Whether a signature (64 octets) is SIG(point, message); :func:`verify`, or a chip that does it."""
+"""Returns True if a signature (64 octets) is SIG(point, message); :func:`verify`, or a chip that does it."""
 
 
 def verify(point: bytes, message: bytes, signature: bytes) -> bool:
-    """Say whether ``signature`` (64 octets) is SIG(point, message); a high s is refused."""
+    """True if ``signature`` (64 octets) is SIG(point, message); a high s is refused."""
     if len(signature) != SIGNATURE_OCTETS:
         return False
     r, s = int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big")
@@ -170,33 +170,33 @@ def from_pem(text: bytes) -> bytes:
 
 @lru_cache(maxsize=256)
 def node_key_good(uuid: bytes, node: bytes, signature: bytes) -> bool:
-    """Whether SIG102 (64 octets) is a node's over its own key for this UUID; False for what is no point.
+    """True if SIG102 (64 octets) is a node's over its own key for this UUID; False if ``node`` is no point.
 
-    Asked at each step of a provisioning, about the same octets: the answer is remembered, as it never changes.
+    Cached: each step of a provisioning needs it for the same octets, and it never changes.
     """
     return verify(node, node_key_message(uuid, node), signature)
 
 
 def node_key_message(uuid: bytes, node: bytes) -> bytes:
-    """What field 102 signs."""
+    """Return the message that field 102 signs."""
     return b"TEDS1 node key\0" + uuid + node
 
 
 def station_key_message(station: bytes) -> bytes:
-    """What field 104 (SIG104) signs."""
+    """Return the message that field 104 (SIG104) signs."""
     return b"TEDS1 station key\0" + station
 
 
 def agreement_message(script: bytes) -> bytes:
-    """What sigN of the reply to Request signs; ``script`` is T, 32 octets."""
+    """Return the message that sigN of the reply to Request signs; ``script`` is T, 32 octets."""
     return b"TEDS1 agree\0" + script
 
 
 def prove_message(uuid: bytes, challenge: bytes) -> bytes:
-    """What the reply to Prove signs."""
+    """Return the message that the reply to Prove signs."""
     return b"TEDS1 prove\0" + uuid + challenge
 
 
 def reset_message(uuid: bytes, epoch: int, challenge: bytes) -> bytes:
-    """What the reply to Reset signs."""
+    """Return the message that the reply to Reset signs."""
     return b"TEDS1 reset\0" + uuid + epoch.to_bytes(4, "big") + challenge

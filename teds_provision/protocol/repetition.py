@@ -1,7 +1,7 @@
 """Repetition on a link: an octet-equal request gets its stored reply, nothing is run twice (profile.md, "Repetition").
 
 The node keeps, for each link, the last request and its reply for 20 s from the reply's end. Commands that change
-nothing (Identify, Prove, List, Query, Read, outside Sealed) are always run anew.
+nothing (Identify, Prove, List, Query, Read, outside Sealed) always run again.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ REPLY_SECONDS, REPEAT_SECONDS, TRIES = 5.0, 15.0, 3
 KEEP_SECONDS = 20.0
 """Longer than the 15 s in which a station repeats, so that no repetition finds its reply gone and is run again."""
 _IDEMPOTENT = {(128, 7), (128, 8), (128, 11), (1, 1), (1, 2)}
-"""Identify, Prove, List, Query, Read change nothing: they are always run anew, and answer what is true now."""
+"""Identify, Prove, List, Query, Read change nothing: they always run again, and answer the present state."""
 
 
 class Repetition:
@@ -39,7 +39,7 @@ class Repetition:
         return reply
 
     def reply_sent(self, now: float) -> None:
-        """The reply has left: it is kept from here on. A commit, or a long reply, may take seconds."""
+        """Start the time for which the reply is kept: it has left. A commit, or a long reply, may take seconds."""
         self._at = now
 
     def forget(self) -> None:

@@ -40,7 +40,7 @@ def pad(octets: bytes) -> bytes:
 
 
 def unpad(octets: bytes) -> bytes | None:
-    """Take the padding off; None where it is not right."""
+    """Remove the padding; None if it is wrong."""
     count = octets[-1] if octets else 0
     if len(octets) % BLOCK_OCTETS or not 1 <= count <= BLOCK_OCTETS or octets[-count:] != bytes([count]) * count:
         return None
@@ -48,7 +48,7 @@ def unpad(octets: bytes) -> bytes | None:
 
 
 def open_mac(key: bytes, uuid: bytes, counter: bytes, station: bytes) -> bytes:
-    """The mac of Open: HMAC-SHA-256(K, "station open" ‖ UUID ‖ c ‖ Es)[0:16].
+    """Return the mac of Open: HMAC-SHA-256(K, "station open" ‖ UUID ‖ c ‖ Es)[0:16].
 
     ``counter`` is c as the node gave it (8 octets), ``station`` Es (65 octets). It makes each Open good once, and lets
     a node refuse a stranger without point arithmetic.
@@ -58,7 +58,7 @@ def open_mac(key: bytes, uuid: bytes, counter: bytes, station: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class SessionKeys:
-    """What one Open gives: k_sn, k_ns (16 octets each), k_m (32, for operation messages) and the node's tag."""
+    """Keys of one Open: k_sn, k_ns (16 octets each), k_m (32, for operation messages) and the node's tag."""
 
     to_node: bytes = field(repr=False)
     to_station: bytes = field(repr=False)
@@ -83,7 +83,7 @@ def _seal_padded(key: bytes, counter: int, padded: bytes) -> bytes:
 
 
 def _decrypt(key: bytes, payload: bytes) -> bytes | None:
-    """The padded octets where the tag is right, else None."""
+    """Return the padded octets if the tag is right, else None."""
     try:
         return AESCCM(key, tag_length=TAG_OCTETS).decrypt(bytes(9) + payload[:4], payload[4:], None)
     except (InvalidTag, ValueError):
@@ -105,14 +105,14 @@ class StationSession:
         self._keys: SessionKeys | None = None
         self._counter = 0
         self.open_counter = b""
-        """c of Open, as the node gave it: the mac is over it, so a good reply says that it was the node's own."""
+        """c of Open, as the node gave it: the mac covers it, so a good reply proves that it was the node's own."""
 
     def request_counter(self) -> Command:
         """Return the empty Open, whose reply is c."""
         return security_command(Function.OPEN)
 
     def open(self, counter: bytes) -> Command:
-        """Return the Open to send for the node's c; raises GarbledError where c has not 8 octets."""
+        """Return the Open to send for the node's c; raises GarbledError if c does not have 8 octets."""
         assert self._one_time is not None, "open() after accept()"
         if len(counter) != COUNTER_OCTETS:
             raise GarbledError(f"The node's counter for Open has {len(counter)} octets, not {COUNTER_OCTETS}.")
@@ -137,7 +137,7 @@ class StationSession:
 
     @property
     def keys(self) -> SessionKeys:
-        """What Open gave, for trying a node out."""
+        """The keys of Open, for testing a node."""
         assert self._keys is not None, "keys before a good accept()"
         return self._keys
 
@@ -198,7 +198,7 @@ class NodeSession:
         return self._keys.messages
 
     def unseal(self, payload: bytes) -> bytes | None:
-        """Return the inner frame where tag and padding are right, else None. Changes nothing."""
+        """Return the inner frame if tag and padding are right, else None. Changes nothing."""
         padded = _decrypt(self._keys.to_node, payload)
         return None if padded is None else unpad(padded)
 

@@ -42,7 +42,7 @@ LAST_EPOCH = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Credentials:
-    """What a station shows: its key, and its owner's CA's signature over it (SIG104, 64 octets) with P(CA)."""
+    """A station's credentials: its key, and its owner's CA's signature over it (SIG104, 64 octets) with P(CA)."""
 
     key: PrivateKey
     station_signature: bytes
@@ -108,9 +108,9 @@ def derive(shared: bytes, nonce: bytes, script: bytes) -> LinkKey:
 
 @dataclass(frozen=True)
 class AgreedKey:
-    """What the station has after a good Request: the key to store as pending, and the Confirm to send then.
+    """The station's result of a good Request: the key to store as pending, and the Confirm to send then.
 
-    ``unsigned`` says that the node shows its initial Security TEDS: authentic, since sigN covers the transcript.
+    ``unsigned``: the node shows its initial Security TEDS: authentic, since sigN covers the transcript.
     """
 
     key: bytes = field(repr=False)
@@ -126,13 +126,13 @@ class AgreedKey:
 
 
 class TranscriptMismatchError(NotAuthenticError):
-    """A wrong tagN: the node's Security TEDS changed meanwhile, or the reply was disturbed. It accuses nobody."""
+    """A wrong tagN: the node's Security TEDS changed meanwhile, or the reply was disturbed. No proof of misbehavior."""
 
 
 def fit_to_agree(teds: bytes, uuid: bytes, pinned: str | None) -> SecurityTeds:
-    """What a node's Security TEDS must be before a Request is made: canonical, this profile's values, its own key.
+    """Check a node's Security TEDS before a Request: canonical, this profile's values, its own key.
 
-    ``pinned`` is the fingerprint that the whitelist holds, None where this contact pins. Raises NotCanonicalError,
+    ``pinned`` is the fingerprint that the whitelist holds, None if this contact pins. Raises NotCanonicalError,
     BadDataError (another ProfileVersion, SessionSuite or KeyAgreement, by name), KeyMismatchError, NotAuthenticError
     (field 102).
     """
@@ -204,7 +204,7 @@ class StationAgreement:
 
 
 def other_key(pinned: str, node: bytes) -> KeyMismatchError:
-    """The error for a known UUID that comes with another key."""
+    """Return the error for a known UUID that comes with another key."""
     return KeyMismatchError(
         f"This UUID is known with key {pinned[:16]}, the node shows {fingerprint(node)[:16]}.",
         hint="It may be a clone. If the board was replaced on purpose: whitelist remove UUID, then whitelist it anew.",
@@ -213,7 +213,7 @@ def other_key(pinned: str, node: bytes) -> KeyMismatchError:
 
 @dataclass(frozen=True)
 class NodeAgreement:
-    """The node's half between Request and Confirm; lies in RAM only."""
+    """The node's half between Request and Confirm; kept in RAM only."""
 
     reply: bytes = field(repr=False)
     key: bytes = field(repr=False)
@@ -254,5 +254,5 @@ def good_point(point: bytes, own: bytes) -> bool:
 
 
 def good_one_time(point: bytes, *others: bytes) -> bool:
-    """Whether ``point`` may be the other side's one-time key: a point, none of one's own, nor a static one at hand."""
+    """True if ``point`` may be the other side's one-time key: a point, none of one's own, nor a known static one."""
     return point not in others and is_point(point)

@@ -1,6 +1,6 @@
-"""Bundles, receipts and revocations of a handover: what they say and how they are signed and sealed.
+"""Bundles, receipts and revocations of a handover: their content, and how they are signed and sealed.
 
-The modules are loaded at their first use: whoever shows a file need not load the cryptography of a bundle.
+The modules are loaded at their first use: showing a file does not need the cryptography of a bundle.
 """
 
 from typing import TYPE_CHECKING

@@ -3,8 +3,8 @@
 The format is that of profile.md, "Handover between base stations".
 
 :func:`seal_bundle` makes one, :func:`open_bundle` checks all that can be checked without a store, :func:`peek_bundle`
-reads what stands in the clear. What remains for whoever holds the store: a known UUID with another node key, an epoch
-that would go back, an id that was seen before, a node on the deny list, a receiver that is not yet certified.
+reads the clear part. The owner of the store checks the rest: a known UUID with another node key, an epoch that would go
+back, an id that was seen before, a node on the deny list, a receiver that is not yet certified.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Bundle:
 
 
 def check_rules(bundle: Bundle) -> None:
-    """The rules between members, the same for sender and receiver."""
+    """Check the rules between members, the same for sender and receiver."""
     if bundle.mode == "move" and len(bundle.to) != 1:
         raise PolicyError(f"A move has exactly one receiver, this one {len(bundle.to)}.")
     if not bundle.to:
@@ -120,12 +120,12 @@ def _check_writable(node: BundledNode) -> None:
 
 
 def payload_of(bundle: Bundle) -> bytes:
-    """The whole JSON that is signed."""
+    """Return the whole JSON that is signed."""
     return b"".join(payload_pieces(bundle, bundle.nodes, len(bundle.nodes)))
 
 
 def payload_pieces(bundle: Bundle, nodes: Iterable[BundledNode], count: int) -> Iterator[bytes]:
-    """The JSON that is signed, node by node: ten thousand of them as objects would take many times its size."""
+    """Yield the JSON that is signed, node by node: ten thousand of them as objects would take many times its size."""
     members: dict[str, object] = {
         "format": FORMAT,
         "id": bundle.id,
@@ -247,7 +247,7 @@ def _read_node(members: Members) -> BundledNode:
 
 
 def _shared(text: str | None) -> str | None:
-    """The same text object for all nodes of a profile: there are few profiles and many nodes."""
+    """Return the same text object for all nodes of a profile: there are few profiles and many nodes."""
     return None if text is None else sys.intern(text)
 
 
@@ -272,7 +272,7 @@ CONTENT_TYPE = "JWS"
 MAX_BUNDLE_OCTETS = 64 * 1024 * 1024
 """More is not read: about 80,000 nodes. Look at the size of a file before reading it."""
 _MAX_PAYLOAD_OCTETS = (MAX_BUNDLE_OCTETS - 128 * 1024) // 16 * 9
-"""What fits into one: base64url of base64url, after headers of at most 256 recipients."""
+"""The largest payload: base64url of base64url, after headers of at most 256 recipients."""
 CLOCK_TOLERANCE = timedelta(minutes=10)
 """How far a sender's clock may be ahead."""
 
@@ -281,9 +281,9 @@ CLOCK_TOLERANCE = timedelta(minutes=10)
 class OpenedBundle:
     """A bundle that passed every check but those of the store.
 
-    ``station_signature`` is the CA's over this station's key, None where the bundle brings none; ``revocations`` are
-    those of trusted signers, ``unknown_revocations`` counts the others; ``sha256`` is over the octets of the file,
-    ``signed_sha256`` over the JWS in it, which nobody on the way can change: receipts name that.
+    ``station_signature`` is the CA's over this station's key, None if the bundle has none; ``revocations`` are those of
+    trusted signers, ``unknown_revocations`` counts the others; ``sha256`` is over the octets of the file,
+    ``signed_sha256`` over the JWS in it, which cannot be changed on the way: receipts name that.
     """
 
     bundle: Bundle
@@ -297,7 +297,10 @@ class OpenedBundle:
 
 @dataclass(frozen=True)
 class BundleHeader:
-    """What a bundle shows without a key. Nothing here is authenticated. ``recipients`` are fingerprints, or ""."""
+    """The part of a bundle that is readable without a key. Nothing in it is authenticated.
+
+    ``recipients`` are fingerprints, or "".
+    """
 
     algorithm: str
     encryption: str
@@ -320,7 +323,7 @@ def seal_pieces(
 
     Its ``signed_sha256``, the digest of what was signed, is what the receipt will name.
 
-    Raises BadDataError or PolicyError where the payload breaks a rule that :func:`open_bundle` would hold against it.
+    Raises BadDataError or PolicyError if the payload breaks a rule that :func:`open_bundle` checks.
     """
     if any(not is_point(point) for point in recipients):
         raise BadDataError("A recipient's key is not a P-256 point.")
@@ -336,7 +339,7 @@ def seal_pieces(
 
 
 def _within(pieces: Iterable[bytes], count: int) -> Iterator[bytes]:
-    """Pieces of a payload; raises BadDataError where the bundle becomes longer than a reader takes."""
+    """Yield the pieces of a payload; raises BadDataError if the bundle becomes longer than a reader accepts."""
     octets = 0
     for piece in pieces:
         octets += len(piece)
@@ -413,7 +416,7 @@ def _opened(source: Source, recipient: PrivateKey, trusted: FindKey, max_octets:
 
 
 def _station_signature(bundle: Bundle, station: bytes) -> bytes | None:
-    """SIG104 over ``station``, verified; None where there is none."""
+    """Return SIG104 over ``station``, verified; None if there is none."""
     signature = bundle.station_signatures.get(fingerprint(station))
     if signature is not None and not verify(bundle.ca, station_key_message(station), signature):
         raise NotAuthenticError("The CA's signature over the receiver's key does not verify under the bundle's CA.")

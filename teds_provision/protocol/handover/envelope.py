@@ -1,9 +1,9 @@
 """A signed payload sealed a piece at a time, and opened again: compact JWS (ES256) inside a JWE (A256GCM).
 
-A bundle of ten thousand nodes is 7 MB, and each of its forms in memory at once would be five times that. Written, the
-signature comes last in the JWS and the tag last in the JWE, so a payload of any length passes through once. Read, its
-ciphertext stays where it lies until the key for it is known. What came out is given on only when tag and signature are
-good. The octets are those of :mod:`.jose`: every JOSE library writes and reads them.
+A bundle of ten thousand nodes is 7 MB, and all of its forms in memory at once would be five times that. When writing,
+the signature comes last in the JWS and the tag last in the JWE, so a payload of any length passes through once. When
+reading, the ciphertext stays in the file until its key is known. The plaintext is returned only if tag and signature
+are good. The octets are those of :mod:`.jose`: every JOSE library writes and reads them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Source = bytes | BinaryIO
 
 
 class EnvelopeWriter:
-    """What is written for a payload: :meth:`body`, then :meth:`end`, without which nobody can open or believe it.
+    """Writer of a payload: :meth:`body`, then :meth:`end`, without which the result can be neither opened nor verified.
 
     The digests and ``octets`` are known when :meth:`end` has returned. ``signed_sha256`` is over the JWS inside.
     """
@@ -102,7 +102,7 @@ class EnvelopeWriter:
 
 @dataclass(frozen=True)
 class UnsealedPayload:
-    """What was sealed and signed: ``kid`` and point of the signer, the payload, and both digests in hex."""
+    """An opened payload: ``kid`` and point of the signer, the payload, and both digests in hex."""
 
     kid: str
     signer: bytes
@@ -155,10 +155,10 @@ def unseal(
 
 
 def read_envelope(file: BinaryIO, max_octets: int) -> Envelope:
-    """Read the JSON of a JWE, leaving the inner part of a long ciphertext where it is; raises BadDataError.
+    """Read the JSON of a JWE, leaving the inner part of a long ciphertext in the file; raises BadDataError.
 
-    A run of base64url characters in a JSON text is replaced by another one and what is read is the same but for that
-    run; so it is no matter in which member, or in which piece of the file, it begins.
+    A run of base64url characters in a JSON text can be replaced by another one without any effect on the rest; so it
+    does not matter in which member, or in which piece of the file, it begins.
     """
     size = file.seek(0, os.SEEK_END)
     check_size(size, max_octets, "the sealed document")
@@ -199,7 +199,7 @@ class _Outline:
         self.last = self.octets
 
     def _is_run(self, piece: bytes, here: int) -> bool:
-        """Whether a piece is nothing but base64url, and begins the run or goes on with it."""
+        """True if a piece is nothing but base64url, and begins or continues the run."""
         if len(piece) < PIECE or self.last not in (0, here):
             return False
         begins_in_an_escape = not self.last and b"\\" in self.text[-_ESCAPE:]
@@ -207,7 +207,7 @@ class _Outline:
 
 
 def _cut(ciphertext: object, mark: str) -> tuple[object, bool, str]:
-    """Cut the ciphertext in two where the mark stands in it."""
+    """Cut the ciphertext in two at the mark."""
     if not isinstance(ciphertext, str):
         return ciphertext, False, ""
     before, found, after = ciphertext.partition(mark)
@@ -234,9 +234,9 @@ def _ascii(text: object) -> bytes:
 
 
 class _SplitJws:
-    """A compact JWS that comes in pieces: its payload decoded, its edges as they are. Nothing of it is believed yet.
+    """A compact JWS that comes in pieces: its payload decoded, its edges unchanged. Nothing of it is verified yet.
 
-    A fault in its form is told only at the end, after the tag was checked.
+    A fault in its form is reported only at the end, after the tag was checked.
     """
 
     def __init__(self) -> None:

@@ -1,12 +1,12 @@
 """The two JOSE forms of a handover: compact JWS with ES256, and JWE (JSON) with ECDH-ES+A256KW and A256GCM.
 
-RFC 7515, 7516 and 7518 sections 3.4, 4.6 and 5.3, on ``cryptography``, for keys that may lie in a token: a
-:class:`PrivateKey` signs and agrees, nothing here sees its scalar. Exactly these algorithms exist; a header cannot ask
-for another one, for compression, or for anything "critical". Every octet string ends in a value or in
+RFC 7515, 7516 and 7518 sections 3.4, 4.6 and 5.3, on ``cryptography``, for keys that may be in a token: a
+:class:`PrivateKey` signs and agrees, nothing here sees its scalar. Exactly these algorithms exist; a header cannot
+select another one, compression, or anything "critical". Every octet string ends in a value or in
 :class:`NotAuthenticError` (signature, tag), :class:`PolicyError` (algorithm, extension, recipient) or
-:class:`BadDataError` (form, size). What a key in a token raises (``VaultError``) passes through.
+:class:`BadDataError` (form, size). An error of a key in a token (``VaultError``) passes through.
 
-The profile's rule that s must be low does not hold in JOSE: other people's signers give either s.
+The profile's rule that s must be low does not hold in JOSE: other signers give either s.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ _MAX_PARTY_INFO_OCTETS = 256
 MAX_SEPARATORS = 20 * MAX_RECIPIENTS
 
 FindKey = Callable[[str], bytes | None]
-"""From a ``kid`` to the 65-octet point of a trusted key, None where there is none."""
+"""Maps a ``kid`` to the 65-octet point of a trusted key, None if there is none."""
 
 
 @dataclass(frozen=True)
 class VerifiedJws:
-    """What stands under a good signature: ``kid`` and point of the signer, and the payload."""
+    """Content under a good signature: ``kid`` and point of the signer, and the payload."""
 
     kid: str
     signer: bytes
@@ -79,7 +79,7 @@ class VerifiedJws:
 
 @dataclass(frozen=True)
 class JweHeader:
-    """What a JWE says in the clear, authenticated by nothing; ``recipients`` are the ``kid`` of each, "" for none."""
+    """The clear part of a JWE, unauthenticated; ``recipients`` are the ``kid`` of each, "" for none."""
 
     algorithm: str
     encryption: str
@@ -157,7 +157,7 @@ class JweWriter:
     """A JWE in the General JSON serialization, written a piece at a time: ``begin``, ``more`` of the payload, ``end``.
 
     Algorithms and ``cty`` are in the protected header, ``kid`` (the fingerprint) and ``epk`` with each recipient. The
-    tag comes last: without :meth:`end` nobody can open what was written. Raises BadDataError for a bad point.
+    tag comes last: without :meth:`end` the result cannot be opened. Raises BadDataError for a bad point.
     """
 
     def __init__(self, recipients: Sequence[bytes], *, cty: str) -> None:
@@ -172,7 +172,7 @@ class JweWriter:
         self._text = Base64urlWriter()
 
     def begin(self) -> bytes:
-        """Return what stands before the ciphertext."""
+        """Return the octets before the ciphertext."""
         return self._head[:-1] + b',"ciphertext":"'  # base64url needs no escape
 
     def more(self, payload: bytes | memoryview) -> bytes:
@@ -210,8 +210,8 @@ def _wrapping_key(shared: bytes, party_u: bytes, party_v: bytes) -> bytes:
 def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> bytes:
     """Open a JWE that names ``key`` among its recipients; General or Flattened JSON serialization.
 
-    A recipient entry is ours where its ``kid`` is our fingerprint, or where it has no ``kid``. Size is looked at before
-    anything is parsed. Raises NotAuthenticError, PolicyError or BadDataError.
+    A recipient entry is ours if its ``kid`` is our fingerprint, or if it has no ``kid``. Size is checked before
+    parsing. Raises NotAuthenticError, PolicyError or BadDataError.
     """
     document = _document(octets, max_octets)
     content_key, seal = content_key_for(document, key, cty=cty)
@@ -264,12 +264,12 @@ def content_key_for(document: Mapping[str, Any], key: PrivateKey, *, cty: str) -
 
 
 def read_header(octets: bytes, *, max_octets: int) -> JweHeader:
-    """Read what a JWE says in the clear, without any key; raises BadDataError."""
+    """Read the clear part of a JWE, without any key; raises BadDataError."""
     return header_of(_document(octets, max_octets))
 
 
 def header_of(document: Mapping[str, Any]) -> JweHeader:
-    """Read what a JWE that :func:`parse_document` gave says in the clear; raises BadDataError."""
+    """Read the clear part of a JWE that :func:`parse_document` returned; raises BadDataError."""
     shared = _shared_header(document)
     headers = [
         _merged(shared, _mapping(entry.get("header"), "The header of a recipient")) for entry in _entries(document)
@@ -316,7 +316,7 @@ def _entries(document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
 
 
 def _content_key(header: Mapping[str, Any], entry: Mapping[str, Any], key: PrivateKey) -> bytes | None:
-    """Agree and unwrap; None where the wrapped key is not for this key."""
+    """Agree and unwrap; return None if the wrapped key is not for this key."""
     one_time = point_of(header.get("epk"), "The one-time key (epk)")
     wrapped = decode_base64url(entry.get("encrypted_key"), "The encrypted key")
     party_u, party_v = _party_info(header, "apu"), _party_info(header, "apv")
@@ -385,7 +385,7 @@ def _text(value: object) -> str:
 
 
 def _shown(value: object) -> str:
-    """A value from outside, short and printable, for a message."""
+    """Return a value from outside, short and printable, for a message."""
     return ascii(value)[:40]
 
 
@@ -409,10 +409,10 @@ def public_jwk(point: bytes) -> dict[str, str]:
 
 
 def point_of(jwk: object, what: str) -> bytes:
-    """Return the point (65 octets) of a public P-256 JWK; members that do not matter (kid, use, alg) are passed over.
+    """Return the point (65 octets) of a public P-256 JWK; other members (kid, use, alg) are ignored.
 
     Raises BadDataError that names ``what``: another key type or curve, a private key, wrong lengths, not on the curve.
-    The test of the curve is plain arithmetic on public values, as ten thousand of them stand in a bundle.
+    The test of the curve is plain arithmetic on public values, as a bundle has ten thousand of them.
     """
     if not isinstance(jwk, dict):
         raise BadDataError(f"{what} is not a JSON Web Key.")

@@ -1,7 +1,7 @@
-"""The signed receipt of a handover: it tells the sender of a bundle what became of it.
+"""The signed receipt of a handover: it reports the outcome of a bundle to its sender.
 
 Compact JWS, ``typ`` ``teds-receipt+jws``. ``from`` is the station that took the keys in and signs, ``to`` the one that
-sent the bundle: a receipt is a message of its own.
+sent the bundle: a receipt is a separate message.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Receipt:
 
 
 def seal_receipt(receipt: Receipt, signer: PrivateKey) -> bytes:
-    """Sign a receipt; returns the octets of the file. Raises BadDataError where ``sender`` is not the signer."""
+    """Sign a receipt; return the octets of the file. Raises BadDataError if ``sender`` is not the signer."""
     if receipt.sender != fingerprint(signer.point):
         raise BadDataError("The receipt names another sender than the key that signs it.")
     members = {

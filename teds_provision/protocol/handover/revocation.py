@@ -1,9 +1,9 @@
-"""A signed statement that a node is trusted no more; it travels in every bundle (member ``revoked``).
+"""A signed statement that a node is no longer trusted; every bundle carries those of its sender (member ``revoked``).
 
-Compact JWS (ES256, ``kid`` the signer's fingerprint), ``typ`` ``teds-revocation+jws``, payload
-``{"format": "teds-revocation/1", "uuid", "fingerprint", "why", "created", "from"}``; ``fingerprint`` is that of the
-node's key, null where it is not known. Section 6 of the profile does not list it: others pass it over, and a bundle
-without it is as good.
+Compact JWS (ES256, ``kid`` the signer's fingerprint), ``typ`` ``teds-revocation+jws``, payload ``{"format":
+"teds-revocation/1", "uuid", "fingerprint", "why", "created", "from"}``; ``fingerprint`` is that of the node's key, null
+if it is not known. Section 6 of the profile does not list it: other readers ignore it, and a bundle without it is as
+good.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_OCTETS = 16384
 
 @dataclass(frozen=True)
 class Revocation:
-    """A node by UUID (10 octets) and, where known, its key's fingerprint; why; when; the signer's fingerprint.
+    """A node by UUID (10 octets) and, if known, its key's fingerprint; why; when; the signer's fingerprint.
 
     ``statement`` is the signed text, to be kept and passed on.
     """

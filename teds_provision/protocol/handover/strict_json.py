@@ -163,7 +163,7 @@ def load_long(octets: bytearray, what: str, name: str, make: Callable[[object], 
 
 @contextmanager
 def _failing_as(what: str) -> Iterator[None]:
-    """Say what is wrong with a JSON text."""
+    """Report what is wrong with a JSON text."""
     try:
         yield
     except RecursionError as error:
@@ -183,7 +183,7 @@ def _decoded(octets: bytes | bytearray) -> str:
 class _Walk:
     """Reads the outermost object of a JSON text member by member (RFC 8259 sections 2, 4 and 5).
 
-    A window of the text is decoded at a time, and longer where a value does not end in it.
+    Decodes a window of the text at a time, and a longer one if a value does not end in it.
     """
 
     def __init__(self, octets: bytearray) -> None:
@@ -244,7 +244,7 @@ class _Walk:
                 return ""
 
     def _value(self) -> Any:
-        """Read a value; one that ends where the window does may go on behind it."""
+        """Read a value; one that ends at the window's end may continue behind it."""
         self.next()
         window = _WINDOW
         while True:
@@ -260,7 +260,7 @@ class _Walk:
             window *= 2
 
     def _more(self, count: int) -> bool:
-        """Decode as many octets more and let go of the text that was read; False where there are none."""
+        """Decode as many octets more and drop the text that was read; False if there are none."""
         if not self._octets:
             return False
         piece = self._octets[:count]
@@ -318,7 +318,7 @@ class Members:
         self._where = where
 
     def get(self, name: str) -> Any:
-        """Return a member as it is, None where it is absent or null."""
+        """Return a member as it is, None if it is absent or null."""
         return self._members.get(name)
 
     def text(self, name: str) -> str:
@@ -326,16 +326,16 @@ class Members:
         return self._printable(name, self.get(name))
 
     def texts(self, name: str) -> tuple[str, ...]:
-        """Return a list of such texts, empty where it is absent or null."""
+        """Return a list of such texts, empty if it is absent or null."""
         return tuple(self._printable(name, value) for value in self.list_of(name, required=False))
 
     def text_or_none(self, name: str) -> str | None:
-        """Like :meth:`text`; None where it is absent or null."""
+        """Return the value of :meth:`text`; None if it is absent or null."""
         value = self._members.get(name)
         return None if value is None else self._printable(name, value)
 
     def list_of(self, name: str, *, required: bool = True) -> list[Any]:
-        """Return a list; an empty one where an optional one is absent or null."""
+        """Return a list; an empty one if an optional one is absent or null."""
         value = self.get(name)
         if value is None and not required:
             return []
@@ -359,7 +359,7 @@ class Members:
         return self._match(name, _SHA256, "is no SHA-256 of 64 hex digits").lower()
 
     def sha256_or_none(self, name: str) -> str | None:
-        """Like :meth:`sha256`; None where it is absent or null."""
+        """Return the value of :meth:`sha256`; None if it is absent or null."""
         return None if self._members.get(name) is None else self.sha256(name)
 
     def time(self, name: str) -> datetime:
@@ -397,7 +397,7 @@ class Members:
 
 
 def is_label(text: str) -> bool:
-    """Whether a text may stand where people read it: printable, at most 1,024 characters."""
+    """True if a text may be shown to people: printable, at most 1,024 characters."""
     return text.isprintable() and len(text) <= _MAX_TEXT
 
 

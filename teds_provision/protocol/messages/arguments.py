@@ -30,7 +30,7 @@ _TAG_OF: Final = {"u8": {1, 8}, "u16": {2}, "u32": {3}, "bool": {8, 1}, "f32": {
 
 @dataclass(frozen=True)
 class Argument:
-    """One argument: ``offset`` of its first octet in the message, ``meaning`` in words where the number is a code."""
+    """One argument: ``offset`` of its first octet in the message, ``meaning`` in words if the number is a code."""
 
     name: str
     type: str
@@ -48,7 +48,7 @@ def words(layout: str) -> Iterator[tuple[str, str]]:
 
 
 def size_of(kind: str) -> int | None:
-    """Octets of a type of fixed size, None where it varies."""
+    """Return the octets of a type of fixed size, None if it varies."""
     if kind in _FIXED:
         return _FIXED[kind]
     if kind[0] == "o" and kind[1:].isdigit():
@@ -103,10 +103,10 @@ def _extent(payload: bytes, at: int, kind: str, count: int) -> int:
 
 
 def read_tagged(payload: bytes, layout: str, base: int) -> list[Argument] | None:
-    """Read tagged arguments (type code u8 ‖ length u16 ‖ value); None where the payload is not of that school.
+    """Read tagged arguments (type code u8 ‖ length u16 ‖ value); None if the payload is not of that school.
 
-    Sections of a payload are taken as tagged only when every one closes, there are as many as the layout asks, and
-    those of fixed size carry the type code that the layout means.
+    Sections of a payload are taken as tagged only if every one closes, there are as many as in the layout, and those of
+    fixed size carry the type code that the layout means.
     """
     wanted = list(words(layout))
     parts: list[Argument] = []

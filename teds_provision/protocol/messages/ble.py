@@ -27,7 +27,7 @@ def piece_octets(mtu: int) -> int:
 
 
 def cut(transaction: int, message: bytes, mtu: int) -> Iterator[bytes]:
-    """The frames of one command or reply."""
+    """Yield the frames of one command or reply."""
     room = piece_octets(mtu)
     for offset in range(0, max(1, len(message)), room):
         yield _HEAD.pack(transaction, len(message), offset) + message[offset : offset + room]
@@ -43,8 +43,8 @@ class ReceivedMessage(NamedTuple):
 class BleAssembly:
     """Puts frames of one connection together; a message longer than ``most`` octets is never begun.
 
-    Offset 0 begins anew; a frame that does not continue what is held drops it. Nothing is answered to either: the other
-    side repeats.
+    Offset 0 starts a new message; a frame that does not continue the current one drops it. Neither is answered: the
+    other side repeats.
     """
 
     def __init__(self, most: int) -> None:
@@ -53,7 +53,7 @@ class BleAssembly:
         self._held: bytearray | None = None
 
     def add_frame(self, frame: bytes) -> ReceivedMessage | None:
-        """Take one frame; the message where it was the last one."""
+        """Add one frame; return the message if it was the last one."""
         if len(frame) < _HEAD.size:
             self._held = None
             return None

@@ -108,7 +108,7 @@ class Reply:
 
     @property
     def reason(self) -> int | None:
-        """The refusal's reason, None for a success or where the node gave none."""
+        """The refusal's reason, None for a success or if the node gave none."""
         return self.payload[0] if not self.ok and self.payload else None
 
     def encode(self) -> bytes:
@@ -117,7 +117,7 @@ class Reply:
 
 
 def decode_reply(frame: bytes) -> Reply:
-    """Read a whole reply frame; raises GarbledError when its length is not what it says."""
+    """Decode a whole reply frame; raises GarbledError if its length differs from its length field."""
     if len(frame) < REPLY_HEADER:
         raise GarbledError(f"A reply frame has at least {REPLY_HEADER} octets, this one {len(frame)}.")
     flag, length = struct.unpack_from(">BH", frame)
@@ -138,7 +138,7 @@ LIST_OVERHEAD: Final = 42
 
 
 def security_command(function: Function, payload: bytes = b"") -> Command:
-    """A command of class 128; they all go to channel 0."""
+    """Return a command of class 128; they all go to channel 0."""
     return Command(0, SECURITY, function, payload)
 
 

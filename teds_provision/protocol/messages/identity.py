@@ -1,4 +1,4 @@
-"""Identify (128.7): what a node says of itself to anyone, unauthenticated (profile.md, "Identify, Prove, List")."""
+"""Identify (128.7): a node's unauthenticated description of itself (profile.md, "Identify, Prove, List")."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LEAST_MESSAGE, MOST_MESSAGE = 512, 4094
 
 
 class NodeState(IntEnum):
-    """Where a node stands: no key; a key; a key and a committed datasheet since the last reset."""
+    """State of a node: no key; a key; a key and a committed datasheet since the last reset."""
 
     FACTORY = 0
     KEYED = 1

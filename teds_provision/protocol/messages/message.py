@@ -1,6 +1,6 @@
 """Messages between NCAP and TIM (2007) and between application and NCAP (2024): octets to names, and back.
 
-:func:`decode_message` never raises, whatever the octets; what is wrong or guessed stands in ``findings``. Of the two
+:func:`decode_message` never raises, whatever the octets; ``findings`` lists what is wrong or guessed. Of the two
 payload schools of the 2007 commands both are read, only plain concatenation is written (formats.md, "Messages").
 """
 
@@ -70,12 +70,12 @@ class Message:
 
 
 def looks_like_message(octets: bytes) -> bool:
-    """Whether header, length and codes fit a known command, reply or network service; a TEDS never does."""
+    """True if header, length and codes fit a known command, reply or network service; never for a TEDS."""
     return _sniff(octets) != "unknown"
 
 
 def decode_message(octets: bytes, *, request: Message | None = None) -> Message:
-    """Read any octets as a message; a 2007 reply is read for what it is where its ``request`` is given."""
+    """Decode any octets as a message; a 2007 reply is decoded by its ``request`` if given."""
     if request is not None and request.kind == "command":
         return _reply(octets, request)
     kind = _sniff(octets, lenient=True)

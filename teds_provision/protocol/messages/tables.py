@@ -1,12 +1,12 @@
-"""Commands, replies and network services by name: one table, from which both decoding and composing go.
+"""Commands, replies and network services by name: one table for both decoding and composing.
 
 A layout is a string of ``name:type`` words, in wire order. Types: ``u8 u16 u32 bool f32``, ``oN`` (N octets as they
 are), ``uuid`` (16 octets), ``text`` (up to a NUL), ``time`` (TimeInstance of the 2024 messages, 10 octets),
 ``duration`` (8 octets), ``teds`` (a whole TEDS), ``octets`` (the rest), ``blocks`` (channel u16 and access code u8,
-repeated), ``u16s texts uuids`` (as many as the ``count`` before says).
+repeated), ``u16s texts uuids`` (as many as the ``count`` before).
 
-What is read of them: formats.md, "Messages"; class 128 is the security profile's. Classes 4 to 7 of the 2007 commands
-rest on one public implementation, the layouts of announcements and departures of 2024 too.
+Source: formats.md, "Messages"; class 128 is the security profile's. Classes 4 to 7 of the 2007 commands rest on one
+public implementation, the layouts of announcements and departures of 2024 too.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, F
 class Spec(NamedTuple):
     """A command or a service: its name, the layout of its arguments, and of its reply (None: it has none).
 
-    ``answer`` is the layout of the reply to the command without arguments, where that is another form of it (Open).
+    ``answer`` is the layout of the reply to the command without arguments, if that is another form of it (Open).
     """
 
     name: str
@@ -319,7 +319,7 @@ NETWORK: Final[dict[tuple[int, int], Spec]] = {
 
 
 def describe_command(command: Command) -> str:
-    """A command in words: name, class and function, payload octets; "Prove (128.8), 31 octets"."""
+    """Describe a command: name, class and function, payload octets; "Prove (128.8), 31 octets"."""
     number = f"{command.command_class}.{command.function}"
     kind = Function if command.command_class == SECURITY else TedsFunction
     if command.command_class in (COMMON, SECURITY) and command.function in {int(code) for code in kind}:
@@ -330,7 +330,7 @@ def describe_command(command: Command) -> str:
 
 
 def describe_reply(reply: Reply) -> str:
-    """A reply in words: "success, 64 octets", "refusal 4"."""
+    """Describe a reply: "success, 64 octets", "refusal 4"."""
     if reply.ok:
         return f"success, {len(reply.payload)} octets"
     return f"refusal {reply.reason}" if len(reply.payload) == 1 else f"a refusal of {len(reply.payload)} octets"
@@ -353,7 +353,7 @@ def describe_request(command: Command) -> str:
 
 
 def describe_answer(command: Command, reply: Reply) -> str:
-    """A reply in words, with what it answers: "reply to Prove (128.8): success, 64 octets"."""
+    """Describe a reply with its command: "reply to Prove (128.8): success, 64 octets"."""
     text = f"reply to {describe_command(command).rpartition(',')[0]}: {describe_reply(reply)}"
     if reply.reason is not None and reply.reason in {int(reason) for reason in Reason}:
         text += f" ({Reason(reply.reason).name.lower().replace('_', ' ')})"

@@ -1,4 +1,4 @@
-"""What data messages take of a link: the node's budget, and the load of a CAN bus (operation.md sections 4 and 6)."""
+"""The share of a link that data messages use: the node's budget, the load of a CAN bus (operation.md sections 4, 6)."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ _SEGMENTS: Final = 7
 
 
 class DataAddress(NamedTuple):
-    """What the identifier of a data frame says; ``station`` and ``node`` are source addresses."""
+    """The fields of a data frame's identifier; ``station`` and ``node`` are source addresses."""
 
     station: int
     stream: int
@@ -38,7 +38,7 @@ class DataAddress(NamedTuple):
 
 
 class DriveAddress(NamedTuple):
-    """What the identifier of a Drive frame says."""
+    """The fields of a Drive frame's identifier."""
 
     node: int
     station: int
@@ -65,29 +65,29 @@ def drive_address(identifier: int) -> DriveAddress | None:
 
 
 def trigger_identifier(station: int) -> int:
-    """Identifier of a station's trigger frame."""
+    """Return the identifier of a station's trigger frame."""
     return TRIGGER | station
 
 
 def trigger_station(identifier: int) -> int | None:
-    """The station of a trigger frame; None for any other."""
+    """Return the station of a trigger frame; None for any other."""
     station = identifier & 0xFF
     good = identifier & 0x1FFFFF00 == TRIGGER and FIRST_STATION <= station <= LAST_STATION
     return station if good else None
 
 
 def fd_length(octets: int) -> int:
-    """The shortest length that CAN FD knows for so many octets, at most 64."""
+    """Return the shortest CAN FD length that holds so many octets, at most 64."""
     return int(next(length for length in _FD_LENGTHS if length >= octets))
 
 
 def next_segment(segment: int) -> int:
-    """The segment that follows: 0, 1 to 7, 1 to 7 …."""
+    """Return the segment that follows: 0, 1 to 7, 1 to 7 …."""
     return segment % _SEGMENTS + 1
 
 
 class Segment(NamedTuple):
-    """One frame's share of a message: its segment, and the frame's data (Drive: the segment stands in front)."""
+    """One frame's share of a message: its segment, and the frame's data (Drive: the segment comes first in it)."""
 
     segment: int
     data: bytes
@@ -125,7 +125,7 @@ class StreamAssembly:
         self._next = 0
 
     def add_segment(self, segment: int, data: bytes) -> bytes | None:
-        """Take one frame (Drive: :meth:`add_drive_segment`); the whole message where it was the last one."""
+        """Add one frame (Drive: :meth:`add_drive_segment`); return the whole message if it was the last one."""
         if segment == 0:
             if self._held is not None:
                 self.broken += 1
@@ -158,10 +158,10 @@ class StreamAssembly:
 
 
 def ble_frame(stream: int, message: bytes) -> bytes:
-    """A data message as one notification: stream ‖ message. A Drive message is written under 0."""
+    """Return a data message as one notification: stream ‖ message. A Drive message is written under 0."""
     return bytes([stream]) + message
 
 
 def read_ble_frame(octets: bytes) -> tuple[int, bytes] | None:
-    """Stream and message of a notification; None where it is no such thing."""
+    """Return stream and message of a notification; None if it is malformed."""
     return (octets[0], octets[1:]) if len(octets) > 1 and octets[0] <= 3 else None

@@ -49,7 +49,7 @@ class Claims:
         return frozenset(sensors | acting)
 
     def holds(self, session: NodeSession, channel: int) -> bool:
-        """Whether a session claims a channel."""
+        """True if a session claims a channel."""
         held = self.actuators.get(channel)
         return (held is not None and held.session is session) or session in self._sensors.get(channel, ())
 
@@ -129,7 +129,7 @@ class Claims:
                 self.release(session)
 
     def next_deadline(self) -> int | None:
-        """When :meth:`expire` has something to do next, real ns; None where nothing is claimed."""
+        """Return when :meth:`expire` is due next, real ns; None if nothing is claimed."""
         due = [held.deadline for held in self.actuators.values()]
         due += [_last_sign(session) + lease for session, lease in self._leases.items()]
         return min(due, default=None)

@@ -62,7 +62,7 @@ class OperateCommand:
     dead_man: int | None = None
 
     def command(self) -> Command:
-        """The command."""
+        """Return the command."""
         payload = self.digest + bytes([self.lease])
         if self.dead_man is not None:
             payload += struct.pack(">H", self.dead_man)
@@ -130,7 +130,10 @@ def read_data_set(channel: int) -> Command:
 
 
 def decode_data_set(payload: bytes, octets: int) -> bytes:
-    """The data set of a reply to 3.1; raises GarbledError where it has not ``octets`` octets from offset 0 on."""
+    """Return the data set of a reply to 3.1.
+
+    Raises GarbledError if it does not hold ``octets`` octets from offset 0 on.
+    """
     if len(payload) != 4 + octets or payload[:4] != bytes(4):
         raise GarbledError(f"A data set of {octets} octets came as {max(0, len(payload) - 4)}.")
     return payload[4:]
@@ -167,7 +170,7 @@ class SampleReply:
 
     @property
     def valid(self) -> bool:
-        """Whether every value is valid."""
+        """True if every value is valid."""
         return not self.flags & NOT_VALID
 
 
@@ -185,7 +188,7 @@ POWER: Final = security_command(Function.POWER)
 
 
 def bit_words(kind: type[IntFlag], value: int) -> list[str]:
-    """The bits that are set, as words: ``in field``, ``too low``."""
+    """Return the names of the set bits: ``in field``, ``too low``."""
     return [bit.name.lower().replace("_", " ") for bit in kind if value & bit and bit.name]
 
 
@@ -203,7 +206,7 @@ class PowerFlag(IntFlag):
 class PowerReply:
     """Reply to Power (128.18); ``flags`` are those of PowerFlag.
 
-    Level in %, voltage in V, current in A (+ charges), temperature in °C; None where unknown.
+    Level in %, voltage in V, current in A (+ charges), temperature in °C; None if unknown.
     """
 
     flags: int = 0

@@ -49,7 +49,7 @@ class DatagramSealer:
         return head + self._cipher.encrypt(_NONCE_HEAD + head, plain, None)
 
     def open(self, message: bytes) -> bytes | None:
-        """The plain octets, None for a bad tag (or too few octets to hold one)."""
+        """Return the plain octets, None for a bad tag (or too few octets to hold one)."""
         try:
             return self._decrypt(_NONCE_HEAD + message[:COUNTER_OCTETS], message[COUNTER_OCTETS:], None)
         except (InvalidTag, ValueError):
@@ -57,12 +57,12 @@ class DatagramSealer:
 
 
 def counter_of(message: bytes) -> int:
-    """The counter at its head."""
+    """Return the counter at its head."""
     return int.from_bytes(message[:COUNTER_OCTETS], "big")
 
 
 class DriveValues(NamedTuple):
-    """What a Drive message says: ``until`` in µs (node's tick / 1000 mod 2^32), and the data sets one after another."""
+    """Content of a Drive message: ``until`` in µs (node's tick / 1000 mod 2^32), and its data sets in order."""
 
     until: int
     data: bytes
@@ -84,7 +84,7 @@ def drive_length(octets: int) -> int:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the values of a stream's channels lie in one instant: channel numbers and their ModLenth in octets."""
+    """Positions of a stream's channels in one instant: channel numbers and their ModLenth in octets."""
 
     channels: tuple[int, ...]
     widths: tuple[int, ...]

@@ -21,10 +21,10 @@ _WRAP: Final = 1 << 32
 
 
 class Driver:
-    """Seals the values of one run of Drive; ``layout`` says channels and widths, ``dead_man`` the smallest of them, ms.
+    """Seals the values of one run of Drive; ``layout`` has channels and widths, ``dead_man`` the smallest of them, ms.
 
-    ``after`` is the session's last run of Drive. Raises NotAuthenticError where the reply's length is not the one
-    computed, or its run is not a new one.
+    ``after`` is the session's last run of Drive. Raises NotAuthenticError if the reply's length is not the computed
+    one, or its run is not a new one.
     """
 
     def __init__(self, layout: Layout, reply: DriveReply, message_key: bytes, *, dead_man: int, after: int = 0) -> None:
@@ -39,10 +39,10 @@ class Driver:
         self._sealer = DatagramSealer(drive_key(message_key, reply.run))
 
     def seal(self, values: tuple[bytes, ...], now: TickBounds, *, hold: int | None = None) -> bytes:
-        """One message with these data sets, in the layout's order.
+        """Seal one message with these data sets, in the layout's order.
 
         It holds for ``hold`` ns from the earliest that the node's tick can be now (the dead-man by default, and never
-        longer), so that it is never too far ahead for the node. Raises GarbledError where the counters are used up.
+        longer), so that it is never too far ahead for the node. Raises GarbledError if the counters are used up.
         """
         if tuple(map(len, values)) != self.layout.widths:
             raise GarbledError("The data sets of a Drive message do not have the widths of its channels.")

@@ -1,7 +1,7 @@
-"""What the firmware below a node gives to measurement operation: channels, values, clock (operation.md 1, 2, 5). Node.
+"""The firmware below a node as measurement operation sees it: channels, values, clock (operation.md 1, 2, 5). Node.
 
-The TEDS does not command the hardware: kind, widths, halt and shortest period of a channel stand here, and a channel
-whose stored TEDS says otherwise is not claimed.
+The TEDS does not command the hardware: kind, widths, halt and shortest period of a channel are defined here, and a
+channel whose stored TEDS differs is not claimed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from teds_provision.teds.sheet import ChannelKind, channel_from
 
 _MILLION: Final = 10**6
 _LONGEST: Final = 1e6
-"""Seconds that stand for every longer SPeriod, infinity too: no stream has such a period."""
+"""Seconds that replace every longer SPeriod, infinity too: no stream has such a period."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class ChannelHardware:
 
     @property
     def actuator(self) -> bool:
-        """Whether it acts."""
+        """True if the channel is an actuator."""
         return self.kind is ChannelKind.ACTUATOR
 
 
 class RawReading(NamedTuple):
-    """One data set, ModLenth octets; not valid where out of range, warming up, or with a fault."""
+    """One data set, ModLenth octets; not valid if out of range, warming up, or with a fault."""
 
     octets: bytes
     valid: bool = True
@@ -64,44 +64,44 @@ class Hardware(Protocol):
         """How far the clock may run off, ppm."""
 
     def now(self) -> int:
-        """The present tick."""
+        """Return the present tick."""
 
     def keeps(self, period: int) -> bool:
-        """Whether the clock keeps a period of so many ns on average."""
+        """True if the clock keeps a period of so many ns on average."""
 
     def read(self, channel: int, tick: int) -> RawReading:
-        """The value of a sensor at ``tick``, which is now or a little before."""
+        """Return the value of a sensor at ``tick``, which is now or a little before."""
 
     def bears(self, channel: int, data_set: bytes) -> bool:
-        """Whether the hardware of an actuator bears this raw value."""
+        """True if the hardware of an actuator accepts this raw value."""
 
     def apply(self, values: Mapping[int, bytes]) -> None:
         """Give actuators their values, all together."""
 
     def set_point(self, channel: int) -> bytes:
-        """The present value of an actuator."""
+        """Return the present value of an actuator."""
 
     def safe(self, channel: int) -> None:
-        """Bring an actuator to its safe state, as ActHalt says."""
+        """Bring an actuator to its safe state, as ActHalt requires."""
 
     def self_test(self, channels: Sequence[int]) -> None:
         """Begin a self-test; it never moves an actuator."""
 
     def testing(self, channel: int) -> bool:
-        """Whether its self-test runs."""
+        """True if its self-test runs."""
 
     def fault(self, channel: int) -> bool:
-        """Whether its hardware has a fault, or its last self-test failed."""
+        """True if its hardware has a fault, or its last self-test failed."""
 
     def power(self) -> PowerReply:
         """Battery and charge."""
 
 
 class SessionPort(NamedTuple):
-    """Where a session's link lies: ``kind`` nfc, can or ble; streams of one ``bus`` share its budget.
+    """Place of a session's link: ``kind`` nfc, can or ble; streams of one ``bus`` share its budget.
 
-    ``source`` is the station's address there (F1 to F7 on CAN, 1 on NFC, 2 and up on BLE); ``fd`` says that the command
-    came by CAN FD; ``mtu`` is that of a BLE connection, ``hears`` whether the station has enabled data messages on it.
+    ``source`` is the station's address there (F1 to F7 on CAN, 1 on NFC, 2 and up on BLE); ``fd``: the command came by
+    CAN FD; ``mtu`` is that of a BLE connection, ``hears``: the station has enabled data messages on it.
     """
 
     kind: str
@@ -113,7 +113,7 @@ class SessionPort(NamedTuple):
 
 
 def port_of(link: str) -> SessionPort:
-    """The port that a link's name says: ``nfc``, ``can:f1``, ``ble:2`` (bus = what stands before the last colon)."""
+    """Return the port of a link's name: ``nfc``, ``can:f1``, ``ble:2`` (the bus is the part before the last colon)."""
     bus, _, source = link.rpartition(":")
     bus = bus or link
     kind = bus.partition(":")[0].rstrip("0123456789")
@@ -122,7 +122,7 @@ def port_of(link: str) -> SessionPort:
 
 
 def teds_fits(own: ChannelHardware, teds: bytes | None) -> bool:
-    """Whether a stored Channel TEDS says what the firmware is: ChanType, DatModel, ModLenth, ActHalt where there."""
+    """True if a stored Channel TEDS matches the firmware: ChanType, DatModel, ModLenth, and ActHalt if present."""
     if teds is None:
         return False
     said = channel_from(decode(teds))
@@ -133,6 +133,6 @@ def teds_fits(own: ChannelHardware, teds: bytes | None) -> bool:
 
 
 def teds_period(teds: bytes | None) -> int:
-    """SPeriod of a Channel TEDS in ns, less 1 ppm (it is a Float32); 0 where it is absent, NaN or not positive."""
+    """Return SPeriod of a Channel TEDS in ns, less 1 ppm (it is a Float32); 0 if it is absent, NaN or not positive."""
     period = channel_from(decode(teds)).period if teds is not None else 0.0
     return int(min(period, _LONGEST) * 1e9 * (1 - 1 / _MILLION)) if period > 0 else 0

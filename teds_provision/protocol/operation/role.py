@@ -1,7 +1,7 @@
 """The node's half of measurement operation: every command of operation.md inside a session. Pure.
 
-``Tim`` asks :meth:`OperationRole.run` for what it does not know itself, tells of sessions that end, and asks before
-commands that a claim forbids. Checks run in the order in which operation.md writes them.
+``Tim`` passes unknown commands to :meth:`OperationRole.run`, reports sessions that end, and checks here before commands
+that a claim forbids. Checks run in the order of operation.md.
 """
 
 from __future__ import annotations
@@ -108,11 +108,11 @@ class OperationRole:
     # -- what Tim asks ---------------------------------------------------------------------------------------------
 
     def now(self) -> int:
-        """The present tick."""
+        """Return the present tick."""
         return self._hardware.now()
 
     def knows(self, command: Command) -> bool:
-        """Whether a command is one of operation.md."""
+        """True if a command is one of operation.md."""
         return (command.command_class, command.function) in self._commands
 
     def run(self, inner: InnerCommand) -> Reply:
@@ -122,7 +122,7 @@ class OperationRole:
         return Reply(True, self._commands[inner.command.command_class, inner.command.function](inner))
 
     def demand_configuration(self, session: NodeSession | None, *, writes_over_nfc: bool = False) -> None:
-        """1.3, 1.4, 128.10: 2 in a session that claims, 17 where another does (section 1); else nothing.
+        """Check 1.3, 1.4, 128.10: reason 2 in a session with a claim, 17 if another session has one (section 1).
 
         ``writes_over_nfc``: 1.3 over NFC, which ends the claims of others on sensors once it is good.
         """
@@ -132,7 +132,7 @@ class OperationRole:
         demand(not claiming or (writes_over_nfc and not self.claims.actuators), Reason.BUSY)
 
     def session_ended(self, session: NodeSession) -> None:
-        """The session is over: its claims, streams and arms go."""
+        """End the claims, streams and arms of a session that is over."""
         self.claims.release(session)
         self.streams.session_ended(session)
         self._ports.pop(session, None)
@@ -140,9 +140,9 @@ class OperationRole:
     # -- what links tell and ask -----------------------------------------------------------------------------------
 
     def poll(self) -> float | None:
-        """Take what is due; gives seconds until a sample, lease or dead-man is due again, None where none is known.
+        """Take what is due; return seconds until a sample, lease or dead-man is due again, None if none is known.
 
-        Frames that wait are told by :meth:`next_frame_in`: only the link knows when its controller is free for one.
+        :meth:`next_frame_in` reports waiting frames: only the link knows when its controller is free for one.
         """
         if self.claims.sessions() and self._hardware.power().flags & PowerFlag.TOO_LOW:
             self.claims.release_all()
@@ -154,12 +154,12 @@ class OperationRole:
         return max(0, min(waits)) / SECOND if waits else None
 
     def next_frame_in(self) -> float | None:
-        """Seconds until the next data frame of any bus may begin; None where none is waiting."""
+        """Return seconds until the next data frame of any bus may begin; None if none is waiting."""
         due = self.streams.next_frame()
         return None if due is None else max(0, due - self._real()) / SECOND
 
     def frame(self, bus: str) -> DataFrame | None:
-        """The next data frame of a bus, where one may begin now."""
+        """Return the next data frame of a bus, if one may begin now."""
         return self.streams.frame(bus)
 
     # -- claims ----------------------------------------------------------------------------------------------------

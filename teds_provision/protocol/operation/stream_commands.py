@@ -54,12 +54,12 @@ class SubscribeCommand:
         return head + bytes(self.channels)
 
     def command(self) -> Command:
-        """The command."""
+        """Return the command."""
         return security_command(Function.SUBSCRIBE, self.encode())
 
     @classmethod
     def decode(cls, payload: bytes) -> SubscribeCommand:
-        """Read the payload; its form is checked as section 4 says (form, stream, kind, n: 4)."""
+        """Decode the payload; checks its form by section 4 (form, stream, kind, n: 4)."""
         demand_form(len(payload) > 21)
         stream, kind, n, gap, period, start = struct.unpack_from(">BBBHQQ", payload)
         channels = channel_list(payload[21:], MOST_STREAM_CHANNELS)
@@ -69,7 +69,7 @@ class SubscribeCommand:
         return made
 
     def length(self, octets: int) -> int:
-        """Octets of each data message, where one instant of all channels has ``octets``."""
+        """Return the octets of each data message, if one instant of all channels has ``octets``."""
         return message_length(self.kind, self.n, octets)
 
 
@@ -104,7 +104,7 @@ def stop(stream: int) -> Command:
 
 
 def decode_stopped(payload: bytes) -> int:
-    """The counter that the next message would have had; raises GarbledError."""
+    """Return the counter that the next message would have had; raises GarbledError."""
     if len(payload) != 4:
         raise GarbledError(f"A reply to Stop has 4 octets, this one {len(payload)}.")
     return int.from_bytes(payload, "big")
@@ -163,7 +163,7 @@ class ClockReply:
 
 
 class Action(IntEnum):
-    """What a trigger does: note the tick, start the streams that wait, bring every actuator to its safe state."""
+    """Action of a trigger: note the tick, start the streams that wait, bring every actuator to its safe state."""
 
     MARK = 0
     START = 1
@@ -179,7 +179,7 @@ class ArmCommand:
     action: int
 
     def command(self) -> Command:
-        """The command."""
+        """Return the command."""
         return security_command(Function.ARM, self.commitment + bytes([self.life, self.action]))
 
     @classmethod

@@ -69,7 +69,7 @@ class DriveRun:
 
 @dataclass
 class _SessionStreams:
-    """What a session has besides its claims: the last run, what is armed, the mark, its Drive."""
+    """A session's state besides its claims: the last run, what is armed, the mark, its Drive."""
 
     run: int = 0
     armed: dict[Action, ArmedTrigger] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class StreamRole:
 
     @property
     def running(self) -> bool:
-        """Whether a stream runs."""
+        """True if a stream runs."""
         return bool(self._streams)
 
     @property
@@ -118,7 +118,7 @@ class StreamRole:
 
     @property
     def backlog(self) -> bool:
-        """Whether a full message waits to be begun."""
+        """True if a full message waits to be begun."""
         return any(stream.waiting is not None and stream.ready for stream in self._streams)
 
     # -- commands --------------------------------------------------------------------------------------------------
@@ -204,7 +204,7 @@ class StreamRole:
     # -- what comes without a reply --------------------------------------------------------------------------------
 
     def trigger(self, session: NodeSession, token: bytes, tick: int) -> None:
-        """A trigger frame of this session's station, at whose end the clock stood at ``tick``."""
+        """Handle a trigger frame of this session's station; the clock was at ``tick`` at the frame's end."""
         own, seen = self._measuring_of(session), commitment(token)
         for action, armed in list(own.armed.items()):
             if self._real() >= armed.until:
@@ -259,7 +259,7 @@ class StreamRole:
         return not any(map(self._hardware.fault, data))
 
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool) -> None:
-        """An event sensor has seen something."""
+        """Record a value of an event sensor."""
         for stream in self._streams:
             stream.event(channel, tick, octets, valid=valid)
 
@@ -276,18 +276,18 @@ class StreamRole:
             own.armed.clear()
 
     def session_ended(self, session: NodeSession) -> None:
-        """The session is over, and its claims with it."""
+        """End the streams of a session that is over, together with its claims."""
         self._sessions.pop(session, None)
 
     def unheard(self, session: NodeSession) -> None:
-        """The station has disabled data messages on its connection: the session's streams end (section 6)."""
+        """End the session's streams: the station has disabled data messages on its connection (section 6)."""
         for stream in [stream for stream in self._streams if stream.session is session]:
             self._end(stream)
 
     # -- time ------------------------------------------------------------------------------------------------------
 
     def reply_left(self, session: NodeSession) -> None:
-        """The reply to the session's last command has left: its streams may send."""
+        """Let the session's streams send: the reply to its last command has left."""
         for stream in self._streams:
             if stream.session is session:
                 stream.ready = True
@@ -300,12 +300,12 @@ class StreamRole:
                 self._end(stream)  # the last counter was sent
 
     def next_instant(self) -> int | None:
-        """The tick of the next sample."""
+        """Return the tick of the next sample."""
         due = [stream.next_instant for stream in self._streams]
         return min((tick for tick in due if tick is not None), default=None)
 
     def frame(self, bus: str) -> DataFrame | None:
-        """The next data frame of a bus, where one may begin now."""
+        """Return the next data frame of a bus, if one may begin now."""
         return self._sender(bus).frame(self._on(bus), self._real())
 
     def next_frame(self) -> int | None:
@@ -341,7 +341,7 @@ class StreamRole:
 
 
 def _share(others: list[Stream], asked: SubscribeCommand, length: int, port: SessionPort) -> int:
-    """What the streams of a bus take of the node's budget, with one more, in ppm."""
+    """Return the share of the node's budget that the streams of a bus use with one more, in ppm."""
     there = [stream for stream in others if stream.port.bus == port.bus]
     widest = max([1, asked.gap, *(stream.asked.gap for stream in there)])
     shares = [

@@ -62,7 +62,7 @@ class Stream:
 
     @property
     def next_instant(self) -> int | None:
-        """The tick of the next sample, None where events or a trigger are awaited."""
+        """The tick of the next sample, None while waiting for events or a trigger."""
         if self.start is None or self.ended:
             return None
         if self.asked.kind == StreamKind.EVENT:
@@ -87,7 +87,7 @@ class Stream:
                 self._instant(hardware, due)
 
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool) -> None:
-        """An event sensor has seen something at ``tick``."""
+        """Record a value of an event sensor at ``tick``."""
         if self.asked.kind != StreamKind.EVENT or self.asked.test_pattern or self.channels != (channel,) or self.ended:
             return
         if self.start is not None and tick >= self.start:
@@ -160,21 +160,21 @@ class Sender:
         self._free_at = 0
 
     def take_back(self, stream: Stream) -> None:
-        """A stream ended: what was not sent yet is not sent."""
+        """Drop the unsent messages of a stream that ended."""
         stream.waiting = None
         if self._stream is stream:
             self._stream, self._pieces, self._next = None, None, None
 
     def sends(self, stream: Stream) -> bool:
-        """Whether a message of this stream is being sent."""
+        """True if a message of this stream is being sent."""
         return self._stream is stream
 
     def due(self, streams: list[Stream]) -> int | None:
-        """When the next frame may begin, real ns; None where nothing is to be sent."""
+        """Return when the next frame may begin, real ns; None if there is nothing to send."""
         return self._free_at if self._next is not None or self._choice(streams) is not None else None
 
     def frame(self, streams: list[Stream], now: int) -> DataFrame | None:
-        """The frame to send at real time ``now``; None where the gap has not passed or there is none."""
+        """Return the frame to send at real time ``now``; None if the gap has not passed or there is none."""
         if now < self._free_at:
             return None
         if self._next is None:
@@ -209,10 +209,10 @@ class Sender:
 
 
 def gap(streams: list[Stream]) -> int:
-    """The largest gap of the streams of a bus, at least 1 µs, in ns."""
+    """Return the largest gap of the streams of a bus, at least 1 µs, in ns."""
     return max([1, *(stream.asked.gap for stream in streams)]) * MICRO
 
 
 def waits(start: int) -> bool:
-    """Whether a start says that the stream waits for a trigger."""
+    """True if a start means that the stream waits for a trigger."""
     return start == WAITS

@@ -1,7 +1,7 @@
-"""A stream as the station sees it: what it asks for, which messages it believes (operation.md sections 3 and 4).
+"""A stream on the station's side: its request, and which messages it accepts (operation.md sections 3 and 4).
 
-:class:`StreamPlan` builds Subscribe and checks its reply; :class:`Receiver` opens messages, drops what section 3 says
-and counts each cause apart. No clock of its own: the caller hands in the bounds of the node's present tick.
+:class:`StreamPlan` builds Subscribe and checks its reply; :class:`Receiver` opens messages, drops those that section 3
+excludes and counts each cause separately. It has no clock: the caller passes the bounds of the node's present tick.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _TICK: Final = 8
 
 
 class TickBounds(NamedTuple):
-    """The node's present tick in ns lies between these, by the clock map and its bound."""
+    """Bounds of the node's present tick in ns, from the clock map and its error."""
 
     low: int
     high: int
@@ -49,7 +49,10 @@ class TickBounds(NamedTuple):
 
 @dataclass(frozen=True)
 class StreamPlan:
-    """A stream that a station wants; ``subscribe`` says it, ``layout`` the channels' widths (from the signed TEDS)."""
+    """A stream that a station wants.
+
+    ``subscribe`` is the command, ``layout`` the channels' widths (from the signed TEDS).
+    """
 
     subscribe: SubscribeCommand
     layout: Layout
@@ -67,7 +70,7 @@ class StreamPlan:
         start: int = SOON,
         test_pattern: bool = False,
     ) -> StreamPlan:
-        """A plan over (channel, ModLenth) pairs; ``period`` and ``start`` in ns, ``gap`` in µs."""
+        """Return a plan over (channel, ModLenth) pairs; ``period`` and ``start`` in ns, ``gap`` in µs."""
         numbers, widths = tuple(c for c, _ in channels), tuple(w for _, w in channels)
         return cls(
             SubscribeCommand(stream, kind, n, gap, period, start, numbers, test_pattern), Layout(numbers, widths)
@@ -80,7 +83,7 @@ class StreamPlan:
 
     @property
     def fits(self) -> bool:
-        """Whether a message has at most 240 octets (on BLE the MTU may ask for less)."""
+        """True if a message has at most 240 octets (on BLE the MTU may require less)."""
         return self.length <= MOST_OCTETS
 
     @property
@@ -93,10 +96,10 @@ class StreamPlan:
         return self.subscribe.command()
 
     def accept(self, payload: bytes, now: TickBounds, *, after: int = 0) -> SubscribeReply:
-        """Read the reply; ``now`` bounds the node's tick when it came (it may have been made up to 1 s before).
+        """Decode the reply; ``now`` bounds the node's tick when it came (it may have been made up to 1 s before).
 
-        ``after`` is the session's last run. Raises GarbledError, or NotAuthenticError where length or start are not
-        those that were asked, or the run is not a new one: end and report the stream.
+        ``after`` is the session's last run. Raises GarbledError, or NotAuthenticError if length or start differ from
+        the request, or the run is not a new one: end and report the stream.
         """
         reply, asked = SubscribeReply.decode(payload), self.subscribe.start
         if reply.length != self.length:
@@ -109,14 +112,14 @@ class StreamPlan:
 
 
 def require_new_run(run: int, after: int) -> None:
-    """Raise NotAuthenticError where a session's run is not above the last one: two runs would have one key."""
+    """Raise NotAuthenticError if a session's run is not above the last one: two runs would have one key."""
     if run <= after:
         said = f"run {run} after run {after}" if after else f"run {run}; runs begin at 1"
         raise NotAuthenticError(f"The node names {said}.", hint="Its firmware does not keep to the profile.")
 
 
 def most_instants(kind: StreamKind, octets: int, most: int = MOST_OCTETS) -> int:
-    """The largest n whose message has at most ``most`` octets, one instant having ``octets``; 0 where none fits."""
+    """Return the largest n whose message has at most ``most`` octets, one instant having ``octets``; 0 if none fits."""
     room = most - message_length(kind, 0, 0)
     return max(0, min(255, room // octets, 1 if kind == StreamKind.EVENT else 255)) if octets else 0
 
@@ -136,25 +139,25 @@ class StreamMessage(NamedTuple):
 
     @property
     def valid(self) -> bool:
-        """Whether every value in it is valid."""
+        """True if every value in it is valid."""
         return not self.flags & NOT_VALID
 
     @property
     def test_pattern(self) -> bool:
-        """Whether it is no measurement."""
+        """True if it is a test pattern and no measurement."""
         return bool(self.flags & TEST_PATTERN)
 
 
 @dataclass
 class Counts:
-    """What became of messages; each counts once.
+    """Counters of messages; each counts once.
 
     ``lost``: gaps of the counter, to the count that Stop gave. ``late``: counter not above the last good one (late,
     doubled, replayed). ``bad``: wrong tag. ``junk``: wrong length, or frames that make no message. ``future``: its
     first tick is later than now. ``stale``: too old. ``back``: its tick is not later than that of the good one before,
-    though ticks never go back. ``unasked``: a test pattern that was not asked for, or the other
-    way round. ``overflow``: held for a mark for too long. ``cut``: begun after the end that the station wanted, and
-    taken back by Stop before it had left.
+    though ticks never go back. ``unasked``: a test pattern that was not requested, or the other way round.
+    ``overflow``: held for a mark for too long. ``cut``: begun after the end that the station wanted, and withdrawn by
+    Stop before it had left.
     """
 
     good: int = 0
@@ -202,7 +205,7 @@ class Receiver:
         self._held: deque[tuple[StreamMessage, TickBounds]] = deque()
 
     def open_message(self, octets: bytes, now: TickBounds) -> StreamMessage | None:
-        """Open one message; None where it is dropped (see ``counts``) or held until :meth:`begin`."""
+        """Open one message; None if it is dropped (see ``counts``) or held until :meth:`begin`."""
         found = self.open_messages(((octets, 0),), now)
         return found[0] if found else None
 
@@ -241,7 +244,7 @@ class Receiver:
         return good
 
     def _jumps(self, counter: int) -> bool:
-        """Whether a counter that does not follow on is a later one: what it leaves out was lost."""
+        """True if a counter that does not follow is a later one: the messages between are lost."""
         if counter <= self.last:
             self.counts.late += 1
             return False
@@ -257,7 +260,7 @@ class Receiver:
         return StreamMessage(counter, index, index * self._period + (self.start or 0), plain[0], plain[1:])
 
     def begin(self, start: int) -> list[StreamMessage]:
-        """The first instant of a stream that waited is known (mark + 10 ms): gives the messages held, where fresh."""
+        """Begin a stream that waited, at its first instant (mark + 10 ms); return the held messages that are fresh."""
         self.start = start
         held, self._held = self._held, deque()
         dated = ((message._replace(tick=start + message.tick), now) for message, now in held)
@@ -266,7 +269,10 @@ class Receiver:
         return good
 
     def begun(self, tick: int) -> int:
-        """How many messages of this run had begun by a tick (ns), by period and start; 0 where that is not known."""
+        """Return how many messages of this run had begun by a tick (ns), by period and start.
+
+        0 if that is not known.
+        """
         if self.start is None or self.plan.subscribe.kind == StreamKind.EVENT:
             return 0
         return max(0, (tick - self.start) // self.plan.span + 1)
@@ -283,7 +289,7 @@ class Receiver:
         self.last = max(self.last, counter - 1)
 
     def expected(self, message: StreamMessage) -> bytes:
-        """The test pattern that this message must hold."""
+        """Return the test pattern that this message must hold."""
         layout, n = self.plan.layout, self.plan.subscribe.n
         rows = (
             pattern(channel, width, message.index + i)
@@ -293,9 +299,9 @@ class Receiver:
         return b"".join(rows)
 
     def _fresh(self, tick: int, low: int, high: int) -> bool:
-        """Whether it is after the one before, neither from the future nor too old; else it is counted.
+        """True if it is after the one before, neither from the future nor too old; else count it.
 
-        The node's tick lies between ``low`` and ``high``.
+        The node's tick is between ``low`` and ``high``.
         """
         if tick > high:
             self.counts.future += 1

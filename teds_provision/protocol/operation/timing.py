@@ -1,4 +1,4 @@
-"""Clock and trigger on the station's side: offset, its bound, lies, tokens (operation.md section 5)."""
+"""Clock and trigger on the station's side: offset, its bound, dishonest clocks, tokens (operation.md section 5)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ MILLION: Final = 10**6
 
 @dataclass(frozen=True)
 class ClockSample:
-    """One exchange of Clock; station times in ns: ``asked`` when the first copy left, ``answered`` when all was there.
+    """One exchange of Clock.
 
-    Raises NotAuthenticError where the node's two ticks cannot be: its clock lies.
+    Station times in ns: ``asked`` when the first copy left, ``answered`` when all had arrived.
+
+    Raises NotAuthenticError if the node's two ticks are impossible: its clock is dishonest.
     """
 
     asked: int
@@ -58,7 +60,7 @@ class TriggerToken(NamedTuple):
 
     @classmethod
     def draw(cls) -> TriggerToken:
-        """A new one; each is for one use."""
+        """Return a new one; each is for one use."""
         return cls(os.urandom(TOKEN_OCTETS))
 
     @property
@@ -77,5 +79,5 @@ def commitment(token: bytes) -> bytes:
 
 
 def mark_is_honest(mark: int, seen: TickBounds) -> bool:
-    """Whether a node's mark meets the time, in its ticks, at which the station's controller sent the trigger frame."""
+    """True if a node's mark matches the time, in its ticks, at which the station sent the trigger frame."""
     return seen.low <= mark <= seen.high

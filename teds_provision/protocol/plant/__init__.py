@@ -1,6 +1,6 @@
-"""What stations of one owner tell each other, what they hold as proof, and what follows (contract/plant.md).
+"""Documents that stations of one owner exchange, their proofs, and what follows from them (contract/plant.md).
 
-``document`` signs and opens; ``roster``, ``page``, ``event`` and ``evidence`` are what is said. All pure: octets and
+``document`` signs and opens; ``roster``, ``page``, ``event`` and ``evidence`` are the contents. All pure: octets and
 values in, values out; the clock and the store are the caller's.
 """
 

@@ -20,16 +20,16 @@ class CountedPages:
 
     @property
     def newest(self) -> Place:
-        """The newest page that counts; (0, "") where none does."""
+        """The newest page that counts; (0, "") if none does."""
         return self.pages[-1] if self.pages else (0, "")
 
 
 def counting(pages: Iterable[tuple[int, str, str]], *, last: Place | None, accepted: Place | None) -> CountedPages:
-    """Say which of a station's signed pages (n, H, ``previous``) count.
+    """Return which of a station's signed pages (n, H, ``previous``) count.
 
-    ``last`` is the roster's word on a removed station, ``accepted`` a person's on two histories; the roster's goes
-    first. A page n is named by its own H and by ``previous`` of every page n + 1. The chain counts up to the page
-    before the first number for which two are named, unless one of those words names the branch.
+    ``last`` is the roster's limit for a removed station, ``accepted`` an operator's choice between two histories; the
+    roster's goes first. A page n is named by its own H and by ``previous`` of every page n + 1. The chain counts up to
+    the page before the first number for which two are named, unless ``last`` or ``accepted`` selects the branch.
     """
     there: dict[int, dict[str, str]] = {}
     for n, hash, previous in pages:
@@ -55,7 +55,7 @@ def counting(pages: Iterable[tuple[int, str, str]], *, last: Place | None, accep
 
 
 def _branch(there: dict[int, dict[str, str]], anchor: Place) -> dict[int, dict[str, str]]:
-    """The pages that lead to one page, it, and those that descend from it."""
+    """Return the pages that lead to one page, it, and those that descend from it."""
     kept: dict[int, dict[str, str]] = {}
     n, hash = anchor
     while hash in there.get(n, ()):

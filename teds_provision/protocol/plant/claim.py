@@ -1,7 +1,7 @@
-"""What one station claims of one node, gathered from its pages in their order (contract/plant.md section 2).
+"""One station's claims about one node, gathered from its pages in their order (contract/plant.md section 2).
 
-Within a chain newest is by place (n, then the place in ``events``), never by ``at``. A claim holds what the rules ask
-for and nothing of the order in which chains arrived: the greatest key, the last pin and name, sets of the rest.
+Within a chain newest is by place (n, then the place in ``events``), never by ``at``. A claim holds what the rules need
+and nothing of the order in which chains arrived: the greatest key, the last pin and name, sets of the rest.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ class Claim:
                 self.groups[said["group"]] = said["member"], event.at
 
     def key(self) -> Key | None:
-        """The greatest key that it agreed or took."""
+        """Return the greatest key that it agreed or took."""
         return max((key for key in (self.agreed and self.agreed[:2], self.took) if key), default=None)
 
     def given_keys(self) -> set[tuple[str, str, int, str, str]]:
-        """What it gave and did not undo."""
+        """Return the keys that it gave and did not undo."""
         return {gave for gave in self.gave if gave[0] not in self.undone}
 
     def to_json(self) -> str:
@@ -98,7 +98,7 @@ class Claim:
 
     @classmethod
     def from_json(cls, text: str) -> Claim:
-        """What :meth:`to_json` gave."""
+        """Parse the JSON of :meth:`to_json`."""
         kept = json.loads(text)
         claim = cls(forgot=kept.get("forgot", -1))
         for name in ("pin", "agreed", "took", "written", "name"):

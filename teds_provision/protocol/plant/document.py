@@ -1,7 +1,7 @@
-"""The one form of everything that a plant signs: a compact JWS, one kind for each ``typ`` (contract/plant.md).
+"""The one form of every document that a plant signs: a compact JWS, one kind for each ``typ`` (contract/plant.md).
 
 ES256, ``kid`` the signer's fingerprint, payload JSON in UTF-8 without spaces. A document is kept and passed on as the
-octets that came. Its name is H: SHA-256 of its signing input, all before the last dot. A document that was signed anew
+octets that came. Its name is H: SHA-256 of its signing input, all before the last dot. A document that was signed again
 (another random k, the other s) has the same H, so two of them never look like two histories.
 
 Readers are bounded and strict: one size for each kind, exactly ``alg``, ``kid``, ``typ`` in the header, no member
@@ -49,14 +49,14 @@ SIGNED: Final = DocumentKind("teds-signed+jws", 64 << 10, "teds-signed/1", "the 
 
 
 class NewerFormatError(BadDataError):
-    """The document is of a newer version of its format; whoever knows it can read it."""
+    """The document is of a newer version of its format; a newer program can read it."""
 
     code = "newer-format"
 
 
 @dataclass(frozen=True)
 class SignedDocument:
-    """A document under a good signature: the signer's fingerprint and point, H, and what it says."""
+    """A document under a good signature: the signer's fingerprint and point, H, and its members."""
 
     signer: str
     point: bytes
@@ -66,12 +66,12 @@ class SignedDocument:
 
 
 def payload(members: Mapping[str, Any]) -> bytes:
-    """The octets that are signed for these members, in their order."""
+    """Return the octets that are signed for these members, in their order."""
     return json.dumps(members, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 
 def seal(members: Mapping[str, Any], key: PrivateKey, kind: DocumentKind) -> bytes:
-    """Sign a document; raises BadDataError where it is larger than anybody reads."""
+    """Sign a document; raises BadDataError if it is larger than readers accept."""
     octets = jose.sign_compact(payload(members), key, typ=kind.typ)
     check_size(len(octets), kind.most, kind.what)
     return octets
@@ -83,10 +83,10 @@ def hash_of(octets: bytes) -> str:
 
 
 def open_document(octets: bytes, find_key: Callable[[str], bytes | None], kind: DocumentKind) -> SignedDocument:
-    """Check who signed a document and read its members; their values are the caller's to look at.
+    """Check who signed a document and read its members; the caller checks their values.
 
-    ``find_key`` gives the point of a fingerprint that may sign this kind. Raises NotAuthenticError (nobody known signed
-    this), BadDataError (no such document), NewerFormatError.
+    ``find_key`` gives the point of a fingerprint that may sign this kind. Raises NotAuthenticError (no known signer),
+    BadDataError (no such document), NewerFormatError.
     """
     check_size(len(octets), kind.most, kind.what)
     header = load_exact(decode_base64url(octets.partition(b".")[0], "The JWS header"), "The JWS header")
@@ -112,7 +112,7 @@ def split(octets: bytes) -> tuple[bytes, bytes, bytes]:
 
 
 def join(header: bytes, content: bytes, signature: bytes) -> bytes:
-    """The document of which :func:`split` gave the parts."""
+    """Return the document of which :func:`split` gave the parts."""
     return b".".join((header, base64url(content), base64url(signature)))
 
 
@@ -132,12 +132,12 @@ _PATTERNS: Final = {
 
 
 def is_form(kind: str, value: object) -> bool:
-    """Whether a value is a text of one of the forms: uuid, sha256, digits, point, time, random_id."""
+    """True if a value is a text of one of the forms: uuid, sha256, digits, point, time, random_id."""
     return isinstance(value, str) and _PATTERNS[kind][0].fullmatch(value) is not None
 
 
 def is_time(value: object) -> bool:
-    """Whether a value is a time of that form that there is: the 31st of February is none."""
+    """True if a value is an existing time of that form: the 31st of February is none."""
     try:
         return is_form("time", value) and datetime.fromisoformat(str(value)) is not None
     except ValueError:
@@ -145,22 +145,22 @@ def is_time(value: object) -> bool:
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a whole number of 0 to 2^32 - 1 (true is none)."""
+    """True if a value is a whole number of 0 to 2^32 - 1 (true is none)."""
     return type(value) is int and 0 <= value <= LAST_NUMBER
 
 
 def is_name(value: object) -> bool:
-    """Whether a value is 1 to 100 printable characters without space at either end."""
+    """True if a value is 1 to 100 printable characters without space at either end."""
     return isinstance(value, str) and 1 <= len(value) <= LONGEST_NAME and value.isprintable() and value == value.strip()
 
 
 def is_text(value: object) -> bool:
-    """Whether a value is printable and of at most 1,024 characters."""
+    """True if a value is printable and of at most 1,024 characters."""
     return isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()
 
 
 class Fields:
-    """The members of one object, read strictly; ``where`` opens every complaint. Unknown members are passed over."""
+    """The members of one object, read strictly; ``where`` opens every complaint. Unknown members are ignored."""
 
     def __init__(self, members: object, where: str) -> None:
         if not isinstance(members, dict):
@@ -169,28 +169,28 @@ class Fields:
         self._where = where
 
     def text_of_form(self, form: str, name: str) -> str:
-        """A text of one of the forms of :func:`is_form`."""
+        """Return a text of one of the forms of :func:`is_form`."""
         value = self.members.get(name)
         if not is_form(form, value):
             raise self.bad(name, _PATTERNS[form][1])
         return str(value)
 
     def number(self, name: str, least: int = 0) -> int:
-        """A whole number of ``least`` to 2^32 - 1."""
+        """Return a whole number of ``least`` to 2^32 - 1."""
         value = self.members.get(name)
         if type(value) is not int or not least <= value <= LAST_NUMBER:
             raise self.bad(name, f"is no whole number of {least} to {LAST_NUMBER}")
         return value
 
     def name(self, name: str) -> str:
-        """A name: 1 to 100 printable characters."""
+        """Return a name: 1 to 100 printable characters."""
         value = self.members.get(name)
         if not is_name(value):
             raise self.bad(name, f"is no name of 1 to {LONGEST_NAME} printable characters")
         return str(value)
 
     def point(self, name: str) -> bytes:
-        """A public key, 65 octets, on the curve."""
+        """Return a public key, 65 octets, on the curve."""
         point = bytes.fromhex(self.text_of_form("point", name))
         if not is_point(point):
             raise self.bad(name, "is no point of the curve P-256")
@@ -205,7 +205,7 @@ class Fields:
         return octets
 
     def time(self, name: str) -> datetime:
-        """A moment, in UTC."""
+        """Return a moment, in UTC."""
         text = self.text_of_form("time", name)
         try:
             return datetime.strptime(text, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
@@ -213,7 +213,7 @@ class Fields:
             raise self.bad(name, "is no time") from error
 
     def flag(self, name: str) -> bool:
-        """True or false."""
+        """Return a boolean."""
         value = self.members.get(name)
         if not isinstance(value, bool):
             raise self.bad(name, "is neither true nor false")
@@ -227,7 +227,7 @@ class Fields:
         return value
 
     def list_of(self, name: str, most: int) -> list[Any]:
-        """A list of at most so many; one that is not there is empty."""
+        """Return a list of at most so many; an absent one is empty."""
         value = self.members.get(name, [])
         if not isinstance(value, list):
             raise self.bad(name, "is no list")
@@ -236,7 +236,7 @@ class Fields:
         return value
 
     def place(self, name: str) -> tuple[int, str]:
-        """A page by its number and H; ``[0, ""]`` is none."""
+        """Return a page by its number and H; ``[0, ""]`` is none."""
         value = self.members.get(name)
         if isinstance(value, list) and len(value) == 2 and is_number(value[0]):
             number, named = value
@@ -245,7 +245,7 @@ class Fields:
         raise self.bad(name, "is no page as [number, H]")
 
     def bad(self, name: str, complaint: str) -> BadDataError:
-        """The error for one member."""
+        """Return the error for one member."""
         return BadDataError(f"{self._where}: {name} {complaint}.")
 
 
@@ -256,7 +256,7 @@ _LOGIN: Final = re.compile(r"SCRAM-SHA-256\$4096:[A-Za-z0-9+/]{22,86}={0,2}\$[A-
 
 @dataclass(frozen=True)
 class MemberRequest:
-    """What a station shows who would be a member: its name, key, certificate (SIG104), and its login's verifier."""
+    """A station's request for membership: its name, key, certificate (SIG104), and its login's verifier."""
 
     name: str
     point: bytes
@@ -270,7 +270,7 @@ class MemberRequest:
         return fingerprint(self.point)
 
     def sealed(self, key: PrivateKey) -> bytes:
-        """The request, signed by the station itself."""
+        """Return the request, signed by the station itself."""
         members = {
             "format": MEMBER_REQUEST.format,
             "name": self.name,

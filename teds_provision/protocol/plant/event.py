@@ -1,7 +1,7 @@
-"""What a station says of a node or of itself: one event of a page (contract/plant.md section 2).
+"""A station's statement about a node or about itself: one event of a page (contract/plant.md section 2).
 
-An event that is not of its form is skipped by every reader, and told; it never ends a chain. One of an unknown ``act``
-and unknown members are skipped too and stay in the page, for a newer version.
+An event that is not of its form is skipped by every reader, and reported; it never ends a chain. One of an unknown
+``act`` and unknown members are skipped too and stay in the page, for a newer version.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ FORMS: Final[dict[str, dict[str, _Form]]] = {
 """The members of each act, beside ``act``, ``id``, ``at`` and ``uuid``."""
 
 OF_UNIT: Final[dict[str, _Form]] = {"job": _random_id, "unit": is_number}
-"""What an office adds to a ``signed`` event: the unit that it signed for. Readers of others pass over both."""
+"""Members that an office adds to a ``signed`` event: the unit that it signed for. Other readers ignore both."""
 
 WITHOUT_NODE: Final = frozenset({"lifted", "closed", "alarm"})
 """Acts that are about no node."""
@@ -99,7 +99,7 @@ class Event(NamedTuple):
 
 
 def made(act: str, id: str, at: str, uuid: bytes | None, members: Mapping[str, Any]) -> dict[str, Any]:
-    """An event to be written, its members in the order of the contract; a caller's slip raises ValueError."""
+    """Return an event to be written, its members in the order of the contract; a caller's mistake raises ValueError."""
     event: dict[str, Any] = {"act": act, "id": id, "at": at}
     if uuid is not None:
         event["uuid"] = uuid.hex()
@@ -112,7 +112,7 @@ def made(act: str, id: str, at: str, uuid: bytes | None, members: Mapping[str, A
 
 
 def read(value: object) -> Event | str | None:
-    """An event, why it is not of its form, or None for an act that this version does not know."""
+    """Return an event, why it is not of its form, or None for an act that this version does not know."""
     if not isinstance(value, dict):
         return "an event is no object"
     act = value.get("act")
@@ -139,7 +139,7 @@ def read(value: object) -> Event | str | None:
 
 
 def unit_of(event: Event) -> tuple[str, int] | None:
-    """The job and the unit that an ``evidence`` event, or a ``signed`` one of an office, is about; None for none."""
+    """Return the job and unit of an ``evidence`` event, or of an office's ``signed`` one; None for none."""
     job, unit = event.members.get("job"), event.members.get("unit")
     if (
         event.act not in ("evidence", "signed")
@@ -151,7 +151,7 @@ def unit_of(event: Event) -> tuple[str, int] | None:
 
 
 def reset_proven(event: Event) -> str | None:
-    """Fingerprint of the node's key that signed this ``reset``, None where the proof is not good."""
+    """Return the fingerprint of the node's key that signed this ``reset``, None if the proof is not good."""
     assert event.uuid is not None
     point = bytes.fromhex(event.members["point"])
     message = reset_message(event.uuid, event.members["epoch"], bytes.fromhex(event.members["challenge"]))

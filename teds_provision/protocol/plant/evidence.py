@@ -61,11 +61,11 @@ _TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 
 @dataclass(frozen=True)
 class BoardFacts:
-    """What the board signs, beside which datasheet it has: who made it, for which job, from what, step by step.
+    """The facts that a board signs beside its datasheet: maker, job, components, and each step.
 
     ``epoch``, ``sequence`` and ``blocks`` (channel, access code, SHA-256) are those of the Security TEDS. ``job`` and
-    ``unit`` are None outside a job, ``heads`` (first 16 digits, number of chains) where no registry was joined.
-    ``steps``: name, result, milliseconds. Times are ``2026-01-31T12:00:00Z``.
+    ``unit`` are None outside a job, ``heads`` (first 16 digits, number of chains) if no registry was joined. ``steps``:
+    name, result, milliseconds. Times are ``2026-01-31T12:00:00Z``.
     """
 
     station: str
@@ -91,7 +91,7 @@ class BoardFacts:
 
     @property
     def failure(self) -> str | None:
-        """The code of the error that ended the attempt, None where no step failed."""
+        """The code of the error that ended the attempt, None if no step failed."""
         return next((result for _, result, _ in self.steps if result not in GOOD_RESULTS), None)
 
 
@@ -109,7 +109,7 @@ class EvidenceClaim:
         return [{"name": f"teds:{self.uuid.hex()}", "digest": {"sha256": hashlib.sha256(self.teds).hexdigest()}}]
 
     def challenge(self, nonce: bytes) -> bytes:
-        """The challenge (32 octets) of Prove; see :func:`challenge`."""
+        """Return the challenge (32 octets) of Prove; see :func:`challenge`."""
         return challenge(nonce, canonical(self.facts.to_json(), self.subject))
 
 
@@ -122,12 +122,12 @@ def canonical(facts: Mapping[str, Any], subject: object) -> bytes:
 
 
 def challenge(nonce: bytes, bound: bytes) -> bytes:
-    """What the board signs by Prove: SHA-256("TEDS1 evidence" ‖ 00 ‖ nonce ‖ RFC 8785 form)."""
+    """Return what the board signs by Prove: SHA-256("TEDS1 evidence" ‖ 00 ‖ nonce ‖ RFC 8785 form)."""
     return hashlib.sha256(b"TEDS1 evidence\0" + nonce + bound).digest()
 
 
 def pae(payload: bytes) -> bytes:
-    """What a DSSE envelope of our payload type signs (DSSE 1.0, "Signature Definition")."""
+    """Return what a DSSE envelope of our payload type signs (DSSE 1.0, "Signature Definition")."""
     return b"DSSEv1 %d %s %d %s" % (len(PAYLOAD_TYPE), PAYLOAD_TYPE.encode(), len(payload), payload)
 
 
@@ -178,7 +178,7 @@ def seal(
 class Evidence:
     """A document as it was read; nothing of it is verified yet (:func:`faults`).
 
-    ``bound`` is the RFC 8785 form that the board signed. ``nonce`` and ``proof`` are empty where no board answered.
+    ``bound`` is the RFC 8785 form that the board signed. ``nonce`` and ``proof`` are empty if no board answered.
     """
 
     uuid: bytes
@@ -303,7 +303,7 @@ def check_signatures(checked: CheckedEvidence) -> Signatures:
 
 
 def faults(evidence: Evidence, ca: bytes) -> list[str]:
-    """What is wrong with a document, a sentence each; empty for one that holds under the owner's ``ca`` (65 octets).
+    """Return the faults of a document, a sentence each; empty if it holds under the owner's ``ca`` (65 octets).
 
     A document of an attempt that ``failed`` claims no datasheet: its Security TEDS is what the board showed, and the
     board's proof may be absent.
@@ -313,7 +313,7 @@ def faults(evidence: Evidence, ca: bytes) -> list[str]:
 
 
 def faults_of(checked: CheckedEvidence, signatures: Signatures, ca: bytes) -> list[str]:
-    """As :func:`faults`, where the signatures were checked already."""
+    """Return the same as :func:`faults`, for signatures that were checked already."""
     words = _wrong_words(checked.evidence)
     return [*words, *_wrong_datasheet(checked, signatures, ca), *_wrong_signatures(checked.evidence, signatures, ca)]
 

@@ -1,8 +1,8 @@
-"""What holds of a node when many stations speak of it: a pure function of their claims, the roster and one's own store.
+"""The result of many stations' claims about a node: a pure function of the claims, the roster and one's own store.
 
-Nothing here asks who was first (contract/plant.md sections 2 and 3), so every station that has the same pages comes to
-the same view, in whatever order they reached it. What others say informs, and holds back what this station would do
-for the first time; it takes nothing away (rule 2).
+Order in time does not matter (contract/plant.md sections 2 and 3), so every station that has the same pages comes to
+the same view, in whatever order they reached it. Statements of others inform, and hold back what this station would do
+for the first time; they take nothing away (rule 2).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ BY_CONTACT: Final = frozenset({"tap", "bus"})
 
 @dataclass(frozen=True)
 class LocalState:
-    """What this station's own store says of the node.
+    """State of the node in this station's own store.
 
-    ``pin`` is the key that the UUID is pinned to here, ``assurance`` how ("" for none), ``met`` whether the node itself
-    showed it here. ``holds``: it has a link key. ``holders``: who, by this store, holds or was given the node's key.
-    ``lifted``: bans (H) that a person took back here.
+    ``pin`` is the key that the UUID is pinned to here, ``assurance`` how ("" for none), ``met``: the node itself showed
+    it here. ``holds``: it has a link key. ``holders``: the stations that, by this store, hold or were given the node's
+    key. ``lifted``: bans (H) that an operator withdrew here.
     """
 
     station: str
@@ -42,7 +42,7 @@ class LocalState:
 
 @dataclass(frozen=True)
 class BanStatement:
-    """A ban that stands in somebody's page: H, whose page, whether that page counts, what is banned and by whom."""
+    """A ban on a station's page: H, whose page, whether that page counts, what is banned and by whom."""
 
     hash: str
     page_of: str
@@ -52,12 +52,11 @@ class BanStatement:
 
 @dataclass(frozen=True)
 class MergedClaims:
-    """What the plant says of a node; stations are fingerprints.
+    """The plant's view of a node; stations are fingerprints.
 
-    ``pin`` is the key that all keepers who pin it name, ``pins`` whom each station pins. ``held``: which member holds
-    which key;
-    ``holder``: the highest epoch that anybody claims, and who claims which key of it. ``made``: who agreed the key
-    that it holds. ``conflicts`` by name, with a sentence. ``key_it``: whether this station may agree a key with it.
+    ``pin`` is the key that all keepers who pin it name, ``pins`` each station's pin. ``held``: which member holds which
+    key; ``holder``: the highest epoch that any station claims, and who claims which key of it. ``made``: who agreed the
+    key that it holds. ``conflicts`` by name, with a sentence. ``key_it``: this station may agree a key with it.
     """
 
     pin: str | None
@@ -86,7 +85,7 @@ def merge_claims(
     statements: Sequence[BanStatement] = (),
     liftings: Mapping[str, Collection[str]] = {},
 ) -> MergedClaims:
-    """Say what holds of one node.
+    """Return the view of one node.
 
     ``claims`` by station, of pages that count; ``liftings``: by H of a ban, who lifted it on a page that counts.
     """
@@ -141,7 +140,7 @@ def merge_claims(
 
 
 def _resets(claims: Mapping[str, Claim], pinned: str | None) -> frozenset[tuple[str, int]]:
-    """Resets whose proof is of the key that the node is pinned to: anybody can reset a board of his own."""
+    """Return resets whose proof is of the key that the node is pinned to, as any owner of a board can reset it."""
     return frozenset(
         reset
         for claim in claims.values()
@@ -180,7 +179,7 @@ def _holdings(roster: Roster, claims: Mapping[str, Claim], reset_to: int) -> _Ho
 
 
 def _holders(roster: Roster, held: Mapping[str, Key]) -> tuple[int | None, dict[str, tuple[str, ...]]]:
-    """The newest epoch that a station that works with nodes says it holds, and who holds which key of it."""
+    """Return the newest epoch that a station that works with nodes claims to hold, and who holds which key of it."""
     heard = {holder: key for holder, key in held.items() if roster.roles_of(holder) & {"line", "base", "keeper"}}
     newest = max((epoch for epoch, _ in heard.values()), default=None)
     found: dict[str, tuple[str, ...]] = {}
@@ -193,7 +192,7 @@ def _holders(roster: Roster, held: Mapping[str, Key]) -> tuple[int | None, dict[
 def _pin_conflicts(
     roster: Roster, claims: Mapping[str, Claim], own: LocalState, pins: Mapping[str, str], keepers: Collection[str]
 ) -> dict[str, str]:
-    """Where stations name other keys of the board: keepers among themselves, anybody where none has pinned it."""
+    """Return conflicts about the board's key: keepers among themselves, or any stations if no keeper has pinned it."""
     by_keepers = {station: pins[station] for station in keepers if station in pins}
     if len(set(by_keepers.values())) > 1:
         return {TWO_KEYS: "keepers pin " + _who(roster, by_keepers)}
@@ -211,10 +210,10 @@ def _pin_conflicts(
 
 
 def bans(roster: Roster, statement: BanStatement, own: LocalState, liftings: Mapping[str, Collection[str]]) -> bool:
-    """Whether a statement bans its node here.
+    """True if a statement bans its node here.
 
-    Its signer is a keeper, or by one's own store holds or was given the node's key; a removed one's word counts from
-    its own pages alone, up to ``last``. Until a keeper lifts it, its signer, or here a person.
+    Its signer is a keeper, or by one's own store holds or was given the node's key; a removed one's statement counts
+    only from its own pages, up to ``last``. It ends when a keeper lifts it, its signer, or here an operator.
     """
     signer = statement.said.sender
     if roster.member(signer) is None and (statement.page_of != signer or not statement.counts):
@@ -232,7 +231,7 @@ def bans(roster: Roster, statement: BanStatement, own: LocalState, liftings: Map
 
 
 def _keys(named: Collection[str]) -> list[str]:
-    """The different keys among fingerprints, some of which may be their first digits alone."""
+    """Return the distinct keys among fingerprints, some of which may be shortened to their first digits."""
     found: list[str] = []
     for fingerprint in sorted(named, key=lambda digits: (-len(digits), digits)):
         if not any(same_key(fingerprint, other) for other in found):

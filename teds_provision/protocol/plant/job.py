@@ -1,6 +1,6 @@
 """A job for a line: what may be built, of what, how often, by whom and until when (contract/plant.md section 9).
 
-Signed by a keeper. What a job says is bookkeeping for who owns the home; only an office that signs can enforce it.
+Signed by a keeper. The owner of a home could ignore a job; only an office that signs can enforce it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class CalibrationRule:
         return {"rule": "none"}
 
     def wants(self, uuid: bytes) -> str | None:
-        """The digest that the calibration of a board must have, None where any will do, or none is meant."""
+        """Return the digest that the calibration of a board must have, None if any will do, or none is meant."""
         return self.by_uuid.get(uuid) if self.rule == "list" else self.sha256
 
 
@@ -61,8 +61,8 @@ class CalibrationRule:
 class Job:
     """One job; ``hash`` and ``signer`` are "" until it is signed.
 
-    ``count`` or ``boards`` (UUID to fingerprint) says how many and which. ``stations`` are fingerprints with their
-    allotments. ``sign`` is :data:`BY_STATION` or the fingerprint of the office.
+    ``count`` or ``boards`` (UUID to fingerprint) limits the units. ``stations`` are fingerprints with their allotments.
+    ``sign`` is :data:`BY_STATION` or the fingerprint of the office.
     """
 
     id: str
@@ -92,11 +92,11 @@ class Job:
 
     @property
     def office(self) -> str | None:
-        """Fingerprint of the office that signs, None where each station does."""
+        """Fingerprint of the office that signs, None if each station does."""
         return None if self.sign == BY_STATION else self.sign
 
     def why_not(self, now: datetime, station: str) -> str | None:
-        """Why ``station`` (fingerprint) may not work on it now, None where it may."""
+        """Return why ``station`` (fingerprint) may not work on it now, None if it may."""
         if now < self.not_before:
             return f"it begins {time_text(self.not_before)}"
         if now >= self.ends:
@@ -106,7 +106,7 @@ class Job:
         return None
 
     def name_for(self, uuid: bytes, unit: int) -> str | None:
-        """The name of the board that got this unit, None where the job gives none."""
+        """Return the name of the board that got this unit, None if the job gives none."""
         if self.name is None:
             return None
 
@@ -119,7 +119,7 @@ class Job:
         return _FIELD.sub(value, self.name)
 
     def unsigned(self) -> dict[str, Any]:
-        """What a keeper signs, in the order of the contract."""
+        """Return what a keeper signs, in the order of the contract."""
         listed = [{"uuid": uuid.hex(), "fingerprint": key} for uuid, key in self.boards.items()]
         return {
             "format": JOB.format,

@@ -1,7 +1,7 @@
-"""Pages: what a station says, in a chain of its own (contract/plant.md section 2).
+"""Pages: a station's statements, in its own chain (contract/plant.md section 2).
 
-Of a page that somebody else wrote only ``format``, ``registry``, ``station``, ``n``, ``previous``, ``events`` (a list)
-and its octets are asked; what is wrong inside is skipped and told. Limits on numbers bind the writer.
+Of another station's page only ``format``, ``registry``, ``station``, ``n``, ``previous``, ``events`` (a list) and its
+octets are required; faults inside are skipped and reported. Limits on numbers bind the writer.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ MOST_HEADS: Final = 2048
 class Page:
     """A page under a good signature. ``station`` signed it; ``hash`` is H, ``previous`` that of the page before.
 
-    ``previous`` of page 1 is "". ``home`` (16 digits), ``created`` and ``heads`` are "", "" and empty where they are
-    not of their form.
+    ``previous`` of page 1 is "". ``home`` (16 digits), ``created`` and ``heads`` are "", "" and empty if they are not
+    of their form.
     """
 
     station: str
@@ -53,7 +53,7 @@ class Page:
 def open_page(octets: bytes, registry: str, find_key: Callable[[str], bytes | None]) -> Page:
     """Read a page of a member of this registry.
 
-    Raises NotAuthenticError or BadDataError (nobody's page: junk), NewerFormatError (the chain waits).
+    Raises NotAuthenticError or BadDataError (no member's page: junk), NewerFormatError (the chain waits).
     """
     document = open_document(octets, find_key, PAGE)
     fields = Fields(document.members, "The page")
@@ -99,7 +99,7 @@ def _heads(value: object) -> dict[str, tuple[int, str]]:
 
 @dataclass(frozen=True)
 class PageDraft:
-    """What goes into the next page of a station, beside its events."""
+    """Content of the next page of a station, beside its events."""
 
     registry: str
     number: int
@@ -111,7 +111,7 @@ class PageDraft:
 
 
 def seal_page(draft: PageDraft, events: Sequence[Mapping[str, Any]], key: PrivateKey) -> bytes:
-    """Sign a page; raises BadDataError where more is in it than a page takes."""
+    """Sign a page; raises BadDataError if it exceeds the limits of a page."""
     if len(events) > MOST_EVENTS:
         raise BadDataError(f"A page takes {MOST_EVENTS} events, not {len(events)}.")
     members = {

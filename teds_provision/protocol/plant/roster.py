@@ -1,6 +1,6 @@
-"""The roster: who belongs to a plant, and whose word counts for what (contract/plant.md section 1).
+"""The roster: the members of a plant and their roles (contract/plant.md section 1).
 
-Signed by the owner's CA; nobody's store is needed to read it.
+Signed by the owner's CA; can be read without a store.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NOWHERE: Final[Place] = (0, "")
 
 @dataclass(frozen=True)
 class Member:
-    """A station of the plant. ``signed``: the last page whose ``signed`` events count, where it has lost ``sign``."""
+    """A station of the plant. ``signed``: the last page whose ``signed`` events count, if it has lost ``sign``."""
 
     name: str
     point: bytes
@@ -53,7 +53,7 @@ class Member:
 
 @dataclass(frozen=True)
 class RemovedMember:
-    """A station that left: what it said on pages up to ``last`` counts as ``roles`` say, and nothing after."""
+    """A station that left: its pages up to ``last`` count as ``roles`` allow, and nothing after."""
 
     name: str
     point: bytes
@@ -95,42 +95,42 @@ class Roster:
 
     @cached_property
     def by_key(self) -> dict[str, Member | RemovedMember]:
-        """Everybody whom it names, by fingerprint."""
+        """Return all that it names, by fingerprint."""
         everybody: tuple[Member | RemovedMember, ...] = (*self.members, *self.removed)
         return {station.fingerprint: station for station in everybody}
 
     def member(self, fingerprint: str) -> Member | None:
-        """A station that belongs now."""
+        """Return a present member."""
         found = self.by_key.get(fingerprint)
         return found if isinstance(found, Member) else None
 
     def removed_one(self, fingerprint: str) -> RemovedMember | None:
-        """A station that left."""
+        """Return a station that left."""
         found = self.by_key.get(fingerprint)
         return found if isinstance(found, RemovedMember) else None
 
     def point_of(self, fingerprint: str) -> bytes | None:
-        """The key of a member or removed one."""
+        """Return the key of a member or removed one."""
         found = self.by_key.get(fingerprint)
         return found.point if found is not None else None
 
     def roles_of(self, fingerprint: str) -> frozenset[str]:
-        """The roles that somebody has, or had when removed; none for a stranger."""
+        """Return the roles that a station has, or had when removed; none for a stranger."""
         found = self.by_key.get(fingerprint)
         return found.roles if found is not None else frozenset()
 
     def has(self, fingerprint: str, role: Role) -> bool:
-        """Whether a member has this role now."""
+        """True if a member has this role now."""
         found = self.member(fingerprint)
         return found is not None and role in found.roles
 
     def name_of(self, fingerprint: str) -> str:
-        """What people call a station; 16 digits for a stranger."""
+        """Return the name of a station; 16 digits for a stranger."""
         found = self.by_key.get(fingerprint)
         return found.name if found is not None else fingerprint[:16]
 
     def named(self, text: str) -> Member | RemovedMember | None:
-        """A member by name, else anybody by at least 16 digits of the fingerprint, else a removed one by name."""
+        """Return a member by name, else any by at least 16 digits of the fingerprint, else a removed one by name."""
         for member in self.members:
             if member.name == text:
                 return member
@@ -142,7 +142,7 @@ class Roster:
         return left[-1] if left else None
 
     def unsigned(self) -> dict[str, Any]:
-        """What the CA signs, in the order of the contract."""
+        """Return what the CA signs, in the order of the contract."""
         return {
             "format": ROSTER.format,
             "registry": self.registry,
@@ -197,7 +197,7 @@ def open_roster(octets: bytes, ca: bytes) -> Roster:
 
 
 def read_roster(members: object, ca: bytes, hash: str = "", octets: bytes = b"") -> Roster:
-    """Read what a roster says, signed or still a draft; raises BadDataError."""
+    """Parse a roster, signed or still a draft; raises BadDataError."""
     fields = Fields(members, "The roster")
     created, expires = fields.time("created"), fields.time("expires")
     if not created < expires <= created + LONGEST:
@@ -227,7 +227,7 @@ def read_roster(members: object, ca: bytes, hash: str = "", octets: bytes = b"")
 
 
 def _roles(fields: Fields) -> frozenset[str]:
-    """The roles that are known; somebody without any reads, as ``audit``."""
+    """Return the known roles; a member without any reads, as ``audit``."""
     told = fields.list_of("roles", MOST_ROLES)
     if not all(isinstance(role, str) for role in told):
         raise fields.bad("roles", "is no list of words")
@@ -277,9 +277,9 @@ Taking = Literal["taken", "taken, two rosters", "same", "older", "two rosters", 
 
 
 def taking(new: Roster, own: Roster | None, registry: str) -> tuple[Taking, str]:
-    """Whether a roster that the CA signed takes the place of one's own, and why not.
+    """Return whether a roster that the CA signed replaces one's own, and why not.
 
-    ``two rosters``: the CA signed two of one version; the cure is the next version.
+    ``two rosters``: the CA signed two of one version; the remedy is the next version.
     """
     if new.registry != registry:
         return "refused", "it is of another registry"

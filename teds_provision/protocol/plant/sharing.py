@@ -29,9 +29,9 @@ def receivers(roster: Roster, sender: str, share: Share) -> tuple[str, ...]:
 
 
 def shares_any(shares: Iterable[Share], view: MergedClaims, sender: str) -> bool:
-    """Whether a node is one of any share's: all, a profile that the sender wrote on it, a group.
+    """True if any share covers the node: all, a profile that the sender wrote on it, a group.
 
-    A group is the sender's own, or a keeper's: else any member could put a node where its key is shared.
+    A group is the sender's own, or a keeper's: else any member could add a node to a group that shares its key.
     """
     profile = view.written[sender][2] if sender in view.written else None
     groups = {*view.own_groups.get(sender, ()), *(group for group, member in view.keeper_groups.items() if member)}
@@ -42,7 +42,7 @@ def shares_any(shares: Iterable[Share], view: MergedClaims, sender: str) -> bool
 
 
 def gave_away(view: MergedClaims, station: str) -> bool:
-    """Whether a station gave the node away by a move that stands."""
+    """True if a station gave the node away by a move that is still in force."""
     return any(giver == station and mode == "move" for giver, _, _, _, mode, _ in view.gave)
 
 
@@ -96,9 +96,9 @@ def why_not(
     pin: str | None,
     quiet: AbstractSet[str],
 ) -> str:
-    """Why a copy of one node is not taken in by itself, "" where it is.
+    """Return why a copy of one node is not accepted automatically, "" if it is.
 
-    ``pin``: the node's key by one's own store; ``quiet``: the silent stations. :data:`LATER` is looked at once more.
+    ``pin``: the node's key by one's own store; ``quiet``: the silent stations. :data:`LATER` is tried once more.
     """
     fits = [share for share in roster.share if receiver in receivers(roster, sender, share)]
     if not fits:
@@ -121,13 +121,16 @@ def why_not(
 
 
 def _claims(view: MergedClaims, sender: str, node: str) -> bool:
-    """Whether the sender names this node key, else somebody: as there is no conflict, nobody names another one."""
+    """True if the sender names this node key, else any station: as there is no conflict, none names another one."""
     named = [view.pins[sender]] if sender in view.pins else list(view.pins.values())
     return any(same_key(fingerprint, node) for fingerprint in named)
 
 
 def forgets(roster: Roster, me: str, fitting: Iterable[Share], taken: Collection[str]) -> bool:
-    """Whether a key may be deleted here: shares that say so, none that names me, and all their receivers receipted."""
+    """True if a key may be deleted here.
+
+    That needs shares that allow it, none that names me, and receipts of all their receivers.
+    """
     shares = list(fitting)
     if not any(share.forget for share in shares) or any(me in share.to for share in shares):
         return False

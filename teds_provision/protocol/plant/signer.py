@@ -1,7 +1,7 @@
 """Whose signature under a datasheet counts (contract/plant.md section 1, "verify").
 
-Being certified by the owner's CA is not enough in a plant: the roster says who may sign, and for who may not any more
-the pages say what was signed before.
+Being certified by the owner's CA is not enough in a plant: the roster lists who may sign, and for a station that may no
+longer, the pages list what was signed before.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from teds_provision.protocol.plant.roster import Member, Place, RemovedMember, R
 
 
 class SignatureClaim(NamedTuple):
-    """Who said of a datasheet's digest, on page ``n`` of its chain, that it signed it, or (``vouched``) vouches."""
+    """A claim on page ``n`` of a chain: its station signed this datasheet's digest, or vouches for it (``vouched``)."""
 
     station: str
     number: int
@@ -28,7 +28,7 @@ class SignerVerdict(NamedTuple):
 
 
 def limit_of(member: Member | RemovedMember) -> Place | None:
-    """Up to which page the ``signed`` events of somebody without ``sign`` count; None: it never had it."""
+    """Return up to which page the ``signed`` events of a station without ``sign`` count; None: it never had it."""
     if isinstance(member, Member):
         return member.signed
     if "sign" in member.roles:

@@ -1,7 +1,7 @@
-"""Remote signing: what a line asks an office, and what it answers (contract/plant.md section 11).
+"""Remote signing: a line's request to an office, and the answer (contract/plant.md section 11).
 
-The board takes part: it signs a challenge over the line's key, its own epoch and sequence, and every digest, so that
-nobody has a datasheet signed for a board that is not in his hands.
+The board takes part: it signs a challenge over the line's key, its own epoch and sequence, and every digest, so that a
+datasheet can be signed only for a board that the line holds.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ REFUSALS: Final = (
 def challenge(
     nonce: bytes, line: bytes, uuid: bytes, epoch: int, sequence: int, blocks: Mapping[BlockId, bytes]
 ) -> bytes:
-    """What the board signs by Prove: SHA-256 over label, nonce, P(line), UUID, epoch, sequence and the values of 108.
+    """Return what the board signs by Prove: SHA-256 over label, nonce, P(line), UUID, epoch, sequence, values of 108.
 
     ``blocks`` are the TEDS (without the Security TEDS), framed.
     """
@@ -55,7 +55,7 @@ def challenge(
 
 @dataclass(frozen=True)
 class SignRequest:
-    """What a line asks of an office (``to``, a fingerprint) for one board of a job.
+    """A line's request to an office (``to``, a fingerprint) for one board of a job.
 
     ``image`` holds every TEDS but the Security TEDS; ``key_signature`` is field 102; ``epoch`` and ``sequence`` were
     read in a session. ``signer``, ``line`` (its key), ``hash`` and ``octets`` are "" until it is signed.
@@ -85,12 +85,12 @@ class SignRequest:
         return self.image.uuid
 
     def challenge(self) -> bytes:
-        """What the board must have signed, under the line's key."""
+        """Return what the board must have signed, under the line's key."""
         blocks = self.image.unsigned_blocks()
         return challenge(self.nonce, self.line, self.uuid, self.epoch, self.sequence, blocks)
 
     def unsigned(self) -> dict[str, Any]:
-        """What the line signs, in the order of the contract."""
+        """Return what the line signs, in the order of the contract."""
         blocks = self.image.unsigned_blocks()
         return {
             "format": SIGN_REQUEST.format,
@@ -114,7 +114,7 @@ class SignRequest:
 
 
 def seal_request(request: SignRequest, line: PrivateKey) -> bytes:
-    """Sign a request; raises BadDataError where it is larger than an office reads."""
+    """Sign a request; raises BadDataError if it is larger than an office reads."""
     return seal(request.unsigned(), line, SIGN_REQUEST)
 
 
@@ -158,7 +158,7 @@ def open_request(octets: bytes, find_key: Callable[[str], bytes | None]) -> Sign
 
 @dataclass(frozen=True)
 class Answer:
-    """What an office answers to the request of this H: a Security TEDS (framed), or the word and why it refuses."""
+    """An office's answer to the request of this H: a Security TEDS (framed), or a code and the reason."""
 
     of: str
     sequence: int = 0
@@ -167,7 +167,7 @@ class Answer:
     why: str = ""
 
     def unsigned(self) -> dict[str, Any]:
-        """What the office signs, in the order of the contract."""
+        """Return what the office signs, in the order of the contract."""
         told: dict[str, Any] = {"format": SIGNED.format, "of": self.of}
         if self.refused:
             return {**told, "refused": self.refused, "why": self.why}

@@ -41,7 +41,7 @@ from teds_provision.protocol.tim.permission import Origin, Permission, of_teds
 from teds_provision.protocol.tim.teds_access import Staging, TedsAccess
 
 _ADDRESS_SECONDS: Final = 10.0
-"""Between two writes of the address to flash: whoever taps, or opens a session, could wear it out."""
+"""Seconds between two writes of the address to flash: taps or sessions could wear it out."""
 
 
 @dataclass
@@ -125,7 +125,7 @@ class Tim:
         return self._flash
 
     def identity(self) -> Identity:
-        """What Identify says now."""
+        """Return the present Identify reply."""
         flash = self._flash
         address = self.can_address if self.has_can else 0
         return Identity(flash.uuid, flash.state, flash.epoch, flash.sequence, self.max_message, address)
@@ -144,8 +144,8 @@ class Tim:
     ) -> bytes:
         """Run one whole command frame and return the whole reply frame. Never raises on any octets.
 
-        ``port`` says more than the link's name does (CAN FD, MTU); ``received`` is the tick at the frame's last octet,
-        by default now. When the reply has left, call :meth:`reply_left`.
+        ``port`` adds to the link's name (CAN FD, MTU); ``received`` is the tick at the frame's last octet, by default
+        now. When the reply has left, call :meth:`reply_left`.
         """
         tick = received if received is not None else self._role.now() if self._role is not None else 0
         self.poll()  # what ran out before this frame is over, and is told: it revives no lease, hides no dead-man
@@ -167,7 +167,7 @@ class Tim:
     # -- what links that measure call as well ----------------------------------------------------------------------
 
     def reply_left(self, link: str) -> None:
-        """The reply to the last command of this link has left: what its session streams may follow."""
+        """Handle that the reply to the last command of this link has left: its session's streams may follow."""
         session = self._sessions.on(link)
         if self._role is not None and session is not None:
             self._role.streams.reply_left(session)
@@ -180,19 +180,19 @@ class Tim:
         return self._role.poll() if self._role is not None else None
 
     def next_frame(self, bus: str) -> DataFrame | None:
-        """The next data frame of a bus (the link's name without its last part), where one may begin now.
+        """Return the next data frame of a bus (the link's name without its last part), if one may begin now.
 
-        Ask again when the frame before has left, after :meth:`next_frame_in`.
+        Call again when the frame before has left, after :meth:`next_frame_in`.
         """
         return self._role.frame(bus) if self._role is not None else None
 
     def next_frame_in(self) -> float | None:
-        """Seconds until the next data frame of any bus may begin; None where none is waiting."""
+        """Return seconds until the next data frame of any bus may begin; None if none is waiting."""
         return self._role.next_frame_in() if self._role is not None else None
 
     @property
     def streaming(self) -> bool:
-        """Whether a stream runs."""
+        """True if a stream runs."""
         return self._role is not None and self._role.streams.running
 
     @property
@@ -202,22 +202,22 @@ class Tim:
 
     @property
     def backlog(self) -> bool:
-        """Whether a full message waits for the one before it: what is sampled now may push it out."""
+        """True if a full message waits for the one before it: a new sample may overwrite it."""
         return self._role is not None and self._role.streams.backlog
 
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool = True) -> None:
-        """An event sensor has seen something at ``tick``."""
+        """Record a value of an event sensor at ``tick``."""
         if self._role is not None:
             self._role.streams.event(channel, tick, octets, valid=valid)
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:
-        """A trigger frame of the station of this link; ``tick`` is that of the frame's end."""
+        """Handle a trigger frame of the station of this link; ``tick`` is that of the frame's end."""
         session = self._sessions.on(link)
         if self._role is not None and session is not None and len(token) == TOKEN_OCTETS:
             self._role.streams.trigger(session, token, tick)
 
     def drive(self, link: str, octets: bytes) -> None:
-        """A Drive frame from CAN, or a whole Drive message from BLE (without its first octet)."""
+        """Handle a Drive frame from CAN, or a whole Drive message from BLE (without its first octet)."""
         session = self._sessions.on(link)
         if self._role is None or session is None:
             return
@@ -228,17 +228,17 @@ class Tim:
             self._role.streams.drive_message(session, octets)
 
     def unheard(self, link: str) -> None:
-        """The station of this link has disabled data messages there (BLE): its streams end."""
+        """End the streams of this link: its station has disabled data messages there (BLE)."""
         session = self._sessions.on(link)
         if self._role is not None and session is not None:
             self._role.streams.unheard(session)
 
     def in_session(self, link: str) -> bool:
-        """Whether a session is open on this link."""
+        """True if a session is open on this link."""
         return self._sessions.on(link) is not None
 
     def actuator_claimed(self) -> bool:
-        """Whether a session claims an actuator."""
+        """True if a session claims an actuator."""
         return self._role is not None and bool(self._role.claims.actuators)
 
     # -- routing ---------------------------------------------------------------------------------------------------

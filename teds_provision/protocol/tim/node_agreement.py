@@ -1,4 +1,4 @@
-"""The node's half of the agreement: Request, Confirm, what lies in RAM meanwhile (profile.md, "Key agreement")."""
+"""The node's half of the agreement: Request, Confirm, and the RAM between (profile.md, "Key agreement")."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PENDING_SECONDS: Final = 60.0
 
 @dataclass
 class _PendingAgreement:
-    """What a good Request left in RAM, and where its Confirm must come from."""
+    """What a good Request left in RAM, and the link of its Confirm."""
 
     agreement: NodeAgreement = field(repr=False)
     link: str
@@ -80,7 +80,10 @@ class AgreementSlot:
         return agreement.reply
 
     def confirm(self, payload: bytes, origin: Origin, flash: Flash) -> Flash:
-        """Confirm: the state to commit. What pends is left (2, 4), or goes with a wrong tag (12)."""
+        """Return the state to commit for a Confirm.
+
+        Refusals 2 and 4 keep the pending agreement, a wrong tag (12) drops it.
+        """
         pending = self._pending
         if (
             pending is None
@@ -99,6 +102,6 @@ class AgreementSlot:
         return replace(flash, key=agreement.key, epoch=agreement.epoch, station=agreement.station, ca=ca)
 
     def forget(self, link: str | None = None) -> None:
-        """What pends goes: with its link, or (None) whatever it is."""
+        """Drop the pending agreement of a link, or (None) of any."""
         if link is None or (self._pending is not None and self._pending.link == link):
             self._pending = None

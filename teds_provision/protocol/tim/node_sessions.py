@@ -41,7 +41,7 @@ class _LinkSessions:
 
 
 class OpenedFrame(NamedTuple):
-    """A good Sealed frame: its session, counter and inner frame. ``room`` is False where a new session found none."""
+    """A good Sealed frame: its session, counter and inner frame. ``room`` is False if a new session found none."""
 
     session: NodeSession
     counter: int
@@ -50,7 +50,7 @@ class OpenedFrame(NamedTuple):
 
 
 class Sessions:
-    """Sessions by link. ``claims`` says whether a session has a claim, ``ended`` is told of each that is over.
+    """Sessions by link. ``claims`` returns True if a session has a claim, ``ended`` is called for each that is over.
 
     ``room`` is how many sessions, and how many half-open Opens, there may be over all links, at least two.
     """
@@ -95,7 +95,7 @@ class Sessions:
         return made.reply
 
     def any_on(self, link: str) -> bool:
-        """Whether a session or half-open Open of this link lives; drops those whose time is over."""
+        """True if a session or half-open Open of this link lives; drops those whose time is over."""
         held = self._links.get(link)
         if held is None:
             return False
@@ -103,14 +103,14 @@ class Sessions:
         return held.session is not None or held.half_open is not None
 
     def on(self, link: str) -> NodeSession | None:
-        """The session of a link."""
+        """Return the session of a link."""
         held = self._links.get(link)
         return held.session if held is not None else None
 
     def open_frame(self, payload: bytes, link: str) -> OpenedFrame:
-        """A Sealed frame: tried under the session, then under the half-open Open.
+        """Open a Sealed frame under the session, else under the half-open Open.
 
-        Raises CommandRefusedError; changes nothing then.
+        Raises CommandRefusedError and changes nothing then.
 
         A link must have a session or half-open Open (:meth:`any_on`).
         """
@@ -168,7 +168,7 @@ class Sessions:
             held.half_open = None
 
     def _make_room(self, held: _LinkSessions) -> bool:
-        """Room for one more session: where there is none, that without a claim goes which was silent longest."""
+        """Make room for one more session: if there is none, the longest silent one without a claim ends."""
         others = [link for link in self._links.values() if link is not held]
         for other in others:
             self._drop_old(other)

@@ -51,9 +51,9 @@ _STRANGER_SECONDS: Final = 1.0
 
 @dataclass
 class Permission:
-    """Says no where the table does. ``in_factory`` and ``open_on`` (a link) tell the node's state.
+    """Refuses what the table forbids. ``in_factory`` and ``open_on`` (a link) return the node's state.
 
-    ``quick_points``: the node's point arithmetic holds no Sealed frame up by more than 5 ms.
+    ``quick_points``: the node's point arithmetic delays no Sealed frame by more than 5 ms.
     """
 
     in_factory: Callable[[], bool]
@@ -65,7 +65,7 @@ class Permission:
     _stranger_at: float | None = None
 
     def check(self, command: Command, origin: Origin) -> None:
-        """Raise CommandRefusedError where the command may not be run now, or is not known."""
+        """Raise CommandRefusedError if the command may not be run now, or is not known."""
         if command.command_class == SECURITY:
             # class 128 goes to channel 0; a function that nobody knows gets 1 in every state
             unknown = command.function not in _FUNCTIONS or (
@@ -92,7 +92,7 @@ class Permission:
         self._change(command, origin)
 
     def _plain_security(self, function: Function, payload: bytes, origin: Origin) -> None:
-        """The columns "factory" and "keyed or provisioned"."""
+        """Check the columns "factory" and "keyed or provisioned"."""
         self._permitted_plain(function, origin)
         if function == Function.OPEN and self.in_factory():
             raise CommandRefusedError(Reason.WRONG_STATE)
@@ -115,7 +115,7 @@ class Permission:
         return self.role is not None and self.role.knows(command)
 
     def _change(self, command: Command, origin: Origin) -> None:
-        """The datasheet and the address do not change under a claim."""
+        """Refuse changes of datasheet and address under a claim."""
         if self.role is None or (command.command_class, command.function) not in _CHANGES:
             return
         writes = (command.command_class, command.function) == (COMMON, TedsFunction.WRITE)
@@ -137,5 +137,5 @@ class Permission:
 
 
 def of_teds(command: Command) -> bool:
-    """Whether it is Query, Read, Write or Update."""
+    """True if it is Query, Read, Write or Update."""
     return command.command_class == COMMON and command.function in _TEDS_FUNCTIONS

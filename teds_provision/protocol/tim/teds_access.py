@@ -28,7 +28,7 @@ from teds_provision.teds.codec.security import NotCanonicalError, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
 
 STAGED_SECONDS: Final = 60.0
-"""What a session has staged and not touched for so long gives way to a Write in another one."""
+"""Seconds after which untouched staging of a session gives way to a Write in another one."""
 _ENTRY_OCTETS: Final = 3
 
 
@@ -41,13 +41,13 @@ class Staging:
     _touched_at: float = 0.0
 
     def staged_by(self, session: NodeSession) -> Mapping[BlockId, bytes]:
-        """What this session has staged."""
+        """Return what this session has staged."""
         return self._images if session is self._owner else {}
 
     def require(self, session: NodeSession, *, untouched: float | None = None) -> None:
-        """Raise CommandRefusedError (17) where something is staged in another session.
+        """Raise CommandRefusedError (17) if something is staged in another session.
 
-        ``untouched``: seconds (monotonic) now, for a Write, to which what lies there for too long gives way.
+        ``untouched``: seconds (monotonic) now, for a Write, to which staging that is too old gives way.
         """
         gives_way = untouched is not None and untouched - self._touched_at >= STAGED_SECONDS
         if self._images and session is not self._owner and not gives_way:
@@ -60,12 +60,12 @@ class Staging:
         self._images[block], self._touched_at = image, now
 
     def touch(self, session: NodeSession, now: float) -> None:
-        """The session has looked after what it staged."""
+        """Record that the session uses its staging."""
         if session is self._owner:
             self._touched_at = now
 
     def end(self, session: NodeSession | None = None) -> None:
-        """What this session has staged goes; None: whatever is there."""
+        """Drop what this session has staged; None: any staging."""
         if session is None or session is self._owner:
             self._owner, self._images = None, {}
 
@@ -97,7 +97,7 @@ class TedsAccess:
         return Reply(True, offset.to_bytes(4, "big") + octets)
 
     def write(self, flash: Flash, command: Command, staging: Staging, session: NodeSession, *, now: float) -> Reply:
-        """Write TEDS segment (1.3) into the staged image; what lay after the written octets is dropped.
+        """Write TEDS segment (1.3) into the staged image; octets after the written ones are dropped.
 
         ``now`` is a monotonic time in seconds.
         """
@@ -122,7 +122,7 @@ class TedsAccess:
     def update(
         self, flash: Flash, command: Command, staging: Staging, session: NodeSession, *, now: float
     ) -> tuple[Reply, Flash | None]:
-        """Update TEDS (1.4): the reply, and the state to commit where it is that of access code 128."""
+        """Run Update TEDS (1.4): return the reply, and the state to commit if it is that of access code 128."""
         block = _block(command, 1)
         staging.require(session)
         staged = staging.staged_by(session)
@@ -139,7 +139,7 @@ class TedsAccess:
         return Reply(True, self._status(flash, block, staged[block]).encode()), state
 
     def _can_list(self, blocks: set[BlockId]) -> bool:
-        """Whether the reply to List, sealed, still fits into one message."""
+        """True if the reply to List, sealed, still fits into one message."""
         return _ENTRY_OCTETS * len(blocks) <= self.max_message - LIST_OVERHEAD
 
     def _status(self, flash: Flash, block: BlockId, teds: bytes | None) -> TedsStatus:
@@ -156,7 +156,7 @@ class TedsAccess:
 
 
 def _block(command: Command, octets: int) -> BlockId:
-    """The TEDS that a command names; its payload must have that many octets, and the node be able to hold it."""
+    """Return the TEDS that a command names; its payload must have that many octets, and the node be able to hold it."""
     if len(command.payload) != octets:
         raise CommandRefusedError(Reason.BAD_FORM)
     block = (command.channel, command.payload[0])
